@@ -13,14 +13,14 @@ class MappingConfig(NetworkConfig):
     """Settings of a ``MappingCompensator``, in addition to those of ``NetworkConfig``.
 
     Attributes:
-        start: gain before training: ``"nalr"``, or a share of the hearing loss from 0 to 1.
-        phase: phase of the output: ``input`` for that of the input, or ``predicted`` by the
+        start: Gain before training: ``"nalr"``, or a share of the hearing loss from 0 to 1.
+        phase: Phase of the output: ``input`` for that of the input, or ``predicted`` by the
             network, as in Neuro-MSBG. Do not combine ``predicted`` with a criterion that compares
             only levels, such as ``"bands"``. Training may then find phases that differ between
             overlapping frames, which cancels steady sounds.
-        bands: number of bands of the correction, evenly spaced on the ERB-number scale, 4 to 40.
-        reach_db: largest correction up or down in dB.
-        limit_spl: peak of the output in dB SPL that no sample exceeds.
+        bands: Number of bands of the correction, evenly spaced on the ERB-number scale, 4 to 40.
+        reach_db: Largest correction up or down in dB.
+        limit_spl: Peak of the output in dB SPL that no sample exceeds.
 
     >>> MappingConfig(blocks=1, phase="predicted").phase
     'predicted'
@@ -50,22 +50,22 @@ class HearingAidConfig(ModelConfig):
     """Settings of a ``HearingAid``.
 
     Attributes:
-        bands: number of bands with a gain, an equal number of ERBs but at least 125 Hz apart, 4 to
+        bands: Number of bands with a gain, an equal number of ERBs but at least 125 Hz apart, 4 to
             40.
-        bins: number of frequencies of a frame, 62.5 Hz apart from the first, whose levels noise
+        bins: Number of frequencies of a frame, 62.5 Hz apart from the first, whose levels noise
             reduction sees in addition to those of the bands.
-        width: width of the layer before the recurrent one of noise reduction.
-        hidden: width of the recurrent layer.
-        inner: width of the three layers of the correction.
-        reach_db: largest correction of the restoring gain up or down in dB.
-        reduction_db: largest attenuation of a band by noise reduction in dB.
-        attack: time constant in seconds with which the levels behind the gain rise.
-        release: time constant in seconds with which they fall.
-        opening: time constant in seconds with which noise reduction ends.
-        closing: time constant in seconds with which it begins.
-        cap_db: largest gain of a band in dB.
-        quiet_spl: level in dB SPL below which the gain fades, to none 15 dB lower.
-        limit_spl: peak of the output in dB SPL that no sample exceeds.
+        width: Width of the layer before the recurrent one of noise reduction.
+        hidden: Width of the recurrent layer.
+        inner: Width of the three layers of the correction.
+        reach_db: Largest correction of the restoring gain up or down in dB.
+        reduction_db: Largest attenuation of a band by noise reduction in dB.
+        attack: Time constant in seconds with which the levels behind the gain rise.
+        release: Time constant in seconds with which they fall.
+        opening: Time constant in seconds with which noise reduction ends.
+        closing: Time constant in seconds with which it begins.
+        cap_db: Largest gain of a band in dB.
+        quiet_spl: Level in dB SPL below which the gain fades, to none 15 dB lower.
+        limit_spl: Peak of the output in dB SPL that no sample exceeds.
 
     >>> HearingAidConfig(bands=12).cap_db
     45.0

@@ -120,9 +120,9 @@ def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
     of 1 change nothing either.
 
     Args:
-        padded: samples of whole hops, or of a part of one hop, after ``2 * DELAY`` earlier samples.
-        gains: gains minus 1 at the beginning of each hop and at the end of the last.
-        first: position of the first sample in its hop.
+        padded: Samples of whole hops, or of a part of one hop, after ``2 * DELAY`` earlier samples.
+        gains: Gains minus 1 at the beginning of each hop and at the end of the last.
+        first: Position of the first sample in its hop.
 
     Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
 
@@ -146,9 +146,9 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
     """Interpolate the gains of one band at the samples of another rate, as ``apply_gains`` does.
 
     Args:
-        gains: gains before the first sample and at the last sample of each hop.
-        rate: sample rate of the result in Hz.
-        time: number of samples.
+        gains: Gains before the first sample and at the last sample of each hop.
+        rate: Sample rate of the result in Hz.
+        time: Number of samples.
 
     Shape: (items, hops + 1) -> (items, time).
 

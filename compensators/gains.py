@@ -29,17 +29,17 @@ def measure_gains(
     """Measure gains in thirds of an octave around the eight ``FREQUENCIES``.
 
     Args:
-        process: function from the input of an aid, (items, time) in pascals, and the thresholds of
+        process: Function from the input of an aid, (items, time) in pascals, and the thresholds of
             ears, (items, 8), to its output, (items, time).
-        audiogram: one or more ears.
-        level: level of the noise in dB SPL, 0 to 120.
-        dtype: type of the noise.
-        device: device of the noise.
+        audiogram: One or more ears.
+        level: Level of the noise in dB SPL, 0 to 120.
+        dtype: Type of the noise.
+        device: Device of the noise.
 
     Returns: Gains in dB, (8,) for one ear, else (..., 8).
 
     Raises:
-        ValueError: an ear or the level is not valid.
+        ValueError: An ear or the level is not valid.
 
     >>> gains = measure_gains(
     ...     lambda noise, ears: 10.0 * noise, "N3", 65.0, torch.float32, torch.device("cpu")

@@ -47,13 +47,13 @@ class HearingAid(Wearable):
     below ``config.quiet_spl``; the output is softly limited at ``config.limit_spl``.
 
     Args:
-        config: sizes and choices.
-        sample_rate: sample rate in Hz, as in ``Wearable``.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        linked: link the gains of two ears, as in ``Wearable``.
+        config: Sizes and choices.
+        sample_rate: Sample rate in Hz, as in ``Wearable``.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        linked: Link the gains of two ears, as in ``Wearable``.
 
     Raises:
-        ValueError: a rate or level out of range, or a configuration of another type.
+        ValueError: A rate or level out of range, or a configuration of another type.
 
     >>> import hlsim
     >>> aid = HearingAid().eval()
@@ -116,15 +116,15 @@ class HearingAid(Wearable):
         """Return the output for a whole signal, time-aligned.
 
         Args:
-            waveform: input of the aid.
-            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
-            noise_reduction: share of the attenuation, 0 to 1, one number or one per item.
-            amplification: share of the amplification, 0 to 1, one number or one per item.
+            waveform: Input of the aid.
+            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            noise_reduction: Share of the attenuation, 0 to 1, one number or one per item.
+            amplification: Share of the amplification, 0 to 1, one number or one per item.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, sliders outside 0 to 1, or
+            ValueError: No audiogram, levels outside -10 to 100 dB HL, sliders outside 0 to 1, or
                 shapes that do not fit.
         """
         return self.process(waveform, audiogram, (noise_reduction, amplification))
@@ -138,7 +138,7 @@ class HearingAid(Wearable):
         """Return a stream, which gives the same output for chunks of any size.
 
         Raises:
-            ValueError: the sample rate is not 16000 Hz, or an argument is not valid.
+            ValueError: The sample rate is not 16000 Hz, or an argument is not valid.
         """
         return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
 

@@ -49,15 +49,15 @@ class MappingCompensator(EarNetwork):
     ``config.limit_spl``.
 
     Args:
-        config: sizes and choices.
-        sample_rate: sample rate in Hz, as in ``EarNetwork``.
-        full_scale_spl: level in dB SPL of RMS 1.0.
+        config: Sizes and choices.
+        sample_rate: Sample rate in Hz, as in ``EarNetwork``.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
 
     Attributes:
-        highest_frequency: highest frequency of outputs in Hz.
+        highest_frequency: Highest frequency of outputs in Hz.
 
     Raises:
-        ValueError: a rate or level out of range, or a configuration of another type.
+        ValueError: A rate or level out of range, or a configuration of another type.
 
     >>> import hlsim
     >>> model = MappingCompensator(MappingConfig(channels=8, blocks=1))
@@ -105,14 +105,14 @@ class MappingCompensator(EarNetwork):
         """Measure the insertion gains for noise with the spectrum of average speech.
 
         Args:
-            audiogram: one or more ears.
-            level: presentation level in dB SPL, 0 to 120.
+            audiogram: One or more ears.
+            level: Presentation level in dB SPL, 0 to 120.
 
         Returns:
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: an ear or the level is not valid.
+            ValueError: An ear or the level is not valid.
 
         >>> MappingCompensator().gains("N3").shape
         torch.Size([8])

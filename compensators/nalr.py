@@ -40,16 +40,16 @@ class NALR(nn.Module):
     its delay of ``order / 2`` samples. The output is linear in the input and has no limit.
 
     Args:
-        audiogram: ear or ears; may be passed to each call instead. A tensor that requires a
+        audiogram: Ear or ears; may be passed to each call instead. A tensor that requires a
             gradient has to be. The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz
             count, interpolated over log frequency where they were not measured.
-        sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of RMS 1.0. A linear filter does not need it; all
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of RMS 1.0. A linear filter does not need it; all
             compensators accept it.
-        order: order of the filter, even, 2 to 1022.
+        order: Order of the filter, even, 2 to 1022.
 
     Raises:
-        ValueError: a value out of range.
+        ValueError: A value out of range.
 
     >>> import hlsim
     >>> from hlsim.calibration import level_spl
@@ -88,13 +88,13 @@ class NALR(nn.Module):
         """Return the amplified waveform, time-aligned.
 
         Args:
-            waveform: input of the aid.
-            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            waveform: Input of the aid.
+            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 120 dB HL, or shapes that do not fit.
+            ValueError: No audiogram, levels outside -10 to 120 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         thresholds = resolve_thresholds(
@@ -114,14 +114,14 @@ class NALR(nn.Module):
         """Compute the insertion gains of the prescription, which are the same at every level.
 
         Args:
-            audiogram: one or more ears, by default those that were passed to the constructor.
-            level: presentation level in dB SPL, which all aids accept.
+            audiogram: One or more ears, by default those that were passed to the constructor.
+            level: Presentation level in dB SPL, which all aids accept.
 
         Returns:
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: no audiogram, or levels outside -10 to 120 dB HL.
+            ValueError: No audiogram, or levels outside -10 to 120 dB HL.
 
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])

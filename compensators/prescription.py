@@ -67,10 +67,10 @@ def compressive_gains(levels: Tensor, prescribed: Tensor, ratios: Tensor, knee: 
     It is lower for higher levels and higher for lower levels.
 
     Args:
-        levels: levels of the bands relative to average speech in dB.
-        prescribed: prescribed gains in dB.
-        ratios: compression ratios.
-        knee: relative level in dB below which the gain is constant.
+        levels: Levels of the bands relative to average speech in dB.
+        prescribed: Prescribed gains in dB.
+        ratios: Compression ratios.
+        knee: Relative level in dB below which the gain is constant.
 
     Shape: (items, frames, bands), (items, bands) twice -> (items, frames, bands), 0 dB or more.
 

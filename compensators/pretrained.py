@@ -56,13 +56,13 @@ def load_compensator(
         name: ``"nalr"``, the prescription; ``"wdrc"``, the prescription with compression; a
             checkpoint that ships with hlsim; or the folder of a checkpoint. ``trained_for`` returns
             the ear of a compensator that was trained for one ear.
-        sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        linked: link the gains of a hearing aid or WDRC between the ears, as
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        linked: Link the gains of a hearing aid or WDRC between the ears, as
             ``compensators.wearable`` describes.
 
     Raises:
-        ValueError: there is no such checkpoint, it is of another kind or has changed since it was
+        ValueError: There is no such checkpoint, it is of another kind or has changed since it was
             saved, or ``linked`` is set for a compensator that cannot link its gains.
 
     >>> import hlsim
@@ -104,12 +104,12 @@ def save_compensator(
     existing README.md is kept.
 
     Args:
-        model: compensator to save.
-        folder: folder of the checkpoint.
-        audiogram: the one ear for which the compensator was trained, or None for all ears.
+        model: Compensator to save.
+        folder: Folder of the checkpoint.
+        audiogram: The one ear for which the compensator was trained, or None for all ears.
 
     Raises:
-        ValueError: the model is of another kind, or the folder holds something else.
+        ValueError: The model is of another kind, or the folder holds something else.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -130,7 +130,7 @@ def trained_for(name: str | Path) -> Audiogram | None:
     """Return the one ear for which a compensator was trained, or None for one that suits all ears.
 
     Raises:
-        ValueError: there is no such checkpoint, or its record of the ear is no audiogram.
+        ValueError: There is no such checkpoint, or its record of the ear is no audiogram.
 
     >>> trained_for("hearing-aid") is None
     True

@@ -31,9 +31,9 @@ def average(values: Tensor, state: Tensor, past: float) -> Tensor:
     """Compute the exponential average y[n] = past y[n - 1] + (1 - past) x[n].
 
     Args:
-        values: x.
-        state: y of the frame before the first one.
-        past: weight of the past.
+        values: X.
+        state: Y of the frame before the first one.
+        past: Weight of the past.
 
     Shape: (items, frames, n), (items, n) -> (items, frames, n).
 
@@ -64,10 +64,10 @@ def follow_peaks(
     and d[n] = max(x[n] - e[n], release d[n - 1]).
 
     Args:
-        values: x.
-        state: e, d and y of the frame before the first one, (items, 3, n).
-        attack: weight of the past in a rising level, from ``decay``.
-        release: weight of the past in a falling level.
+        values: X.
+        state: E, d and y of the frame before the first one, (items, 3, n).
+        attack: Weight of the past in a rising level, from ``decay``.
+        release: Weight of the past in a falling level.
 
     Shape: (items, frames, n) -> (items, frames, n), and the state after the last frame.
 

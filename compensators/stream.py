@@ -23,9 +23,9 @@ class Stream:
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
 
     Raises:
-        ValueError: as the call of the aid, or the leading dimensions change, or samples are NaN or
+        ValueError: As the call of the aid, or the leading dimensions change, or samples are NaN or
             infinite, which would stay in the state. A rejected chunk changes nothing.
-        AttributeError: an attribute is set that is not a slider of the aid.
+        AttributeError: An attribute is set that is not a slider of the aid.
 
     >>> import hlsim
     >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")
@@ -87,7 +87,7 @@ class Stream:
         """Return the last ``latency`` samples, and begin again: the next chunk follows silence.
 
         Raises:
-            ValueError: no chunk was processed.
+            ValueError: No chunk was processed.
         """
         if not self._state:
             raise ValueError("expected a chunk before flush, got none")

@@ -30,19 +30,19 @@ class WDRC(Wearable):
     up to 10 dB HL, rises by 1 per 40 dB, and is 3 at most.
 
     Args:
-        sample_rate: sample rate in Hz, as in ``Wearable``.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        bands: number of bands, an equal number of ERBs but at least 125 Hz apart, 4 to 40.
-        attack: time constant in seconds, 0 to 1.
-        release: time constant in seconds, 0.01 to 2.
-        knee: knee of the compression in dB below the level of average speech at 65 dB SPL in the
+        sample_rate: Sample rate in Hz, as in ``Wearable``.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        bands: Number of bands, an equal number of ERBs but at least 125 Hz apart, 4 to 40.
+        attack: Time constant in seconds, 0 to 1.
+        release: Time constant in seconds, 0.01 to 2.
+        knee: Knee of the compression in dB below the level of average speech at 65 dB SPL in the
             band.
-        limit_spl: peak of the output in dB SPL that no sample exceeds, and beyond which no band is
+        limit_spl: Peak of the output in dB SPL that no sample exceeds, and beyond which no band is
             amplified.
-        linked: link the gains of two ears, as in ``Wearable``.
+        linked: Link the gains of two ears, as in ``Wearable``.
 
     Raises:
-        ValueError: a value out of range.
+        ValueError: A value out of range.
 
     >>> import hlsim
     >>> WDRC()(hlsim.example_speech(), "N3").shape
@@ -77,13 +77,13 @@ class WDRC(Wearable):
         """Return the output for a whole signal, time-aligned.
 
         Args:
-            waveform: input of the aid.
-            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            waveform: Input of the aid.
+            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
+            ValueError: No audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
         return self.process(waveform, audiogram, ())
 
@@ -91,7 +91,7 @@ class WDRC(Wearable):
         """Return a stream, which gives the same output for chunks of any size.
 
         Raises:
-            ValueError: the sample rate is not 16000 Hz.
+            ValueError: The sample rate is not 16000 Hz.
         """
         return Stream(self, audiogram)
 

@@ -55,16 +55,16 @@ class Wearable(nn.Module):
     streams run the same ``step``.
 
     Args:
-        sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
             kHz; components above get the gain of the highest band. Other rates than 16000 are
             supported for whole signals only, and resampling adds 8.5 ms of look-ahead.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        linked: for two ears, (..., 2, time), set the gains of both ears by their mean power, so
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        linked: For two ears, (..., 2, time), set the gains of both ears by their mean power, so
             that differences in level between ears with the same fitting stay. The limit of the
             output is that of each ear.
 
     Raises:
-        ValueError: a rate or level out of range; in a call with ``linked``, another shape.
+        ValueError: A rate or level out of range; in a call with ``linked``, another shape.
 
     >>> from compensators import WDRC
     >>> aid = WDRC()
@@ -104,10 +104,10 @@ class Wearable(nn.Module):
         """Compute each band's gain in dB at the end of each frame, and the state after the last.
 
         Args:
-            powers: result of ``frame_power``.
-            fitted: result of ``fit``.
-            sliders: values of the sliders in each frame.
-            state: state before the first frame.
+            powers: Result of ``frame_power``.
+            fitted: Result of ``fit``.
+            sliders: Values of the sliders in each frame.
+            state: State before the first frame.
 
         Shape: (items, frames, FRAME / 2 + 1), (items, n), (items, frames, sliders)
             -> (items, frames, bands).
@@ -171,9 +171,9 @@ class Wearable(nn.Module):
         """Return the time-aligned output for whole signals.
 
         Args:
-            waveform: input of the aid.
-            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
-            sliders: values of ``SLIDERS``.
+            waveform: Input of the aid.
+            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            sliders: Values of ``SLIDERS``.
 
         Shape: (..., time) -> (..., time).
         """
@@ -230,14 +230,14 @@ class Wearable(nn.Module):
         Noise reduction is off, and the limit of the output does not count.
 
         Args:
-            audiogram: one or more ears.
-            level: presentation level in dB SPL, 0 to 120.
+            audiogram: One or more ears.
+            level: Presentation level in dB SPL, 0 to 120.
 
         Returns:
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: an ear or the level is not valid.
+            ValueError: An ear or the level is not valid.
 
         >>> from compensators import WDRC
         >>> WDRC().gains("N3", level=65.0).round()
@@ -266,13 +266,13 @@ def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> 
     that are out of range become NaN.
 
     Args:
-        name: name of the slider, for messages.
-        slider: number or tensor from 0 to 1.
-        batch: shape of the result, to which a tensor has to broadcast.
-        like: tensor with the type and the device of the result.
+        name: Name of the slider, for messages.
+        slider: Number or tensor from 0 to 1.
+        batch: Shape of the result, to which a tensor has to broadcast.
+        like: Tensor with the type and the device of the result.
 
     Raises:
-        ValueError: values outside 0 to 1, or a shape that does not broadcast over the items.
+        ValueError: Values outside 0 to 1, or a shape that does not broadcast over the items.
 
     >>> check_slider("amplification", 0.5, torch.Size([2]), torch.empty(0))
     tensor([0.5000, 0.5000])

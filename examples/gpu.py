@@ -135,12 +135,12 @@ class Sizes:
     """Sizes of what is measured.
 
     Attributes:
-        seconds: duration of an item in seconds in the sections that measure speed.
-        short: duration of an item in seconds in the section "equality".
-        items: number of items in the section "equality".
-        batches: numbers of items in the section "throughput".
-        budget: duration in seconds for which a measurement repeats its call.
-        training: number and duration in seconds of the items of training steps.
+        seconds: Duration of an item in seconds in the sections that measure speed.
+        short: Duration of an item in seconds in the section "equality".
+        items: Number of items in the section "equality".
+        batches: Numbers of items in the section "throughput".
+        budget: Duration in seconds for which a measurement repeats its call.
+        training: Number and duration in seconds of the items of training steps.
     """
 
     seconds: float = 4.0
@@ -159,10 +159,10 @@ class Subject:
     """A call that is compared and timed.
 
     Attributes:
-        name: name of the call in tables.
-        build: function that returns the module, on the CPU and in float32.
-        call: function of the module, processed and clean speech (items, time), and ears (items, 8).
-        rate: sample rate in Hz.
+        name: Name of the call in tables.
+        build: Function that returns the module, on the CPU and in float32.
+        call: Function of the module, processed and clean speech (items, time), and ears (items, 8).
+        rate: Sample rate in Hz.
     """
 
     name: str
@@ -698,7 +698,7 @@ def autocast_row(run: Run, model: nn.Module, items: int, inside: bool) -> Row:
     """Compare bfloat16 with float32.
 
     Args:
-        inside: set the network's ``autocast_dtype`` instead of calling it in an autocast region.
+        inside: Set the network's ``autocast_dtype`` instead of calling it in an autocast region.
     """
     model = model.to(run.device)
     wave, _, ears = (tensor.to(run.device) for tensor in signals(16000, run.sizes.seconds, items))

@@ -224,9 +224,9 @@ class WordsCorrect:
     The text is the item's fact ``text``, or that of its fact ``utterance`` in the file of sentences.
 
     Args:
-        recognise: function of samples at 16 kHz, (time,), that returns a text; by default Whisper
+        recognise: Function of samples at 16 kHz, (time,), that returns a text; by default Whisper
             from the folder in the environment variable ``WHISPER_MODEL``.
-        sentences: texts by utterance; by default those of the CSV file in ``WHISPER_SENTENCES``.
+        sentences: Texts by utterance; by default those of the CSV file in ``WHISPER_SENTENCES``.
     """
 
     def __init__(
@@ -357,12 +357,12 @@ def make_items(
     the folder, take turns.
 
     Args:
-        speech, noise: folders.
-        sentences: pieces of the files of speech.
-        ears: audiograms by name.
+        speech, noise: Folders.
+        sentences: Pieces of the files of speech.
+        ears: Audiograms by name.
         snrs_db: signal-to-noise ratios in dB, by active speech level.
-        seed: seed of the noise and of the internal noise.
-        step: every ``step``-th ear processes a sentence, beginning with another one for the next.
+        seed: Seed of the noise and of the internal noise.
+        step: Every ``step``-th ear processes a sentence, beginning with another one for the next.
     """
     generator = torch.Generator().manual_seed(seed)
     kinds = sorted(path for path in Path(noise).iterdir() if path.is_dir()) or [Path(noise)]
@@ -458,8 +458,8 @@ class Comparison:
     A share is the number of correct words divided by the number of all words, over all ears.
 
     Args:
-        table: rows of the study.
-        seed: seed of the bootstrap.
+        table: Rows of the study.
+        seed: Seed of the bootstrap.
     """
 
     def __init__(self, table: DataFrame, seed: int = 0) -> None:
@@ -516,9 +516,9 @@ def print_report(table: DataFrame, normal: DataFrame, baseline: str) -> None:
     """Print words correct, differences from a baseline, and speech reception thresholds.
 
     Args:
-        table: rows of the aids.
-        normal: rows of a normal ear without an aid.
-        baseline: name of the aid that is subtracted.
+        table: Rows of the aids.
+        normal: Rows of a normal ear without an aid.
+        baseline: Name of the aid that is subtracted.
     """
     aids, ears = list(table["condition"].unique()), list(table["ear"].unique())
     snrs = sorted(table["snr"].unique())

@@ -21,10 +21,10 @@ def check_full_scale(full_scale_spl: float) -> float:
     """Return ``full_scale_spl`` as a float.
 
     Args:
-        full_scale_spl: level in dB SPL of RMS 1.0, from 0 to 200.
+        full_scale_spl: Level in dB SPL of RMS 1.0, from 0 to 200.
 
     Raises:
-        ValueError: the level is not a number, or out of range.
+        ValueError: The level is not a number, or out of range.
 
     >>> check_full_scale(120)
     120.0
@@ -37,10 +37,10 @@ def gain_to_pascals(full_scale_spl: float) -> float:
     """Compute the linear gain that converts samples to pascals.
 
     Args:
-        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: the level is not a number, or out of range.
+        ValueError: The level is not a number, or out of range.
 
     >>> gain_to_pascals(114.0)
     10.0
@@ -56,10 +56,10 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     Shape: (..., time) -> (...).
 
     Args:
-        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: the waveform is not a floating-point tensor with time last.
+        ValueError: The waveform is not a floating-point tensor with time last.
 
     >>> level_spl(torch.tensor([1.0, -1.0]))
     tensor(94.)
@@ -78,12 +78,12 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
     Shape: (..., time) -> (..., time).
 
     Args:
-        spl: level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
+        spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
             dimensions.
-        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: the waveform is not a floating-point tensor with time last, or ``spl`` is not a
+        ValueError: The waveform is not a floating-point tensor with time last, or ``spl`` is not a
             level or does not fit the items.
 
     >>> level_spl(set_level(torch.randn(2, 16000), torch.tensor([65.0, 80.0]))).round()
@@ -115,7 +115,7 @@ def dbfs(waveform: Tensor) -> Tensor:
     Shape: (..., time) -> (...).
 
     Raises:
-        ValueError: the waveform is not a floating-point tensor with time last.
+        ValueError: The waveform is not a floating-point tensor with time last.
 
     >>> dbfs(torch.tensor([0.1, -0.1])).round()
     tensor(-20.)
@@ -127,7 +127,7 @@ def _as_float32_or_wider(waveform: Tensor) -> Tensor:
     """Convert half precision to float32, because float16 cannot represent the power of soft speech.
 
     Raises:
-        ValueError: the waveform is not a floating-point tensor with time last.
+        ValueError: The waveform is not a floating-point tensor with time last.
     """
     check_time_last(waveform)
     return waveform.float() if waveform.dtype in (torch.float16, torch.bfloat16) else waveform

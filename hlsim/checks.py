@@ -35,7 +35,7 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
     of a second.
 
     Raises:
-        RuntimeError: the shapes do not fit.
+        RuntimeError: The shapes do not fit.
 
     >>> broadcast_shape((3, 1), (2,))
     torch.Size([3, 2])
@@ -48,9 +48,9 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
     """Raise ValueError unless all names are known.
 
     Args:
-        names: names to validate.
-        known: accepted names.
-        description: noun in the plural for the message, such as ``criteria``.
+        names: Names to validate.
+        known: Accepted names.
+        description: Noun in the plural for the message, such as ``criteria``.
 
     >>> check_names(["bands"], ["bands", "paper"], "criteria")
     """
@@ -66,9 +66,9 @@ def check_choice(name: str, value: Any, choice: Any) -> None:
     """Raise ValueError unless a value is one of the strings of a ``Literal``.
 
     Args:
-        name: name of the setting, for the message.
-        value: value to validate.
-        choice: the ``Literal``.
+        name: Name of the setting, for the message.
+        value: Value to validate.
+        choice: The ``Literal``.
 
     >>> from typing import Literal
     >>> check_choice("ears", "better", Literal["mean", "better"])
@@ -84,11 +84,11 @@ def check_number(
     """Raise ValueError unless a value is a finite number in a range that includes both ends.
 
     Args:
-        name: name of the setting, for the message.
-        value: value to validate.
-        lowest: smallest accepted number.
-        highest: largest accepted number.
-        whole: accept integers only.
+        name: Name of the setting, for the message.
+        value: Value to validate.
+        lowest: Smallest accepted number.
+        highest: Largest accepted number.
+        whole: Accept integers only.
 
     >>> check_number("bands", 20, 4, 40, whole=True)
     """
@@ -106,12 +106,12 @@ def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[
     """Return weights by name as floats.
 
     Args:
-        weights: mapping of names to finite numbers of 0 or more, of which one is above 0.
-        known: accepted names.
-        description: noun in the plural for messages, such as ``criteria``.
+        weights: Mapping of names to finite numbers of 0 or more, of which one is above 0.
+        known: Accepted names.
+        description: Noun in the plural for messages, such as ``criteria``.
 
     Raises:
-        ValueError: the weights are not as described.
+        ValueError: The weights are not as described.
 
     >>> check_weights({"bands": 1}, ["bands", "paper"], "criteria")
     {'bands': 1.0}
@@ -156,12 +156,12 @@ def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHE
     """Return a sample rate as an int.
 
     Args:
-        sample_rate: sample rate in Hz.
-        lowest: lowest accepted rate.
-        highest: highest accepted rate.
+        sample_rate: Sample rate in Hz.
+        lowest: Lowest accepted rate.
+        highest: Highest accepted rate.
 
     Raises:
-        ValueError: the rate is not a whole number of Hz from ``lowest`` to ``highest``.
+        ValueError: The rate is not a whole number of Hz from ``lowest`` to ``highest``.
 
     >>> check_rate(44100.0)
     44100
@@ -190,14 +190,14 @@ def check_waveform(
     Shape: (..., time).
 
     Args:
-        waveform: tensor to validate.
-        name: name of the argument, for messages.
-        highest: largest accepted magnitude of a finite sample.
-        full_scale_spl: level in dB SPL of RMS 1.0. If it is passed, the first waveform of a process
+        waveform: Tensor to validate.
+        name: Name of the argument, for messages.
+        highest: Largest accepted magnitude of a finite sample.
+        full_scale_spl: Level in dB SPL of RMS 1.0. If it is passed, the first waveform of a process
             whose level is above ``LOUDEST_SPL`` causes a warning.
 
     Raises:
-        ValueError: it is not a floating-point tensor with time last, has no samples, or has a
+        ValueError: It is not a floating-point tensor with time last, has no samples, or has a
             sample above ``highest``.
 
     >>> check_waveform(torch.zeros(2, 16000)).shape
@@ -284,15 +284,15 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
     """Return the number of samples of each item as integers on the CPU.
 
     Args:
-        lengths: whole numbers of samples from 1 to ``time``, or shares of ``time`` above 0 and up
+        lengths: Whole numbers of samples from 1 to ``time``, or shares of ``time`` above 0 and up
             to 1, as SpeechBrain defines them. The shape is that of the batch without time;
             (batch,) also serves a batch of shape (batch, 1, time).
-        shape: shape of the batch, (..., time).
+        shape: Shape of the batch, (..., time).
 
     Returns: (...), int64.
 
     Raises:
-        ValueError: the numbers, their type or their shape are not as described.
+        ValueError: The numbers, their type or their shape are not as described.
 
     >>> check_lengths([0.5, 1.0], torch.Size([2, 100]))
     tensor([ 50, 100])

@@ -66,20 +66,20 @@ def demo(
     """Train an aid, score it beside others, and write a page and sounds into a folder.
 
     Args:
-        out: folder of the results.
-        audiogram: the ear.
-        speech: folder to use instead of the bundled speech; every third file is scored, and the
+        out: Folder of the results.
+        audiogram: The ear.
+        speech: Folder to use instead of the bundled speech; every third file is scored, and the
             others are trained on.
-        steps: number of training steps.
-        seed: seed of every random draw.
-        jobs: number of processes that score.
-        report: function that is called with lines about the current work.
-        progress: function that is called with the number of scored outputs and their total number.
+        steps: Number of training steps.
+        seed: Seed of every random draw.
+        jobs: Number of processes that score.
+        report: Function that is called with lines about the current work.
+        progress: Function that is called with the number of scored outputs and their total number.
 
     Returns: verdict, table and address of the page, for a terminal.
 
     Raises:
-        ValueError: audio that cannot be used, fewer than 22 files in ``speech``, or a file to score
+        ValueError: Audio that cannot be used, fewer than 22 files in ``speech``, or a file to score
             that lasts less than 0.7 s.
     """
     folder = Path(out)

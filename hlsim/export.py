@@ -168,7 +168,7 @@ def export_onnx(
         ValueError: The simulator or the size is unsuitable, see ``export_program``; ONNX lacks an
             operation; or the output of onnxruntime for noise at 64 dB SPL differs by more than
             ``TOLERANCE``.
-        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+        MissingExtraError: Onnx, onnxscript or onnxruntime is not installed.
 
     >>> import hlsim
     >>> simulator = hlsim.load_pretrained("neuro-msbg-light")
@@ -260,7 +260,7 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
             differs by more than ``TOLERANCE`` in the last of 16 hops of noise at 64 dB SPL.
-        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+        MissingExtraError: Onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
     >>> export_aid(WDRC(), "aid.onnx")  # doctest: +SKIP
@@ -295,7 +295,7 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
 
     Raises:
         ValueError: The output of onnxruntime differs by more than ``TOLERANCE``.
-        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+        MissingExtraError: Onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
     >>> export_fit(WDRC(), "fit.onnx")  # doctest: +SKIP

@@ -20,11 +20,11 @@ def require(module: str, extra: str) -> ModuleType:
     """Import an optional module, or raise an error that shows how to install it.
 
     Args:
-        module: dotted module name, e.g. ``"matplotlib.figure"``.
+        module: Dotted module name, e.g. ``"matplotlib.figure"``.
         extra: hlsim's extra that installs it, e.g. ``"eval"``.
 
     Raises:
-        MissingExtraError: the module, or one that it imports, is not installed.
+        MissingExtraError: The module, or one that it imports, is not installed.
 
     >>> require("json", extra="eval").dumps([1])
     '[1]'

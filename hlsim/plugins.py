@@ -35,10 +35,10 @@ def load_plugin(name: str, kind: str) -> Any:
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
-        kind: noun for the object in error messages, such as ``"teacher"``.
+        kind: Noun for the object in error messages, such as ``"teacher"``.
 
     Raises:
-        ValueError: the name has another form, the import fails, or the object does not exist.
+        ValueError: The name has another form, the import fails, or the object does not exist.
 
     >>> load_plugin("math:pi", kind="measure")
     3.141592653589793
@@ -71,15 +71,15 @@ class WaveformPlugin:
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
-        kind: noun for the plug-in in error messages: ``"teacher"``, ``"enhancer"`` or ``"aid"``.
+        kind: Noun for the plug-in in error messages: ``"teacher"``, ``"enhancer"`` or ``"aid"``.
 
     Attributes:
-        function: callable that was loaded.
-        fingerprint: attribute ``fingerprint`` of the callable as text, which its author changes
+        function: Callable that was loaded.
+        fingerprint: Attribute ``fingerprint`` of the callable as text, which its author changes
             when its outputs change. None if there is no such attribute.
 
     Raises:
-        ValueError: the plug-in cannot be loaded or called.
+        ValueError: The plug-in cannot be loaded or called.
 
     >>> rectifier = WaveformPlugin("torch:abs", kind="aid")
     >>> rectifier(torch.tensor([1.0, -2.0]))
@@ -112,11 +112,11 @@ class WaveformPlugin:
         may have another duration.
 
         Args:
-            waveform: first argument of the plug-in.
-            arguments: further arguments of the plug-in.
+            waveform: First argument of the plug-in.
+            arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: the plug-in fails, or its output is not a real, finite tensor of the same
+            ValueError: The plug-in fails, or its output is not a real, finite tensor of the same
                 shape.
         """
         if isinstance(self.function, nn.Module):
@@ -147,12 +147,12 @@ class WaveformPlugin:
         The delay is the maximum of the cross-correlation of the first channels.
 
         Args:
-            waveform: first argument of the plug-in. Shape: (..., time).
-            sample_rate: sample rate in Hz.
-            arguments: further arguments of the plug-in.
+            waveform: First argument of the plug-in. Shape: (..., time).
+            sample_rate: Sample rate in Hz.
+            arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: the call fails, or the output is not time-aligned.
+            ValueError: The call fails, or the output is not time-aligned.
         """
         output = self(waveform, *arguments)
         points = 2 * waveform.shape[-1]

@@ -62,9 +62,9 @@ def constant(
     """Return the values of ``function(*arguments)`` as a cached tensor, which must not be changed.
 
     Args:
-        function: a module's function that returns an array or numbers.
-        dtype: type of real values, and of the parts of complex ones.
-        device: device of the tensor.
+        function: A module's function that returns an array or numbers.
+        dtype: Type of real values, and of the parts of complex ones.
+        device: Device of the tensor.
 
     >>> constant(np.hanning, 3, dtype=torch.float32, device=torch.device("cpu"))
     tensor([0., 1., 0.])
@@ -87,8 +87,8 @@ def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return ``function(*arguments)`` from a cache that drops the least recently used results.
 
     Args:
-        function: a module's function that returns a tensor or another object with ``nbytes``.
-        arguments: hashable arguments.
+        function: A module's function that returns a tensor or another object with ``nbytes``.
+        arguments: Hashable arguments.
 
     >>> compute_once(np.hanning, 5) is compute_once(np.hanning, 5)
     True

@@ -52,10 +52,10 @@ class Case:
     """A computation that is repeated.
 
     Attributes:
-        compute: returns tensors, arrays or numbers by name.
-        tolerance: largest difference relative to the peak, where equal bits cannot be expected.
-        gradient_tolerance: the same for gradients, where it is another.
-        may_change: whether other bits are accepted on the same machine, too, within the tolerance.
+        compute: Returns tensors, arrays or numbers by name.
+        tolerance: Largest difference relative to the peak, where equal bits cannot be expected.
+        gradient_tolerance: The same for gradients, where it is another.
+        may_change: Whether other bits are accepted on the same machine, too, within the tolerance.
     """
 
     compute: Callable[[], Arrays]

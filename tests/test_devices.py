@@ -36,9 +36,9 @@ class Call(NamedTuple):
     """A call of a module that is compared between devices.
 
     Attributes:
-        build: function that returns the module on the CPU.
-        call: function of the module, processed and clean speech (4, time), and ears (4, 8).
-        waits: number of times that the host may wait for the device.
+        build: Function that returns the module on the CPU.
+        call: Function of the module, processed and clean speech (4, time), and ears (4, 8).
+        waits: Number of times that the host may wait for the device.
     """
 
     build: Callable[[], nn.Module]

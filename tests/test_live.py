@@ -33,10 +33,10 @@ class Devices:
     """A replacement of the module sounddevice.
 
     Args:
-        recording: signal of each microphone, (microphones, time).
-        lost: numbers of the blocks that are reported as lost.
-        sample_rate: the only supported sample rate.
-        headphones: number of output channels.
+        recording: Signal of each microphone, (microphones, time).
+        lost: Numbers of the blocks that are reported as lost.
+        sample_rate: The only supported sample rate.
+        headphones: Number of output channels.
     """
 
     class PortAudioError(Exception):

@@ -256,7 +256,7 @@ class Audiogram:
         """Return pyclarity's ``Audiogram`` with the same levels and frequencies.
 
         Raises:
-            MissingExtraError: pyclarity is not installed.
+            MissingExtraError: Pyclarity is not installed.
         """
         module = require("clarity.utils.audiogram", "dev")
         return module.Audiogram(np.array(self.levels), np.array(self.frequencies))

@@ -245,7 +245,7 @@ def read_labels(texts: Sequence[str]) -> dict[str, str]:
     """Return names by their label. A folder without a label is named by its path.
 
     Raises:
-        ValueError: two names have the same label.
+        ValueError: Two names have the same label.
     """
     labels: dict[str, str] = {}
     for text in texts:

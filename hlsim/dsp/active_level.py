@@ -30,11 +30,11 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     Source: ITU-T P.56, method B.
 
     Args:
-        waveform: samples of one channel. Shape: (time,).
-        sample_rate: sample rate in Hz.
+        waveform: Samples of one channel. Shape: (time,).
+        sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: the waveform is silent, empty or not one-dimensional.
+        ValueError: The waveform is silent, empty or not one-dimensional.
 
     >>> speech = np.sin(np.arange(16000.0))
     >>> with_pause = np.concatenate((speech, np.zeros(64000)))
@@ -84,7 +84,7 @@ def _count_active_samples(
     Shape: (time,), (thresholds,) -> (thresholds,).
 
     Args:
-        hangover: length of the hangover in samples.
+        hangover: Length of the hangover in samples.
     """
     width = max(1, hangover)
     recent_maximum = maximum_filter1d(envelope, width, mode="constant", origin=(width - 1) // 2)

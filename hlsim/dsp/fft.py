@@ -26,7 +26,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
     Shape: (..., time) -> complex (..., points // 2 + 1).
 
     Args:
-        points: length of the transform, by default that of the signals.
+        points: Length of the transform, by default that of the signals.
 
     >>> rfft(torch.tensor([1.0, 0.0, -1.0, 0.0]))
     tensor([0.+0.j, 2.+0.j, 0.+0.j])
@@ -71,8 +71,8 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
     The length has no prime factors above 7, apart from those of ``multiple``.
 
     Args:
-        minimum: smallest length allowed.
-        multiple: number of which the length is a multiple.
+        minimum: Smallest length allowed.
+        multiple: Number of which the length is a multiple.
 
     >>> fft_length(1001)
     1008
@@ -128,11 +128,11 @@ def fade_out_weights(bins: int, spacing: float, end: float) -> NDArray[np.float6
     seconds, and the length of the transform would decide how much of the ringing wraps around.
 
     Args:
-        bins: number of frequencies of the spectrum.
-        spacing: distance between two frequencies in Hz.
-        end: frequency in Hz at which the weights reach 0.
+        bins: Number of frequencies of the spectrum.
+        spacing: Distance between two frequencies in Hz.
+        end: Frequency in Hz at which the weights reach 0.
 
-    Returns: weights of shape (bins,).
+    Returns: Weights of shape (bins,).
 
     >>> print(fade_out_weights(5, spacing=40.0, end=160.0).round(2))
     [1.  1.  1.  0.5 0. ]

@@ -34,12 +34,12 @@ def frequency_sampling_fir(
     they are close. MSBG and pyclarity's NAL-R follow ``fir2``.
 
     Args:
-        taps: number of coefficients, odd and at most 1023. The delay is (taps - 1) / 2 samples.
-        frequencies: ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
-        gains: linear gain at each frequency.
-        window: window of the coefficients. Shape: (taps,).
+        taps: Number of coefficients, odd and at most 1023. The delay is (taps - 1) / 2 samples.
+        frequencies: Ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
+        gains: Linear gain at each frequency.
+        window: Window of the coefficients. Shape: (taps,).
 
-    Returns: coefficients of shape (taps,).
+    Returns: Coefficients of shape (taps,).
 
     >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), np.ones(3))
     >>> print(abs(flat).round(6))
@@ -66,7 +66,7 @@ def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
     Shape: (..., time), (..., 2 half) -> (..., time).
 
     Args:
-        taps: impulse responses, from ``half`` samples before time 0 to ``half - 1`` after it.
+        taps: Impulse responses, from ``half`` samples before time 0 to ``half - 1`` after it.
 
     >>> filter_without_delay(torch.ones(3), torch.tensor([0.0, 0.0, 1.0, 0.0])).round(decimals=3)
     tensor([1., 1., 1.])
@@ -87,8 +87,8 @@ def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
     Shape: (..., time), (2049,) -> (..., length).
 
     Args:
-        response: transform by ``rfft`` of ``BLOCK_POINTS`` points of at most 1025 taps.
-        length: number of samples to return.
+        response: Transform by ``rfft`` of ``BLOCK_POINTS`` points of at most 1025 taps.
+        length: Number of samples to return.
 
     >>> delay_by_one = torch.fft.rfft(torch.tensor([0.0, 1.0]), BLOCK_POINTS)
     >>> filter_in_blocks(torch.tensor([1.0, 2.0]), delay_by_one, 3).round(decimals=3).abs()

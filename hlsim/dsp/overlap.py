@@ -13,10 +13,10 @@ class Block(NamedTuple):
     the processing needs.
 
     Attributes:
-        input_start: first sample of the input.
-        output_start: first sample of the output that is used.
-        output_stop: sample after the last one of the output that is used.
-        input_stop: sample after the last one of the input.
+        input_start: First sample of the input.
+        output_start: First sample of the output that is used.
+        output_stop: Sample after the last one of the output that is used.
+        input_stop: Sample after the last one of the input.
 
     >>> import torch
     >>> block = Block(input_start=2, output_start=4, output_stop=6, input_stop=8)
@@ -61,11 +61,11 @@ def split_into_blocks(
     last block covers half a hop to one and a half hops.
 
     Args:
-        samples: length of the signal.
-        hop: samples from the start of one used output to the start of the next.
-        lead: samples of context that a block needs before its used output.
-        lag: samples of context that a block needs after its used output.
-        unit: number of samples of which inputs and used outputs start at multiples. The hop is
+        samples: Length of the signal.
+        hop: Samples from the start of one used output to the start of the next.
+        lead: Samples of context that a block needs before its used output.
+        lag: Samples of context that a block needs after its used output.
+        unit: Number of samples of which inputs and used outputs start at multiples. The hop is
             rounded down to a multiple of it, lead and lag are rounded up.
 
     >>> split_into_blocks(100, hop=50, lead=10, lag=5)[1]

@@ -62,12 +62,12 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 
     Args:
         waveform: floating-point samples.
-        source_rate: sample rate of ``waveform`` in Hz.
-        target_rate: sample rate of the result in Hz.
+        source_rate: Sample rate of ``waveform`` in Hz.
+        target_rate: Sample rate of the result in Hz.
 
     Raises:
-        TypeError: the samples are integers or complex.
-        ValueError: a rate is not a whole number from 1 to 1000000 Hz, or the common factor of the
+        TypeError: The samples are integers or complex.
+        ValueError: A rate is not a whole number from 1 to 1000000 Hz, or the common factor of the
             rates is so small that the kernel would take gigabytes, as for 44101 and 16000 Hz.
 
     >>> resample(torch.randn(2, 44100), 44100, 16000).shape
@@ -104,12 +104,12 @@ def sinc_kernel(source: int, target: int, dtype: torch.dtype, device: torch.devi
     """Compute one filter for each of the ``target`` samples that a block of input gives.
 
     Args:
-        source: source rate divided by the common factor of both rates.
-        target: target rate divided by the common factor of both rates.
-        dtype: type of the result. The kernel is computed in float32 at least.
-        device: device of the result.
+        source: Source rate divided by the common factor of both rates.
+        target: Target rate divided by the common factor of both rates.
+        dtype: Type of the result. The kernel is computed in float32 at least.
+        device: Device of the result.
 
-    Returns: filters of shape (target, 1, 2 * reach + source), for a convolution with a stride of
+    Returns: Filters of shape (target, 1, 2 * reach + source), for a convolution with a stride of
         ``source``.
 
     >>> sinc_kernel(3, 1, torch.float32, torch.device("cpu")).shape

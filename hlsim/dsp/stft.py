@@ -19,14 +19,14 @@ class STFT:
     Samples before the beginning and after the end of a signal count as zeros.
 
     Args:
-        fft: length of the Fourier transform in samples, an even number.
-        window: length of the Hann window in samples, at most ``fft``.
-        hop: samples from one frame to the next, at most half of ``window``. Where spectra are
+        fft: Length of the Fourier transform in samples, an even number.
+        window: Length of the Hann window in samples, at most ``fft``.
+        hop: Samples from one frame to the next, at most half of ``window``. Where spectra are
             modified before synthesis, take a quarter of it: with longer hops, the last samples may
             be divided by a number close to zero.
 
     Raises:
-        ValueError: the lengths do not fit together.
+        ValueError: The lengths do not fit together.
 
     >>> stft = STFT(fft=400, window=400, hop=100)
     >>> waveform = torch.randn(1, 1600)

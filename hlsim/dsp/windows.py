@@ -23,8 +23,8 @@ def kaiser(taps: int, beta: float) -> NDArray[np.float64]:
     """Compute a symmetric Kaiser window of shape (taps,).
 
     Args:
-        taps: number of values, at least 2.
-        beta: shape parameter, larger for a wider main lobe and lower side lobes.
+        taps: Number of values, at least 2.
+        beta: Shape parameter, larger for a wider main lobe and lower side lobes.
 
     >>> print(kaiser(3, beta=8.0).round(4))
     [0.0023 1.     0.0023]

@@ -64,13 +64,13 @@ def measure_aids(
     """Measure a property of each aid for each ear.
 
     Args:
-        aids: aids by name.
-        ears: ears by name.
-        measure: one of the functions below, ``(aid, ear, *arguments) -> results``.
-        arguments: further arguments of the measure.
+        aids: Aids by name.
+        ears: Ears by name.
+        measure: One of the functions below, ``(aid, ear, *arguments) -> results``.
+        arguments: Further arguments of the measure.
 
     Raises:
-        ValueError: an aid fails; the message names aid and ear.
+        ValueError: An aid fails; the message names aid and ear.
 
     >>> aids = {"unaided": lambda signal, ear: signal}
     >>> measure_aids(aids, {"N3": Audiogram.standard("N3")}, lambda aid, ear: {"cost": 0})
@@ -94,15 +94,15 @@ def insertion_gain(
     The signal is speech with its pauses, because an aid may treat a steady noise as noise.
 
     Args:
-        aid: the aid.
-        ear: the ear.
-        speech: utterances at 16 kHz.
-        levels: levels of each utterance in dB SPL.
+        aid: The aid.
+        ear: The ear.
+        speech: Utterances at 16 kHz.
+        levels: Levels of each utterance in dB SPL.
 
     Shape: (utterances, time) -> (levels, 24).
 
     Raises:
-        ValueError: the aid fails, see ``outputs``.
+        ValueError: The aid fails, see ``outputs``.
 
     >>> gains = insertion_gain(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
     >>> round(gains[0][0])
@@ -133,16 +133,16 @@ def gain_curves(aids: Aids, ears: Ears, utterances: Tensor, levels: Sequence[flo
     """Measure the insertion gain ``gain_db`` of each aid for each ear.
 
     Args:
-        aids: aids by name.
-        ears: ears by name.
-        utterances: speech at 16 kHz. Shape: (utterances, time).
-        levels: levels in dB SPL.
+        aids: Aids by name.
+        ears: Ears by name.
+        utterances: Speech at 16 kHz. Shape: (utterances, time).
+        levels: Levels in dB SPL.
 
     Returns:
         Gains of shape (levels, 24), with ``levels`` and ``frequencies``.
 
     Raises:
-        ValueError: an aid fails.
+        ValueError: An aid fails.
 
     >>> aids, ears = {"unaided": lambda x, _: x}, {"NH": NORMAL}
     >>> gain_curves(aids, ears, torch.randn(1, 16000), [65.0])[0]["gain_db"][0][:2]
@@ -174,8 +174,8 @@ def sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     """Compute the power at more than 20 Hz from a tone, relative to the power near it, in dB.
 
     Args:
-        waveform: tones, of which the middle second counts. Shape: (items, 32000).
-        hertz: frequency of each tone. Shape: (items,).
+        waveform: Tones, of which the middle second counts. Shape: (items, 32000).
+        hertz: Frequency of each tone. Shape: (items,).
 
     Returns:
         Ratios of -200 dB or more. Shape: (items,).
@@ -197,9 +197,9 @@ def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str,
     """Measure how loud an ear perceives tones after an aid, and which sidebands the aid adds.
 
     Args:
-        aid: the aid.
-        ear: the ear.
-        levels: levels of the tones in dB SPL.
+        aid: The aid.
+        ear: The ear.
+        levels: Levels of the tones in dB SPL.
 
     Returns:
         ``loudness_error_db``, the level of the output after the exact MSBG minus that of the tone
@@ -207,7 +207,7 @@ def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str,
         with ``levels`` and ``frequencies``.
 
     Raises:
-        ValueError: the aid fails.
+        ValueError: The aid fails.
 
     >>> steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
     0.0
@@ -225,8 +225,8 @@ def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
     """Measure whether an aid can be worn: its look-ahead, its gain in quiet rooms, and its cost.
 
     Args:
-        aid: the aid.
-        ear: the ear.
+        aid: The aid.
+        ear: The ear.
         speech: 3 s at 16 kHz. Shape: (time,).
 
     Returns:
@@ -234,7 +234,7 @@ def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
         ``QUIET_LEVELS``; and ``cpu_ms``, the processor time per second of sound on one thread.
 
     Raises:
-        ValueError: the aid fails.
+        ValueError: The aid fails.
 
     >>> wearing(lambda x, _: x, NORMAL, torch.randn(48000))["look_ahead_ms"]
     0.0
@@ -277,9 +277,9 @@ def look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
     Differences of more than 1e-4 of the output's peak count.
 
     Args:
-        outputs: outputs for the signals of ``changed_signals``, in the same order: that for the
+        outputs: Outputs for the signals of ``changed_signals``, in the same order: that for the
             unchanged signal, and one for each position. Shape: (..., time) each.
-        positions: samples from which on the input becomes another sound.
+        positions: Samples from which on the input becomes another sound.
 
     Returns:
         The largest number at any position, at least 0.
@@ -303,7 +303,7 @@ def outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
     Shape: signals of (time,) -> (signals, time).
 
     Raises:
-        ValueError: the aid fails, or its output is not a finite tensor of the input's shape.
+        ValueError: The aid fails, or its output is not a finite tensor of the input's shape.
 
     >>> outputs(lambda signal, ear: signal, torch.ones(2, 10), Audiogram.standard("N3")).shape
     torch.Size([2, 10])

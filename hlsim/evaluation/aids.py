@@ -70,9 +70,9 @@ class EqualiserLike(nn.Module):
     Everything that an aid achieves beyond it is not due to gain.
 
     Args:
-        aid: the aid.
-        utterances: speech on which the gain is measured. Shape: (utterances, time) at 16 kHz.
-        levels: levels of the speech in dB SPL, over which the gain in dB is averaged.
+        aid: The aid.
+        utterances: Speech on which the gain is measured. Shape: (utterances, time) at 16 kHz.
+        levels: Levels of the speech in dB SPL, over which the gain in dB is averaged.
 
     >>> equaliser = EqualiserLike(Unaided(), torch.randn(1, 16000), (65.0,))
     >>> max(equaliser.gains_db(Audiogram.standard("N3")))
@@ -105,8 +105,8 @@ def equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
     """Filter a waveform at 16 kHz with one gain per band, with linear phase and without delay.
 
     Args:
-        waveform: signal with shape (..., time).
-        gains_db: gains in dB at the frequencies of ``band_centres``.
+        waveform: Signal with shape (..., time).
+        gains_db: Gains in dB at the frequencies of ``band_centres``.
 
     >>> equalise_bands(torch.ones(1000), [6.0] * 24).shape
     torch.Size([1000])
@@ -135,8 +135,8 @@ class PluginAid(nn.Module):
         """Call the user's function.
 
         Args:
-            waveform: signals at the left and the right ear in pascals. Shape: (2, time).
-            listener: audiograms of both ears, an ``hlsim.Listener``.
+            waveform: Signals at the left and the right ear in pascals. Shape: (2, time).
+            listener: Audiograms of both ears, an ``hlsim.Listener``.
 
         Returns:
             Outputs for both ears. Shape: (2, time).
@@ -151,10 +151,10 @@ class Enhanced(nn.Module):
     """Aid after an enhancer that reduces noise.
 
     Args:
-        enhancer: the enhancer, for signals in pascals.
-        aid: the aid.
-        sample_rate: rate in Hz.
-        full_scale_spl: level in dB SPL of RMS 1.0 at the input of the aid.
+        enhancer: The enhancer, for signals in pascals.
+        aid: The aid.
+        sample_rate: Rate in Hz.
+        full_scale_spl: Level in dB SPL of RMS 1.0 at the input of the aid.
 
     >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
@@ -190,7 +190,7 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
         The enhancers by the part of their names after the colon.
 
     Raises:
-        ValueError: an enhancer cannot be loaded, its output for speech is not a waveform or not
+        ValueError: An enhancer cannot be loaded, its output for speech is not a waveform or not
             time-aligned, or two have the same name after the colon.
 
     >>> load_enhancers([])

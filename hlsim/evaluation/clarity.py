@@ -65,9 +65,9 @@ class Scene(NamedTuple):
     """Files of a scene.
 
     Attributes:
-        mix: front microphones.
-        reference: target without its room.
-        in_room: target in the room, whose level the reference gets; None if it has its level.
+        mix: Front microphones.
+        reference: Target without its room.
+        in_room: Target in the room, whose level the reference gets; None if it has its level.
 
     >>> Scene(Path("S1_mix_CH1.wav"), Path("S1_reference.wav"), None).mix.name
     'S1_mix_CH1.wav'
@@ -101,23 +101,23 @@ def evaluate_scenes(
     with NAL-R by HASPI is planned.
 
     Args:
-        aids: name or folder of a compensator by its label, or ``package.module:name`` of a function
+        aids: Name or folder of a compensator by its label, or ``package.module:name`` of a function
             ``(waveform, listener, sample_rate) -> waveform`` for (2, time) at the files' scale.
-        scenes: folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``) with two channels, and
+        scenes: Folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``) with two channels, and
             ``SCENE_target_anechoic_CH1.wav`` (or ``_target_anechoic``, ``_reference``) with one or
             two. If there is a ``SCENE_target_CH1.wav``, each channel of the reference gets its
             level.
         listeners: Clarity's ``listeners.json``, or a CSV file, see ``read_listeners``. Only
             listeners that are used are validated.
-        out: folder for the results.
+        out: Folder for the results.
         scenes_listeners: JSON file with the names of the listeners of each scene; by default all
             scenes and listeners are combined.
-        stride: n for every n-th pair of scene and listener. 15 gives the challenges' small test.
+        stride: N for every n-th pair of scene and listener. 15 gives the challenges' small test.
         enhancers: ``package.module:name`` of functions that reduce noise before each aid.
-        measures: measures in addition to HASPI and HASQI.
-        linked: whether one level sets the gains of both ears, in compensators that support it.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        seed: seed of the noise that HASPI and HASQI add.
+        measures: Measures in addition to HASPI and HASQI.
+        linked: Whether one level sets the gains of both ears, in compensators that support it.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        seed: Seed of the noise that HASPI and HASQI add.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns:
@@ -125,9 +125,9 @@ def evaluate_scenes(
         condition, and None for an aid that fails on the first pair.
 
     Raises:
-        ValueError: a file is missing, broken or contradicts another, a listener lacks an ear, or
+        ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, or
             nothing could be scored.
-        MissingExtraError: a package is not installed.
+        MissingExtraError: A package is not installed.
     """
     names = ["haspi", "hasqi", *measures]
     find_measures(names)
@@ -178,7 +178,7 @@ def read_scenes(folder: str | Path) -> dict[str, Scene]:
     """Return the scenes of a folder by name.
 
     Raises:
-        ValueError: there is no scene, or a scene lacks its reference.
+        ValueError: There is no scene, or a scene lacks its reference.
     """
     folder, scenes = Path(folder), {}
     if not folder.is_dir():
@@ -203,10 +203,10 @@ class ListenerInScene(NamedTuple):
     """One scene for one listener.
 
     Attributes:
-        scene: name of the scene.
-        name: name of the listener.
-        files: files of the scene.
-        listener: the listener.
+        scene: Name of the scene.
+        name: Name of the listener.
+        files: Files of the scene.
+        listener: The listener.
     """
 
     scene: str
@@ -228,14 +228,14 @@ def read_pairs(
     """Return pairs of scene and listener.
 
     Args:
-        scenes: scenes by name.
+        scenes: Scenes by name.
         listeners: Clarity's ``listeners.json``, or a CSV file.
         scenes_listeners: Clarity's ``scenes_listeners.json``; by default all scenes and listeners
             are combined.
-        stride: n for every n-th pair.
+        stride: N for every n-th pair.
 
     Raises:
-        ValueError: a file is broken or names an unknown scene or listener, or a listener who is
+        ValueError: A file is broken or names an unknown scene or listener, or a listener who is
             used lacks an ear.
     """
     if scenes_listeners is None:
@@ -301,7 +301,7 @@ def _signal_folders(conditions: Sequence[Condition], root: Path) -> dict[str, Pa
     """Return the folder of each condition's signals.
 
     Raises:
-        ValueError: two conditions would have the same folder.
+        ValueError: Two conditions would have the same folder.
     """
     names = {c.name: re.sub(r"[^\w.+-]+", "-", c.name).strip(".-") for c in conditions}
     if len({*names.values(), ""}) <= len(names):
@@ -402,7 +402,7 @@ def _read_scene(scene: Scene, rate: int) -> tuple[Tensor, Tensor]:
     Shape: -> (2, time) twice.
 
     Raises:
-        ValueError: a file is broken, or has another rate or length.
+        ValueError: A file is broken, or has another rate or length.
     """
     mix = _read_channels(scene.mix, rate)
     if len(mix) != 2:

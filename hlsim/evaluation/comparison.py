@@ -32,20 +32,20 @@ class Comparison:
     """Comparison of two conditions by one measure, for the items that have both scores.
 
     Attributes:
-        measure: column of the score.
-        before, after: names of the conditions.
-        overall: comparison over all items, with p values that are not adjusted.
-        level_before_mean, level_after_mean: mean output levels of the same items in dB SPL; NaN if
+        measure: Column of the score.
+        before, after: Names of the conditions.
+        overall: Comparison over all items, with p values that are not adjusted.
+        level_before_mean, level_after_mean: Mean output levels of the same items in dB SPL; NaN if
             they are not known.
-        by_severity: comparison for each degree of loss that occurs.
-        unit: column within which the items are nested, such as ``"listener"``.
-        unit_means: comparison of the means of each unit; None unless there are two units or more.
-        left_out: number of items that lack one of the two scores.
-        p_t, p_w: p values of the t-test and of Wilcoxon's test to be stated.
-        planned: whether the comparison was planned before the scores were known. Its p values are
+        by_severity: Comparison for each degree of loss that occurs.
+        unit: Column within which the items are nested, such as ``"listener"``.
+        unit_means: Comparison of the means of each unit; None unless there are two units or more.
+        left_out: Number of items that lack one of the two scores.
+        p_t, p_w: P values of the t-test and of Wilcoxon's test to be stated.
+        planned: Whether the comparison was planned before the scores were known. Its p values are
             not adjusted; those of all other comparisons are adjusted by Holm over the family of the
             measure.
-        family: number of comparisons for which the p values are adjusted.
+        family: Number of comparisons for which the p values are adjusted.
 
     >>> import pandas
     >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
@@ -94,8 +94,8 @@ class Comparison:
         A higher score is called better only at equal level, because HASPI rewards gain.
 
         Args:
-            subject: name of the second condition at the start of a sentence, by default its own.
-            rival: name of the first condition within a sentence, by default its own.
+            subject: Name of the second condition at the start of a sentence, by default its own.
+            rival: Name of the first condition within a sentence, by default its own.
         """
         c = self.overall
         rises = c.delta > 0
@@ -193,13 +193,13 @@ def compare(
     """Compare each condition of a study with every earlier one.
 
     Args:
-        table: table that ``run_study`` returns.
-        measures: columns of scores.
-        baseline: condition with which all other conditions are compared, instead of every earlier
+        table: Table that ``run_study`` returns.
+        measures: Columns of scores.
+        baseline: Condition with which all other conditions are compared, instead of every earlier
             one.
-        planned: comparisons that were planned before the scores were known. The p values of all
+        planned: Comparisons that were planned before the scores were known. The p values of all
             other comparisons by the same measure are adjusted by Holm.
-        unit: column of the unit within which items are nested.
+        unit: Column of the unit within which items are nested.
 
     Returns:
         The comparisons of each measure, for the pairs of conditions with both scores of an item.

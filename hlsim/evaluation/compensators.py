@@ -77,23 +77,23 @@ def evaluate_compensators(
     counts only if every condition has all its values.
 
     Args:
-        compensators: modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
+        compensators: Modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
             waveform and an ear. If a module has the attribute ``limit_spl`` or
             ``config.limit_spl``, its peaks are compared with that limit.
-        speech, noise: folders of recordings. With ``noise``, every second item is noisy, at 2.5 to
+        speech, noise: Folders of recordings. With ``noise``, every second item is noisy, at 2.5 to
             17.5 dB.
-        store: file of values, which is created if it does not exist; None stores nothing.
+        store: File of values, which is created if it does not exist; None stores nothing.
         audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3.
-        audiogram: single ear for everything, for a compensator that was trained for it.
-        enhancers: names ``package.module:name`` of functions ``(waveform, sample_rate) ->
+        audiogram: Single ear for everything, for a compensator that was trained for it.
+        enhancers: Names ``package.module:name`` of functions ``(waveform, sample_rate) ->
             waveform`` that reduce noise before each aid, in conditions such as ``gtcrn + NAL-R``.
         simulator: Neuro-MSBG of the surrogate gap, by name or folder.
-        measures: measures in addition to HASPI and HASQI.
-        items: number of items. 400 items give each main row 200 pairs.
-        seconds: length of an item. HASPI is not reliable much below 3.
-        levels: levels of the clean speech in dB SPL, in turn.
-        gain_ears: standard ears of the gain curves and the steady tones.
-        seed: seed of all random draws.
+        measures: Measures in addition to HASPI and HASQI.
+        items: Number of items. 400 items give each main row 200 pairs.
+        seconds: Length of an item. HASPI is not reliable much below 3.
+        levels: Levels of the clean speech in dB SPL, in turn.
+        gain_ears: Standard ears of the gain curves and the steady tones.
+        seed: Seed of all random draws.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns:
@@ -101,8 +101,8 @@ def evaluate_compensators(
         details ``gain_curves``, ``steady_tones`` and ``wearing``.
 
     Raises:
-        ValueError: data or settings are not valid, or no item has all its values.
-        MissingExtraError: a package is not installed.
+        ValueError: Data or settings are not valid, or no item has all its values.
+        MissingExtraError: A package is not installed.
     """
     require("pandas", "eval")
     _check_arguments(compensators, items, levels)

@@ -115,7 +115,7 @@ def _describe_object(value: Any) -> Any:
     """Convert an object that JSON cannot represent.
 
     Raises:
-        TypeError: the object cannot be described.
+        TypeError: The object cannot be described.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()

@@ -56,12 +56,12 @@ def draw_items(
     ear once.
 
     Args:
-        speech, noise: folders of recordings.
+        speech, noise: Folders of recordings.
         audiograms: CSV file of ears, or ``"standard"``.
-        items: number of items.
-        seconds: length of an item.
-        seed: seed of all random draws.
-        levels: levels of the signal in dB SPL, in turn.
+        items: Number of items.
+        seconds: Length of an item.
+        seed: Seed of all random draws.
+        levels: Levels of the signal in dB SPL, in turn.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> settings = {"items": 2, "seconds": 1.0, "seed": 0}
@@ -103,12 +103,12 @@ def draw_judged_items(
     every combination of level and ratio.
 
     Args:
-        speech, noise: folders of recordings.
-        ears: ears with their names.
-        items: number of items.
-        seconds: length of an item.
-        seed: seed of all random draws.
-        levels: levels of the clean speech in dB SPL, in turn.
+        speech, noise: Folders of recordings.
+        ears: Ears with their names.
+        items: Number of items.
+        seconds: Length of an item.
+        seed: Seed of all random draws.
+        levels: Levels of the clean speech in dB SPL, in turn.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> settings = {"items": 1, "seconds": 1.0, "seed": 0}
@@ -156,12 +156,12 @@ def treat(
     """Return each item under each treatment in turn, named in its fact ``treatment``.
 
     Args:
-        items: items.
-        treatments: names in ``TREATMENTS``.
-        compensator: the compensator of the treatment ``compensated``.
+        items: Items.
+        treatments: Names in ``TREATMENTS``.
+        compensator: The compensator of the treatment ``compensated``.
 
     Raises:
-        ValueError: a treatment is unknown, or ``compensated`` lacks a compensator.
+        ValueError: A treatment is unknown, or ``compensated`` lacks a compensator.
 
     >>> clean = torch.ones(1600)
     >>> item = Item("item 1", clean, clean, Audiogram.standard("N3"))

@@ -96,11 +96,11 @@ def find_measures(names: Iterable[str]) -> list[Measure]:
     """Return measures by name, without duplicates.
 
     Args:
-        names: names in ``MEASURES``, or ``package.module:name``.
+        names: Names in ``MEASURES``, or ``package.module:name``.
 
     Raises:
-        ValueError: there is no such measure, or no name at all.
-        MissingExtraError: the package of a measure is not installed.
+        ValueError: There is no such measure, or no name at all.
+        MissingExtraError: The package of a measure is not installed.
 
     >>> [measure.title for measure in find_measures(["haspi", "hasqi", "haspi"])]
     ['HASPI', 'HASQI']
@@ -146,7 +146,7 @@ def load_measure(name: str) -> Measure:
     """Load the measure ``package.module:name``.
 
     Raises:
-        ValueError: it cannot be loaded.
+        ValueError: It cannot be loaded.
 
     >>> load_measure("builtins:max").name
     'builtins:max'
@@ -265,7 +265,7 @@ def band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> flo
     Shape: (time,) and (time,), in pascals.
 
     Raises:
-        ValueError: nothing is audible.
+        ValueError: Nothing is audible.
 
     >>> noise = torch.randn(16000, generator=torch.Generator().manual_seed(0))
     >>> round(band_error_db(0.1 * noise, noise, 16000))

@@ -62,16 +62,16 @@ def run_parallel(
     were running are repeated one by one. The task that ends its process again yields None.
 
     Args:
-        function: function of a task, which can be pickled. An exception that it raises ends the
+        function: Function of a task, which can be pickled. An exception that it raises ends the
             run.
-        tasks: arguments of the function.
-        jobs: number of processes; all cores by default. With 1, tasks run in this process.
-        dask: address of a Dask scheduler, whose workers replace the processes. They import hlsim
+        tasks: Arguments of the function.
+        jobs: Number of processes; all cores by default. With 1, tasks run in this process.
+        dask: Address of a Dask scheduler, whose workers replace the processes. They import hlsim
             and see the same files.
 
     Raises:
         ValueError: ``jobs`` is less than 1, or no scheduler answers.
-        MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not
+        MissingExtraError: Joblib (extra ``eval``) or distributed (extra ``cluster``) is not
             installed.
 
     >>> list(run_parallel(abs, [-1, 2], jobs=1))

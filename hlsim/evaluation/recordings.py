@@ -61,18 +61,18 @@ class Recording:
     """One utterance for one ear, in files.
 
     Args:
-        utterance: name of the utterance, the same for both ears of a listener.
-        clean: file of clean speech.
-        outputs: file of the output for each condition.
-        audiogram: the ear.
-        listener: name of the listener; empty if unknown.
+        utterance: Name of the utterance, the same for both ears of a listener.
+        clean: File of clean speech.
+        outputs: File of the output for each condition.
+        audiogram: The ear.
+        listener: Name of the listener; empty if unknown.
         ear: ``"left"``, ``"right"`` or empty. It selects the channel of a file with two channels.
         snr: signal-to-noise ratio in dB; NaN if unknown.
-        full_scale_spl: level in dB SPL of a file with RMS 1.0.
-        spl: level of the clean file in dB SPL, instead of ``full_scale_spl``.
-        seed: seed of the study. Each clean file has its own seed, which depends on this one and on
+        full_scale_spl: Level in dB SPL of a file with RMS 1.0.
+        spl: Level of the clean file in dB SPL, instead of ``full_scale_spl``.
+        seed: Seed of the study. Each clean file has its own seed, which depends on this one and on
             its contents.
-        problems: reason why there is no file, for conditions without one.
+        problems: Reason why there is no file, for conditions without one.
 
     >>> ear = Audiogram.standard("N3")
     >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
@@ -159,14 +159,14 @@ def read_channel(path: Path, ear: str = "") -> tuple[Tensor, int]:
     """Read the channel of one ear at the scale of the file.
 
     Args:
-        path: audio file.
+        path: Audio file.
         ear: ``"left"`` for the first and ``"right"`` for the second of two channels.
 
     Returns:
         Samples with shape (time,) in float64, and the rate in Hz.
 
     Raises:
-        ValueError: the file cannot be read, or its channels do not fit the ear.
+        ValueError: The file cannot be read, or its channels do not fit the ear.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> read_channel(EXAMPLE_FILE)[1]
@@ -205,29 +205,29 @@ def haspi_report(
     An interrupted run can be continued. A file that cannot be scored is listed with the reason.
 
     Args:
-        clean, before, after: folders, see ``read_folders``. Without ``before``, there is one
+        clean, before, after: Folders, see ``read_folders``. Without ``before``, there is one
             condition, and scores without a comparison.
-        audiogram, audiograms: the ear of all files, or a CSV file of ears.
-        manifest, root: a CSV file instead of the folders, see ``read_manifest``.
-        measures: names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
+        audiogram, audiograms: The ear of all files, or a CSV file of ears.
+        manifest, root: A CSV file instead of the folders, see ``read_manifest``.
+        measures: Names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
             ``stoi``, ``pesq`` or ``package.module:name``.
-        baseline: condition with which all other conditions are compared. By default, all
+        baseline: Condition with which all other conditions are compared. By default, all
             conditions are compared with each other.
-        better_ear: whether to use the better ear's score of each utterance, for which a manifest
+        better_ear: Whether to use the better ear's score of each utterance, for which a manifest
             with both ears is needed.
-        store: file of scores, which is created if it does not exist; None stores nothing.
-        full_scale_spl: level in dB SPL of a file with RMS 1.0.
-        spl: level of every clean file in dB SPL, instead of ``full_scale_spl``.
-        seed: seed of the noise that HASPI, HASQI and HAAQI add.
+        store: File of scores, which is created if it does not exist; None stores nothing.
+        full_scale_spl: Level in dB SPL of a file with RMS 1.0.
+        spl: Level of every clean file in dB SPL, instead of ``full_scale_spl``.
+        seed: Seed of the noise that HASPI, HASQI and HAAQI add.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns:
         The evaluation. The comparison of the first with the last condition is planned.
 
     Raises:
-        ValueError: files do not match, a row of the manifest is not valid, or nothing could be
+        ValueError: Files do not match, a row of the manifest is not valid, or nothing could be
             scored.
-        MissingExtraError: the package of a measure is not installed.
+        MissingExtraError: The package of a measure is not installed.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
@@ -272,10 +272,10 @@ def score_recordings(
     """Score recordings and compare their conditions.
 
     Args:
-        recordings: recordings.
-        conditions: conditions of the recordings' outputs.
-        measures, baseline, better_ear: see ``haspi_report``.
-        planned: planned comparisons; by default that of the first with the last condition by the
+        recordings: Recordings.
+        conditions: Conditions of the recordings' outputs.
+        measures, baseline, better_ear: See ``haspi_report``.
+        planned: Planned comparisons; by default that of the first with the last condition by the
             first measure.
         running: ``store`` as in ``haspi_report``; ``jobs``, ``dask`` and ``progress`` as in
             ``run_study``.
@@ -284,7 +284,7 @@ def score_recordings(
         The evaluation; with ``better_ear``, its group ``ears`` has the scores of each ear.
 
     Raises:
-        ValueError: nothing could be scored, or an utterance lacks one of both ears.
+        ValueError: Nothing could be scored, or an utterance lacks one of both ears.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> outputs = {"unaided": EXAMPLE_FILE}
@@ -330,8 +330,8 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     number is in the column ``source``.
 
     Args:
-        table: table of a study with two ears for each utterance.
-        measures: columns of scores.
+        table: Table of a study with two ears for each utterance.
+        measures: Columns of scores.
 
     >>> import pandas
     >>> facts = {"listener": "L1", "utterance": "s01", "snr": 5.0, "condition": "unaided"}
@@ -368,16 +368,16 @@ def read_folders(
     """Read the recordings of folders, one for each name of a file.
 
     Args:
-        clean: folder of clean speech.
-        folders: folder of the outputs of each condition, or None to leave it out. The files of all
+        clean: Folder of clean speech.
+        folders: Folder of the outputs of each condition, or None to leave it out. The files of all
             folders have the same names, whatever their extension.
-        audiogram: the ear of all files.
+        audiogram: The ear of all files.
         audiograms: CSV file of ears instead, with the columns ``file`` (name below the folder, with
             or without extension) and ``hl_250``, ``hl_500``, .... Rows of other files are ignored.
         settings: ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: the names differ, or a file has no audiogram.
+        ValueError: The names differ, or a file has no audiogram.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
@@ -416,15 +416,15 @@ def read_manifest(
 
     Args:
         path: CSV file.
-        root: folder to which the paths are relative and which contains them; by default that of
+        root: Folder to which the paths are relative and which contains them; by default that of
             the manifest.
-        audiogram: the ear of rows without an audiogram.
+        audiogram: The ear of rows without an audiogram.
         audiograms: CSV file with the columns ``listener``, ``ear`` (if left and right differ) and
             ``hl_250``, ....
         settings: ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: a row is not valid; the message names its line.
+        ValueError: A row is not valid; the message names its line.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -459,12 +459,12 @@ def _read_recordings(
     """Return the recordings of rows with their places.
 
     Args:
-        rows: rows of a manifest, one for each output.
-        column: column that names the ear in ``audiograms``.
-        root: folder that contains all files.
-        audiogram: the ear of rows without an audiogram.
+        rows: Rows of a manifest, one for each output.
+        column: Column that names the ear in ``audiograms``.
+        root: Folder that contains all files.
+        audiogram: The ear of rows without an audiogram.
         audiograms: CSV file of ears.
-        settings: further arguments of the recordings.
+        settings: Further arguments of the recordings.
     """
     ears = {} if audiograms is None else _read_ears(audiograms, column)
     recordings: dict[tuple[str, Path], Recording] = {}
@@ -525,7 +525,7 @@ def _path_below(root: Path, name: str) -> Path:
     """Return a path below the root, with links followed.
 
     Raises:
-        ValueError: the path leads out of the root.
+        ValueError: The path leads out of the root.
     """
     path = resolve_links(root / name)
     if not name or not path.is_relative_to(root):
@@ -544,8 +544,8 @@ def _read_ears(path: str | Path, column: str) -> dict[tuple[str, str], tuple[str
     """Read the rows of a CSV file of ears, whose audiograms are validated when they are used.
 
     Args:
-        path: the file.
-        column: column with the name of the ear, ``"listener"`` or ``"file"``.
+        path: The file.
+        column: Column with the name of the ear, ``"listener"`` or ``"file"``.
 
     Returns:
         The place and the values of the row for each name and ear.

@@ -22,13 +22,13 @@ class Evaluation:
     """A finished study.
 
     Attributes:
-        items, conditions, measures: the three inputs of ``run_study``.
-        table: one row per item and condition, see ``run_study``.
-        comparisons: comparisons of the conditions, see ``compare``.
-        settings: settings on which the values depend, such as the seed.
-        notes: sentences with which the report begins.
-        details: further results for JSON, such as gain curves.
-        groups: the same evaluation for a part of the items, by the name of the part.
+        items, conditions, measures: The three inputs of ``run_study``.
+        table: One row per item and condition, see ``run_study``.
+        comparisons: Comparisons of the conditions, see ``compare``.
+        settings: Settings on which the values depend, such as the seed.
+        notes: Sentences with which the report begins.
+        details: Further results for JSON, such as gain curves.
+        groups: The same evaluation for a part of the items, by the name of the part.
 
     >>> import pandas
     >>> table = pandas.DataFrame({"item": [0], "condition": ["aid"], "haspi": [0.5]})
@@ -60,7 +60,7 @@ class Evaluation:
         """Run a study, see ``run_study``.
 
         Raises:
-            ValueError: no output could be scored.
+            ValueError: No output could be scored.
         """
         table = run_study(items, conditions, measures, store=ScoreStore(store), **running)
         evaluation = cls(items, conditions, measures, table, settings=settings)

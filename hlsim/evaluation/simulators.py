@@ -52,19 +52,19 @@ def evaluate_simulators(
     more simulator computes only its values.
 
     Args:
-        simulators: modules by name, at 16 kHz and 94 dB SPL full scale.
-        speech, noise: folders of recordings. With ``noise``, every second item is noisy.
+        simulators: Modules by name, at 16 kHz and 94 dB SPL full scale.
+        speech, noise: Folders of recordings. With ``noise``, every second item is noisy.
         audiograms: CSV file of ears, see ``draw_items``.
-        store: file of values, which is created if it does not exist; None stores nothing.
-        teacher: the simulator to compare with: ``"msbg"``, the exact one, or
+        store: File of values, which is created if it does not exist; None stores nothing.
+        teacher: The simulator to compare with: ``"msbg"``, the exact one, or
             ``package.module:name``.
-        measures: further measures, ``package.module:name``.
-        items: number of items; each is measured for each of ``inputs``.
-        seconds: length of an item; PESQ and STOI need 2 or more.
-        levels: levels in dB SPL that the items have in turn.
-        inputs: treatments of the signal before the simulator, see ``TREATMENTS``.
-        compensator: module of the treatment ``compensated``.
-        seed: seed of all random draws.
+        measures: Further measures, ``package.module:name``.
+        items: Number of items; each is measured for each of ``inputs``.
+        seconds: Length of an item; PESQ and STOI need 2 or more.
+        levels: Levels in dB SPL that the items have in turn.
+        inputs: Treatments of the signal before the simulator, see ``TREATMENTS``.
+        compensator: Module of the treatment ``compensated``.
+        seed: Seed of all random draws.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns:
@@ -73,8 +73,8 @@ def evaluate_simulators(
         compared with that of the first one in ``simulators``.
 
     Raises:
-        ValueError: data or settings are not valid, or no item has a value.
-        MissingExtraError: pandas or pystoi is not installed. Without pesq, that measure is left
+        ValueError: Data or settings are not valid, or no item has a value.
+        MissingExtraError: Pandas or pystoi is not installed. Without pesq, that measure is left
             out.
     """
     require("pandas", "eval")
@@ -115,8 +115,8 @@ def teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
     """Return the teacher's output for an item, which is computed once per item.
 
     Args:
-        teacher: the teacher; None is the exact MSBG.
-        item: the item.
+        teacher: The teacher; None is the exact MSBG.
+        item: The item.
 
     >>> from hlsim import Audiogram
     >>> clean = torch.ones(1600)
@@ -172,7 +172,7 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
     """Compute the agreement of simulator and teacher in a score.
 
     Args:
-        rows: rows of the table.
+        rows: Rows of the table.
         score: ``"stoi"`` or ``"pesq"``.
 
     Returns:

@@ -31,12 +31,12 @@ class PairedComparison:
     with equal differences t, p_t and d, without any difference w and p_w.
 
     Attributes:
-        n, zeros: number of pairs, and of pairs whose difference is zero. Wilcoxon's test leaves out
+        n, zeros: Number of pairs, and of pairs whose difference is zero. Wilcoxon's test leaves out
             the latter.
-        before_mean, after_mean: mean scores.
-        before_std, after_std: standard deviations with n - 1.
-        delta: mean difference.
-        t, p_t: paired t-test with n - 1 degrees of freedom, two-sided.
+        before_mean, after_mean: Mean scores.
+        before_std, after_std: Standard deviations with n - 1.
+        delta: Mean difference.
+        t, p_t: Paired t-test with n - 1 degrees of freedom, two-sided.
         w, p_w: Wilcoxon's signed-rank test, two-sided; w is the smaller rank sum. Differences that
             are equal up to rounding share a rank. The p value is exact for up to 50 differences (13
             if some share a rank), and a normal approximation with a correction for ties otherwise.
@@ -75,10 +75,10 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     values are too small.
 
     Args:
-        before, after: scores in the same order.
+        before, after: Scores in the same order.
 
     Raises:
-        ValueError: there are no pairs, the numbers differ, or a score is NaN or infinite.
+        ValueError: There are no pairs, the numbers differ, or a score is NaN or infinite.
 
     >>> round(paired_comparison([0.1, 0.2, 0.3], [0.2, 0.4, 0.3]).delta, 3)
     0.1
@@ -138,16 +138,16 @@ def bootstrap_interval(
     (plain percentiles: 86, 88, 90, 93), for exponential values in 88, 91, 92 and 94 %.
 
     Args:
-        values: six values or more.
-        confidence: probability that the interval contains the mean.
-        resamples: number of resamples.
-        seed: seed of the resamples.
+        values: Six values or more.
+        confidence: Probability that the interval contains the mean.
+        resamples: Number of resamples.
+        seed: Seed of the resamples.
 
     Returns:
         The lower and the upper limit.
 
     Raises:
-        ValueError: there are fewer than six values, for which no percentile is wide enough.
+        ValueError: There are fewer than six values, for which no percentile is wide enough.
 
     >>> low, high = bootstrap_interval([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     >>> low < 0.35 < high
@@ -189,7 +189,7 @@ def _as_scores(values: Iterable[float], name: str) -> np.ndarray:
     """Convert scores to an array.
 
     Raises:
-        ValueError: there is no score, or one is NaN or infinite.
+        ValueError: There is no score, or one is NaN or infinite.
     """
     scores = np.array([float(value) for value in values], dtype=np.float64)
     if not len(scores):

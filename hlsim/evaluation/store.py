@@ -21,11 +21,11 @@ class ScoreStore:
     The last line with a key counts. A line that an interruption cut short is ignored.
 
     Args:
-        path: file of records, which is created with the first record. None keeps the records in
+        path: File of records, which is created with the first record. None keeps the records in
             memory.
 
     Raises:
-        ValueError: the file cannot be read.
+        ValueError: The file cannot be read.
 
     >>> store = ScoreStore()
     >>> store.append("abc", {"values": {"haspi": 0.5}})
@@ -56,7 +56,7 @@ class ScoreStore:
         """Store a record, which is in the file when this returns.
 
         Raises:
-            ValueError: the file cannot be written, or JSON cannot represent the record.
+            ValueError: The file cannot be written, or JSON cannot represent the record.
         """
         line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False)
         if self.path is not None:
@@ -74,7 +74,7 @@ def content_hash(path: str | Path) -> str:
     """Compute the SHA-256 of a file's contents, in hexadecimal.
 
     Raises:
-        ValueError: the file cannot be read.
+        ValueError: The file cannot be read.
 
     >>> content_hash(__file__) == content_hash(__file__)
     True

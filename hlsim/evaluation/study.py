@@ -64,15 +64,15 @@ class Item:
     """One signal for one ear.
 
     Args:
-        name: name in tables.
-        clean: clean speech, the reference of measures.
-        signal: input of the conditions.
-        ear: the audiogram.
-        sample_rate: rate in Hz.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
-        seed: seed of random numbers that a measure draws.
-        facts: columns of the table, such as ``listener`` or ``snr``.
-        recorded: functions that read recorded outputs, by the name of their condition.
+        name: Name in tables.
+        clean: Clean speech, the reference of measures.
+        signal: Input of the conditions.
+        ear: The audiogram.
+        sample_rate: Rate in Hz.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        seed: Seed of random numbers that a measure draws.
+        facts: Columns of the table, such as ``listener`` or ``snr``.
+        recorded: Functions that read recorded outputs, by the name of their condition.
 
     Shape: (time,).
 
@@ -117,12 +117,12 @@ class Condition:
     """One way of processing an item.
 
     Args:
-        name: name in tables.
-        process: function of an input and an ear that returns an output of the same shape; None if
+        name: Name in tables.
+        process: Function of an input and an ear that returns an output of the same shape; None if
             the outputs were recorded.
-        kind: role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
-        of: name of the condition to which this one belongs, such as the aid whose level it has.
-        rivals: names of the conditions with which this one is compared, most important first.
+        kind: Role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
+        of: Name of the condition to which this one belongs, such as the aid whose level it has.
+        rivals: Names of the conditions with which this one is compared, most important first.
 
     >>> Condition("unaided", lambda signal, ear: signal, "unaided").of
     ''
@@ -153,16 +153,16 @@ class Measure:
     """A function of an item and an output, and its properties.
 
     Args:
-        name: name in options and files. The column of a score has the same name.
-        compute: function that returns values by column, or raises ValueError if there are none.
-        title: name in tables and plots.
-        packages: packages whose versions decide the values.
-        revision: number to be increased when a change of hlsim changes a value.
-        settings: fingerprint of other settings that decide the values, such as a teacher; None if
+        name: Name in options and files. The column of a score has the same name.
+        compute: Function that returns values by column, or raises ValueError if there are none.
+        title: Name in tables and plots.
+        packages: Packages whose versions decide the values.
+        revision: Number to be increased when a change of hlsim changes a value.
+        settings: Fingerprint of other settings that decide the values, such as a teacher; None if
             it is unknown.
-        knows_hearing: whether the values depend on audiogram and level.
-        rewards_gain: whether a higher level alone increases the score.
-        ends: lowest and highest score, for the axes of plots.
+        knows_hearing: Whether the values depend on audiogram and level.
+        rewards_gain: Whether a higher level alone increases the score.
+        ends: Lowest and highest score, for the axes of plots.
 
     >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).revision
     1
@@ -227,14 +227,14 @@ def run_study(
     column ``failure``, and a later run tries again.
 
     Args:
-        items: items, or sources that load them.
-        conditions: conditions.
-        measures: measures.
-        store: values of earlier runs, to which new ones are added. A value is computed again only
+        items: Items, or sources that load them.
+        conditions: Conditions.
+        measures: Measures.
+        store: Values of earlier runs, to which new ones are added. A value is computed again only
             if samples, ear, condition or measure have changed.
-        jobs: number of processes; all cores by default.
-        dask: address of a Dask scheduler, whose workers replace the processes.
-        progress: function that is called with the number of finished values and of all values.
+        jobs: Number of processes; all cores by default.
+        dask: Address of a Dask scheduler, whose workers replace the processes.
+        progress: Function that is called with the number of finished values and of all values.
 
     Returns:
         One row per item and condition: ``item`` (its number), ``name``, the item's facts,
@@ -242,8 +242,8 @@ def run_study(
         measure has its values.
 
     Raises:
-        ValueError: no scheduler answers, or the store cannot be written.
-        MissingExtraError: a package is not installed.
+        ValueError: No scheduler answers, or the store cannot be written.
+        MissingExtraError: A package is not installed.
 
     >>> signal = torch.ones(1600)
     >>> items = [Item("item 1", signal, signal, Audiogram.standard("N3"))]

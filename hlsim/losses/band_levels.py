@@ -72,9 +72,9 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
     audibility.
 
     Args:
-        perceived: output of the impaired ear.
-        normal: output of a normal ear for the clean speech.
-        sample_rate: sample rate in Hz.
+        perceived: Output of the impaired ear.
+        normal: Output of a normal ear for the clean speech.
+        sample_rate: Sample rate in Hz.
 
     Shape: (..., time) twice, in pascals -> (...) in dB; 0 if neither is audible. The weights carry
         no gradient.
@@ -121,8 +121,8 @@ def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor]:
     """Return the transform and the share of each frequency in each band, (frequencies, 24).
 
     Args:
-        like: tensor with the type and the device of the shares.
-        sample_rate: sample rate in Hz.
+        like: Tensor with the type and the device of the shares.
+        sample_rate: Sample rate in Hz.
 
     >>> stft, shares = band_analysis(torch.zeros(1), sample_rate=16000)
     >>> stft.hop, shares.shape

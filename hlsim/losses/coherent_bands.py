@@ -102,9 +102,9 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
     """Return the incoherence, misalignment, compressed level error and excess level of each item.
 
     Args:
-        perceived: output of the impaired ear.
-        normal: output of a normal ear for the clean speech.
-        sample_rate: sample rate in Hz.
+        perceived: Output of the impaired ear.
+        normal: Output of a normal ear for the clean speech.
+        sample_rate: Sample rate in Hz.
 
     Shape: (items, time) twice, in pascals -> (items,) each. The weights carry no gradient; audible
         sound where the reference is silent has a gradient all the same.

@@ -32,7 +32,7 @@ def check_criterion(criterion: Any) -> dict[str, Any]:
     """Return the weights of the criteria by name, without those of 0, or a function by itself.
 
     Raises:
-        ValueError: an unknown name, or a weight that is negative or not finite.
+        ValueError: An unknown name, or a weight that is negative or not finite.
 
     >>> check_criterion({"bands": 1.0, "paper": 0.0})
     {'bands': 1.0}
@@ -50,11 +50,11 @@ def combine_weights(
     """Return the weight of each part of the loss, multiplied by that of its criterion.
 
     Args:
-        weights: weights of the parts by name; the defaults of the criteria if None.
-        criteria: result of ``check_criterion``.
+        weights: Weights of the parts by name; the defaults of the criteria if None.
+        criteria: Result of ``check_criterion``.
 
     Raises:
-        ValueError: an unknown part, or a weight that is negative or not finite.
+        ValueError: An unknown part, or a weight that is negative or not finite.
 
     >>> combine_weights(None, {"bands": 0.5, "haspi": 2.0})
     {'band_levels': 0.5, 'haspi': 2.0}
@@ -73,7 +73,7 @@ def check_values(values: Any, items: int) -> Tensor:
     """Return the result of a criterion of the user's own.
 
     Raises:
-        ValueError: it is not a tensor with one value per item.
+        ValueError: It is not a tensor with one value per item.
 
     >>> check_values(torch.tensor([0.5, 1.0]), items=2)
     tensor([0.5000, 1.0000])

@@ -34,12 +34,12 @@ class Inputs(NamedTuple):
     """Validated arguments of a call of the loss.
 
     Attributes:
-        compensated: output of the compensator, silent after each end and at missing ears.
-        clean: clean speech, silent there, too.
-        ears: thresholds in dB HL, 0 dB HL for missing ears.
-        ends: number of samples of each item, or None if all are as long as the batch.
-        known: mask of the ears that are not missing, or None if all are known.
-        options: arguments of the simulator beyond the audiogram, by name.
+        compensated: Output of the compensator, silent after each end and at missing ears.
+        clean: Clean speech, silent there, too.
+        ears: Thresholds in dB HL, 0 dB HL for missing ears.
+        ends: Number of samples of each item, or None if all are as long as the batch.
+        known: Mask of the ears that are not missing, or None if all are known.
+        options: Arguments of the simulator beyond the audiogram, by name.
 
     >>> speech = torch.randn(2, 1600)
     >>> Inputs(speech, speech, torch.zeros(8), ends=None, known=None, options={}).ears.shape
@@ -61,15 +61,15 @@ class FrozenSimulator:
     ``apply``.
 
     Args:
-        simulator: simulator, as ``HearingLossLoss`` describes it and its attributes.
-        sample_rate: sample rate in Hz.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        normal: normal ear, as in ``HearingLossLoss``.
-        reference: reference of the criteria that have a choice, as in ``HearingLossLoss``.
-        checkpoint: compute the activations of the simulator again in the backward pass.
+        simulator: Simulator, as ``HearingLossLoss`` describes it and its attributes.
+        sample_rate: Sample rate in Hz.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        normal: Normal ear, as in ``HearingLossLoss``.
+        reference: Reference of the criteria that have a choice, as in ``HearingLossLoss``.
+        checkpoint: Compute the activations of the simulator again in the backward pass.
 
     Raises:
-        ValueError: an argument is not as ``HearingLossLoss`` describes it.
+        ValueError: An argument is not as ``HearingLossLoss`` describes it.
 
     >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, reference=None)
     >>> frozen.simulator.training
@@ -111,9 +111,9 @@ class FrozenSimulator:
         """Return the output of the simulator.
 
         Args:
-            waveform: speech.
-            thresholds: ears in dB HL.
-            inputs: lengths, and further arguments of the simulator.
+            waveform: Speech.
+            thresholds: Ears in dB HL.
+            inputs: Lengths, and further arguments of the simulator.
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
         """
@@ -161,8 +161,8 @@ class FrozenSimulator:
 
         Args:
             criterion: ``coherent-bands``, ``bands``, ``paper``, or the name of another criterion.
-            inputs: arguments of the call.
-            batch: leading dimensions of the result.
+            inputs: Arguments of the call.
+            batch: Leading dimensions of the result.
 
         Shape: (*batch, time).
         """
@@ -242,11 +242,11 @@ def build_simulator(
     Args:
         simulator: ``"msbg"`` for the exact model, the name or the folder of a checkpoint, or a
             module.
-        sample_rate: sample rate in Hz.
-        full_scale_spl: level in dB SPL of RMS 1.0.
+        sample_rate: Sample rate in Hz.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
 
     Raises:
-        ValueError: there is no such checkpoint, or the module was built for another rate or level,
+        ValueError: There is no such checkpoint, or the module was built for another rate or level,
             or delays its output.
 
     >>> build_simulator("msbg", sample_rate=16000, full_scale_spl=94.0)
@@ -284,7 +284,7 @@ def _broadcast_batch(items: torch.Size, ears: torch.Size) -> torch.Size | None:
     """Return the shape to which the leading dimensions of signals and ears broadcast, or None.
 
     Raises:
-        ValueError: the ears would broadcast so that each item is simulated for each ear, as
+        ValueError: The ears would broadcast so that each item is simulated for each ear, as
             (batch,) ears with (batch, 1) items would.
     """
     try:
@@ -305,10 +305,10 @@ def _check_output(
     """Return an output, or raise ValueError unless it is a waveform with the shape of its input.
 
     Args:
-        output: value to validate.
-        source: name of the module that returned it, for messages.
-        waveform: input of the module.
-        batch: further leading dimensions that the output may have.
+        output: Value to validate.
+        source: Name of the module that returned it, for messages.
+        waveform: Input of the module.
+        batch: Further leading dimensions that the output may have.
     """
     check_waveform(output, f"the output of the {source}", highest=math.inf)
     time = waveform.shape[-1:]

@@ -30,14 +30,14 @@ class HASPILoss(HearingLossLoss):
     HASQI 23 times.
 
     Args:
-        audiogram: ear or ears, as in ``HearingLossLoss``.
-        quality: weight of 1 minus HASQI, beside 1 for 1 minus HASPI.
-        level: weight of level and peaks. With 0 a model learns to be as loud as it can.
+        audiogram: Ear or ears, as in ``HearingLossLoss``.
+        quality: Weight of 1 minus HASQI, beside 1 for 1 minus HASPI.
+        level: Weight of level and peaks. With 0 a model learns to be as loud as it can.
         options: ``simulator``, ``sample_rate``, ``full_scale_spl``, ``reduction``, ``normal``,
             ``ears`` and ``checkpoint`` of ``HearingLossLoss``.
 
     Raises:
-        ValueError: as ``HearingLossLoss``, or a weight is negative or not finite.
+        ValueError: As ``HearingLossLoss``, or a weight is negative or not finite.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()[:16000]

@@ -98,7 +98,7 @@ class HearingLossLoss(nn.Module):
       returns one value per item, (items,)
 
     Args:
-        audiogram: ear or ears; may be passed to each call instead. A tensor that requires a
+        audiogram: Ear or ears; may be passed to each call instead. A tensor that requires a
             gradient gets one, and is not registered either. Every simulator, ``"msbg"`` included,
             receives the levels at eight frequencies, ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
@@ -109,32 +109,32 @@ class HearingLossLoss(nn.Module):
             are those of MSBG;
             ``highest_frequency`` of its output in Hz; and ``needs_exact_lengths``, true if silence
             after the end of an item changes the output before.
-        sample_rate: sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
+        sample_rate: Sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
             below 8 kHz, and below 7.5 kHz at rates above 16000.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        reference: signal with which ``"paper"``, a function and ``heard`` compare: ``"clean"``, the
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        reference: Signal with which ``"paper"``, a function and ``heard`` compare: ``"clean"``, the
             clean speech (the default for ``"paper"``), or ``"normal-hearing"``, the output of a
             normal ear for it (the default otherwise). The other criteria always compare with a
             normal ear. The reference gets the phase of MSBG's filter bank for the severity of the
             ear (``hlsim.msbg.response``), unless ``normal`` is passed or the simulator does not
             emulate MSBG. Without this phase, speech of the opposite sign could have a lower loss.
-        criterion: criterion, as listed above.
-        weights: weights of the parts that ``parts`` returns, by name; other parts do not count.
+        criterion: Criterion, as listed above.
+        weights: Weights of the parts that ``parts`` returns, by name; other parts do not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"`` for one value
             per item.
-        normal: normal ear that belongs to the simulator: a module, which is frozen too, or a
+        normal: Normal ear that belongs to the simulator: a module, which is frozen too, or a
             function, (..., time) -> (..., time). By default, it is MSBG at 0 dB HL for a simulator
             that emulates MSBG, and the simulator itself at 0 dB HL otherwise. Changes that the
             simulator makes for every ear, such as a low-pass, then apply to the reference, too. A
             network that emulates another teacher needs the normal ear of that teacher.
-        ears: reduction of two ears, (..., 2, time): ``"mean"``, or ``"better"`` for a smooth choice
+        ears: Reduction of two ears, (..., 2, time): ``"mean"``, or ``"better"`` for a smooth choice
             of the better ear. Each ear then counts by its share, ``softmax(-loss / 0.1)`` over
             both. The shares carry no gradient, so that no ear is made worse.
-        checkpoint: compute the activations of the simulator again in the backward pass instead of
+        checkpoint: Compute the activations of the simulator again in the backward pass instead of
             storing them, which takes less memory. Value and gradient are the same.
 
     Raises:
-        ValueError: an unknown name, a value of another type or out of range, or a simulator that
+        ValueError: An unknown name, a value of another type or out of range, or a simulator that
             was built for another rate or level, or delays its output.
 
     >>> import hlsim
@@ -217,16 +217,16 @@ class HearingLossLoss(nn.Module):
         """Return the loss.
 
         Args:
-            compensated: output of the compensator.
-            clean: clean speech.
-            audiogram: one ear, (8,), or (..., 8) that broadcasts over the leading dimensions. With
+            compensated: Output of the compensator.
+            clean: Clean speech.
+            audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions. With
                 (batch, 1, time), (batch, 8) is accepted, too. A ``Listener`` goes with
                 (..., 2, time), left first; a missing ear does not count.
-            lengths: number of samples of each item of a padded batch, (...), or its share of the
+            lengths: Number of samples of each item of a padded batch, (...), or its share of the
                 longest, above 0 and up to 1, as SpeechBrain defines it. Samples after the end of an
                 item are ignored, so that its value is the one that it has alone (within 1e-4 for
                 the exact MSBG, which simulates the padded batch at once).
-            listener: further keyword arguments for a simulator of your own, by name, as a
+            listener: Further keyword arguments for a simulator of your own, by name, as a
                 dictionary. This is not a ``Listener``, which goes into ``audiogram``. Tensors are
                 moved to the device of the speech.
 
@@ -234,7 +234,7 @@ class HearingLossLoss(nn.Module):
             missing ear is NaN. With ``ears="better"`` the result has no dimension of ears.
 
         Raises:
-            ValueError: there is no audiogram, shapes or devices do not fit, levels are outside -10
+            ValueError: There is no audiogram, shapes or devices do not fit, levels are outside -10
                 to 100 dB HL, lengths are outside 1 to time, a simulator, normal ear or criterion
                 returns another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, an item
                 is shorter than 0.7 s.

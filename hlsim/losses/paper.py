@@ -126,12 +126,12 @@ def paper_parts(
     """Return the paper's four losses of each item by name.
 
     Args:
-        estimate: waveform to judge.
-        target: waveform that it should equal.
-        stft: transform. Spectra are scaled to the magnitudes of the paper's transform, so that the
+        estimate: Waveform to judge.
+        target: Waveform that it should equal.
+        stft: Transform. Spectra are scaled to the magnitudes of the paper's transform, so that the
             sample rate changes no level, and the magnitude and complex losses to its number of
             frequencies, so that an empty band changes nothing.
-        frequencies: number of frequencies to compare, from 0 Hz up; all if None.
+        frequencies: Number of frequencies to compare, from 0 Hz up; all if None.
 
     Shape: (items, time) twice -> (items,) each.
 

@@ -37,8 +37,8 @@ class Score(NamedTuple):
     """A score, or the reason why it does not exist.
 
     Attributes:
-        value: score, or None.
-        reason: reason why there is no score, or None.
+        value: Score, or None.
+        reason: Reason why there is no score, or None.
 
     >>> Score(None, "output is silent").value is None
     True
@@ -52,11 +52,11 @@ def snr_db(reference: Signal, estimate: Signal) -> float:
     """Compute the power of the reference relative to that of the error in dB, at most 200 dB.
 
     Args:
-        reference: expected samples. Shape: (time,).
-        estimate: samples to compare. Shape: (time,).
+        reference: Expected samples. Shape: (time,).
+        estimate: Samples to compare. Shape: (time,).
 
     Raises:
-        ValueError: the shapes differ, a sample is not finite, or the reference is silent.
+        ValueError: The shapes differ, a sample is not finite, or the reference is silent.
 
     >>> round(snr_db(np.array([1.0, -1.0]), np.array([1.1, -1.1])))
     20
@@ -71,11 +71,11 @@ def raw_mse(reference: Signal, estimate: Signal) -> float:
     soft items would not count. The Neuro-MSBG paper does not state how it scales its RAW MSE.
 
     Args:
-        reference: expected samples. Shape: (time,).
-        estimate: samples to compare. Shape: (time,).
+        reference: Expected samples. Shape: (time,).
+        estimate: Samples to compare. Shape: (time,).
 
     Raises:
-        ValueError: the shapes differ, a sample is not finite, or the reference is silent.
+        ValueError: The shapes differ, a sample is not finite, or the reference is silent.
 
     >>> round(raw_mse(np.array([1.0, -1.0]), np.array([1.1, -1.1])), 6)
     0.01
@@ -92,12 +92,12 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
     count as at most 120 dB below this band.
 
     Args:
-        reference: expected samples. Shape: (time,).
-        estimate: samples to compare. Shape: (time,).
-        sample_rate: sample rate in Hz, at least 16000.
+        reference: Expected samples. Shape: (time,).
+        estimate: Samples to compare. Shape: (time,).
+        sample_rate: Sample rate in Hz, at least 16000.
 
     Raises:
-        ValueError: the shapes differ, a sample is not finite, the reference is silent or has no
+        ValueError: The shapes differ, a sample is not finite, the reference is silent or has no
             power in the bands, or the sample rate is too low.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
@@ -142,13 +142,13 @@ def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
     Source: Taal, Hendriks, Heusdens and Jensen (2011).
 
     Args:
-        clean: clean speech. Shape: (time,).
-        output: speech to score. Shape: (time,).
-        sample_rate: sample rate in Hz.
+        clean: Clean speech. Shape: (time,).
+        output: Speech to score. Shape: (time,).
+        sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: the shapes differ.
-        MissingExtraError: pystoi is not installed.
+        ValueError: The shapes differ.
+        MissingExtraError: Pystoi is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
     >>> round(stoi(noise, noise, 16000).value)
@@ -168,13 +168,13 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
     Source: ITU-T P.862.2.
 
     Args:
-        clean: clean speech. Shape: (time,).
-        output: speech to score. Shape: (time,).
-        sample_rate: sample rate in Hz.
+        clean: Clean speech. Shape: (time,).
+        output: Speech to score. Shape: (time,).
+        sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: the shapes differ.
-        MissingExtraError: pesq is not installed.
+        ValueError: The shapes differ.
+        MissingExtraError: Pesq is not installed.
 
     >>> pesq_wb(np.zeros(16000), np.ones(16000), 16000).reason
     'clean is silent'
@@ -195,7 +195,7 @@ def linear_correlation(expected_scores: Iterable[float], scores: Iterable[float]
     Returns: correlation, or None for fewer than two scores or scores that are all equal.
 
     Raises:
-        ValueError: the numbers of scores differ, or a score is not finite.
+        ValueError: The numbers of scores differ, or a score is not finite.
 
     >>> round(linear_correlation([0.1, 0.2, 0.4], [0.2, 0.4, 0.8]), 6)
     1.0
@@ -209,7 +209,7 @@ def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) 
     Returns: correlation, or None for fewer than two scores or scores that are all equal.
 
     Raises:
-        ValueError: the numbers of scores differ, or a score is not finite.
+        ValueError: The numbers of scores differ, or a score is not finite.
 
     >>> round(rank_correlation([0.1, 0.2, 0.4], [0.1, 0.3, 0.9]), 6)
     1.0
@@ -221,7 +221,7 @@ def mean_squared_error(expected_scores: Iterable[float], scores: Iterable[float]
     """Compute the mean squared difference of scores, or None if there are none.
 
     Raises:
-        ValueError: the numbers of scores differ, or a score is not finite.
+        ValueError: The numbers of scores differ, or a score is not finite.
 
     >>> mean_squared_error([0.5], [0.75])
     0.0625
@@ -244,7 +244,7 @@ def _check_scores(
     """Convert scores to arrays of equal length.
 
     Raises:
-        ValueError: the numbers of scores differ, or a score is not finite.
+        ValueError: The numbers of scores differ, or a score is not finite.
     """
     x = np.array(list(expected_scores), dtype=np.float64)
     y = np.array(list(scores), dtype=np.float64)
@@ -280,7 +280,7 @@ def _as_equal_length(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndar
     """Convert two signals to arrays of float64.
 
     Raises:
-        ValueError: the signals are not of one shape (time,).
+        ValueError: The signals are not of one shape (time,).
     """
     x = _as_array(first)
     y = _as_array(second)
@@ -300,7 +300,7 @@ def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.
     """Convert two signals whose relative error is defined to arrays.
 
     Raises:
-        ValueError: the shapes differ, a sample is not finite, or the reference is silent.
+        ValueError: The shapes differ, a sample is not finite, or the reference is silent.
     """
     x, y = _as_equal_length(reference, estimate)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):

@@ -75,15 +75,15 @@ def haaqi(
     better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
 
     Args:
-        processed: music at the impaired ear, at least 0.7 s long.
-        clean: clean music, not amplified.
-        audiogram, sample_rate, full_scale_spl, lengths, noise, seed, whole_khz: the arguments of
+        processed: Music at the impaired ear, at least 0.7 s long.
+        clean: Clean music, not amplified.
+        audiogram, sample_rate, full_scale_spl, lengths, noise, seed, whole_khz: The arguments of
             ``hasqi``.
 
     Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> chord = sum(torch.sin(2 * torch.pi * hz * seconds) for hz in (220.0, 277.2, 329.6))
@@ -113,14 +113,14 @@ class HaaqiReference(QualityReference):
     In float32 it takes about 18 MB per second of music.
 
     Args:
-        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: the arguments of
+        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: The arguments of
             ``haaqi``. The scores have the dtype and the device of ``clean``, whose gradient is not
             computed.
-        keep: store the clean signal's features; otherwise they are computed for each score, which
+        keep: Store the clean signal's features; otherwise they are computed for each score, which
             takes less memory.
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -159,9 +159,9 @@ def modulation_correlation(reference: Tensor, processed: Tensor, counts: Extent)
     """Compute the mean correlation of the cepstra in the bands of modulation from 20 to 125 Hz.
 
     Args:
-        reference, processed: levels by ``fine_structure.smooth_levels`` with ``ENVELOPE_SEGMENT``.
+        reference, processed: Levels by ``fine_structure.smooth_levels`` with ``ENVELOPE_SEGMENT``.
             Shape: (items, 32, segments).
-        counts: number of segments of each item.
+        counts: Number of segments of each item.
 
     Returns:
         Correlation of each item, 0 to 1. Shape: (items,).

@@ -68,26 +68,26 @@ def haspi(
     a GPU are not read by the host: if they are out of range, the score is NaN.
 
     Args:
-        processed: signal at the impaired ear, at least 0.7 s long.
-        clean: clean speech, not amplified. Lengths of both that differ by 0.1 s at most are cut to
+        processed: Signal at the impaired ear, at least 0.7 s long.
+        clean: Clean speech, not amplified. Lengths of both that differ by 0.1 s at most are cut to
             the shorter one, with a warning.
-        audiogram: the impaired ear, -10 to 120 dB HL; one ear, or one for each item. Its
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item. Its
             thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz count, interpolated over log
             frequency where they were not measured.
-        sample_rate: sample rate in Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
-        lengths: number of samples of each item in a padded batch.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
+        lengths: Number of samples of each item in a padded batch.
         noise: ``"expected"`` computes the mean over seeds, which is smooth and the same every time;
             ``"seeded"`` draws the noise that pyclarity draws with ``seed`` (scores vary by up to
             0.007); ``"none"`` leaves it out.
-        seed: one seed, or one for each item.
-        whole_khz: round the rate to whole kHz, as pyclarity does. From 44.1 to 44 kHz, scores
+        seed: One seed, or one for each item.
+        whole_khz: Round the rate to whole kHz, as pyclarity does. From 44.1 to 44 kHz, scores
             change by up to 0.005.
 
     Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
 
     Raises:
-        ValueError: signals of other shapes, too short, or not finite; clean speech that is silent
+        ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
             or below 20 dB SPL; a rate, level, audiogram, length or seed out of range.
 
     >>> from hlsim import example_speech
@@ -113,14 +113,14 @@ class HaspiReference(Reference["_Batch"]):
     It does not depend on an audiogram. In float32 it takes about 4 MB per second of speech.
 
     Args:
-        clean: clean speech, not amplified. The scores have its dtype and its device. Its gradient
+        clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
             is not computed.
         settings: ``sample_rate``, ``full_scale_spl``, ``lengths`` and ``whole_khz`` as for
             ``haspi``. ``keep=False`` computes the clean signal's features for each score instead
             of storing them, which takes less memory.
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -148,14 +148,14 @@ class HaspiReference(Reference["_Batch"]):
         """Return the HASPI of each processed signal.
 
         Args:
-            processed: signals of the shape, rate and scale of the clean ones. Lengths that differ
+            processed: Signals of the shape, rate and scale of the clean ones. Lengths that differ
                 by 0.1 s at most are cut to the shorter one, with a warning.
-            audiogram, noise, seed: the arguments of ``haspi``.
+            audiogram, noise, seed: The arguments of ``haspi``.
 
         Shape: (..., time) -> (...,).
 
         Raises:
-            ValueError: as for ``haspi``.
+            ValueError: As for ``haspi``.
         """
         ears = ear_model.hair_cells(self._signals.thresholds(audiogram))
         features = self._compare(processed, noise, seed, ears)
@@ -166,10 +166,10 @@ class _Channels(NamedTuple):
     """Features of the clean speech in some channels of a normal ear.
 
     Attributes:
-        channels: the channels.
-        spectrum: spectrum of the envelopes, which finds the lags of the processed signal.
-        delays: delays that equalise the filters' group delays. Shape: (items, channels).
-        channel_sum: sums of the frames over these channels.
+        channels: The channels.
+        spectrum: Spectrum of the envelopes, which finds the lags of the processed signal.
+        delays: Delays that equalise the filters' group delays. Shape: (items, channels).
+        channel_sum: Sums of the frames over these channels.
     """
 
     channels: slice
@@ -247,10 +247,10 @@ def _draw_pairs(
     """Draw the noise of the clean and of the processed signals.
 
     Args:
-        seeds: seed of each item.
-        skipped: deviates that pyclarity draws before, for each item.
-        extent: number of audible frames of each item.
-        like: cosines of the signals. Shape: (items, 5, audible).
+        seeds: Seed of each item.
+        skipped: Deviates that pyclarity draws before, for each item.
+        extent: Number of audible frames of each item.
+        like: Cosines of the signals. Shape: (items, 5, audible).
 
     Returns:
         Cosines of the noise. Shape: (2, items, 5, audible).
@@ -296,8 +296,8 @@ def legacy_rng_after_normals(seed: int, count: int) -> np.random.RandomState:
     """Return numpy's legacy generator after it has drawn normal deviates.
 
     Args:
-        seed: seed of the generator.
-        count: number of deviates that were drawn, an even number.
+        seed: Seed of the generator.
+        count: Number of deviates that were drawn, an even number.
 
     >>> expected = np.random.RandomState(7).standard_normal(5)[4]
     >>> bool(legacy_rng_after_normals(7, 4).standard_normal() == expected)

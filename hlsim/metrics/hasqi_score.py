@@ -45,16 +45,16 @@ def hasqi(
     ear. It is differentiable in ``processed``.
 
     Args:
-        processed, clean, audiogram, sample_rate, full_scale_spl, lengths, seed, whole_khz: the
+        processed, clean, audiogram, sample_rate, full_scale_spl, lengths, seed, whole_khz: The
             arguments of ``haspi``.
-        noise: noise at the threshold of hearing, which matters where nothing of the processed
+        noise: Noise at the threshold of hearing, which matters where nothing of the processed
             speech is audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the
             noise that pyclarity draws with ``seed``; ``"none"`` leaves it out.
 
     Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -80,14 +80,14 @@ class HasqiReference(QualityReference):
     In float32 it takes about 18 MB per second of speech.
 
     Args:
-        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: the arguments of
+        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: The arguments of
             ``hasqi``. The scores have the dtype and the device of ``clean``, whose gradient is not
             computed.
-        keep: store the clean signal's features; otherwise they are computed for each score, which
+        keep: Store the clean signal's features; otherwise they are computed for each score, which
             takes less memory.
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

@@ -33,9 +33,9 @@ class Interaural(NamedTuple):
     """Interaural differences in each octave, NaN where an ear is silent. Shape: (..., 5) each.
 
     Attributes:
-        level: level of the left ear minus that of the right ear in dB.
-        time: time in microseconds by which the left ear leads, from -1000 to 1000.
-        coherence: correlation of the ears at this time difference, from 0 to 1. The time difference
+        level: Level of the left ear minus that of the right ear in dB.
+        time: Time in microseconds by which the left ear leads, from -1000 to 1000.
+        coherence: Correlation of the ears at this time difference, from 0 to 1. The time difference
             is meaningful where it is close to 1.
 
     >>> Interaural(torch.zeros(5), torch.zeros(5), torch.ones(5)).coherence
@@ -55,11 +55,11 @@ def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
     instead.
 
     Args:
-        waveform: waveforms of the left and the right ear. Shape: (..., 2, time).
-        sample_rate: sample rate in Hz.
+        waveform: Waveforms of the left and the right ear. Shape: (..., 2, time).
+        sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: the waveform has another shape, or the rate is out of range.
+        ValueError: The waveform has another shape, or the rate is out of range.
 
     >>> noise = torch.randn(16000)
     >>> interaural(torch.stack((10.0 * noise, noise))).level.round()
@@ -91,14 +91,14 @@ def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000
     """Compute the change of interaural differences by an aid.
 
     Args:
-        before: input of the aid for the left and the right ear. Shape: (..., 2, time).
-        after: output of the aid for the left and the right ear. Shape: (..., 2, time).
-        sample_rate: sample rate in Hz.
+        before: Input of the aid for the left and the right ear. Shape: (..., 2, time).
+        after: Output of the aid for the left and the right ear. Shape: (..., 2, time).
+        sample_rate: Sample rate in Hz.
 
-    Returns: changes of the differences of level and time, and the coherence of the output.
+    Returns: Changes of the differences of level and time, and the coherence of the output.
 
     Raises:
-        ValueError: a waveform has another shape, or the rate is out of range.
+        ValueError: A waveform has another shape, or the rate is out of range.
 
     >>> noise = torch.randn(2, 16000)
     >>> interaural_change(noise, noise).level
@@ -121,9 +121,9 @@ def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tenso
     Shape: (..., 2, time), (..., 2, time) -> (...).
 
     Args:
-        processed: output of an aid for the left and the right ear in Pa.
-        clean: clean speech at the left and the right ear in Pa.
-        sample_rate: sample rate in Hz.
+        processed: Output of an aid for the left and the right ear in Pa.
+        clean: Clean speech at the left and the right ear in Pa.
+        sample_rate: Sample rate in Hz.
 
     >>> noise = torch.randn(2, 16000)
     >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)
@@ -155,7 +155,7 @@ def _spectra(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor, Tensor
     Shape: (..., 2, time) -> (..., frequencies), (..., frequencies), complex (..., frequencies),
         (frequencies, 5).
 
-    Returns: powers of the left and of the right ear, the cross spectrum, and the frequencies of
+    Returns: Powers of the left and of the right ear, the cross spectrum, and the frequencies of
         each octave as 0 or 1.
     """
     hop = round(0.016 * sample_rate)

@@ -72,17 +72,17 @@ def mbstoi(
     gradient: which frames are speech, the interaural delays and levels, and the better ear.
 
     Args:
-        processed: processed speech at the left and the right ear.
-        clean: clean speech at the left and the right ear, time-aligned with ``processed``.
-        sample_rate: sample rate in Hz, 16000 to 48000.
-        lengths: number of samples of each item in a padded batch. Without it, zeros at the end of
+        processed: Processed speech at the left and the right ear.
+        clean: Clean speech at the left and the right ear, time-aligned with ``processed``.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        lengths: Number of samples of each item in a padded batch. Without it, zeros at the end of
             an item change its score by up to 0.007.
 
     Shape: (..., 2, time) twice -> (...,). The score is computed in float64 where the device
     supports it.
 
     Raises:
-        ValueError: signals of other shapes, on different devices or not finite; clean speech that
+        ValueError: Signals of other shapes, on different devices or not finite; clean speech that
             is silent or lasts less than 0.41 s without its pauses; a rate or length out of range.
 
     >>> from hlsim import example_speech
@@ -111,8 +111,8 @@ def _mean_correlation(envelopes: Tensor, counts: NDArray[np.int64]) -> Tensor:
     """Compute the mean correlation over all segments of each item.
 
     Args:
-        envelopes: output of ``_band_envelopes``.
-        counts: number of frames of each item.
+        envelopes: Output of ``_band_envelopes``.
+        counts: Number of frames of each item.
 
     Returns:
         Scores. Shape: (items,).
@@ -212,16 +212,16 @@ def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]]
     The host waits for the device once.
 
     Args:
-        signals: clean signals of the left and the right ear, then the processed ones. Shape:
+        signals: Clean signals of the left and the right ear, then the processed ones. Shape:
             (items, 4, time).
-        extent: lengths of the items.
+        extent: Lengths of the items.
 
     Returns:
         Frames of the shortened signals, (items, 4, frames, samples), and the number of frames of
         each item.
 
     Raises:
-        ValueError: too few frames remain for a segment.
+        ValueError: Too few frames remain for a segment.
     """
     # As in pyclarity, a frame that ends with the signal is left out.
     frames_of = tuple(max(0, (end - 1 - FRAME) // HOP + 1) for end in extent.ends)
@@ -290,8 +290,8 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
     those of one ear if it is better.
 
     Args:
-        windows: segments of the output of ``_band_envelopes``. Shape: (segments, bands, 8, frames).
-        may_use_one_ear: whether one ear alone may be used. Shape: (segments,).
+        windows: Segments of the output of ``_band_envelopes``. Shape: (segments, bands, 8, frames).
+        may_use_one_ear: Whether one ear alone may be used. Shape: (segments,).
 
     Returns:
         Correlations. Shape: (segments,).

@@ -29,12 +29,12 @@ def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, 
     """Return the length of the shorter of two signals, and warn if their lengths differ.
 
     Args:
-        lengths: lengths of both signals in samples.
-        sample_rate: sample rate in Hz.
-        names: names of both signals in messages.
+        lengths: Lengths of both signals in samples.
+        sample_rate: Sample rate in Hz.
+        names: Names of both signals in messages.
 
     Raises:
-        ValueError: the lengths differ by more than 0.1 s.
+        ValueError: The lengths differ by more than 0.1 s.
 
     >>> common_length((16000, 16000), 16000, ("output", "clean"))
     16000
@@ -61,14 +61,14 @@ def cut_to_common_length(
     checks reject them.
 
     Args:
-        processed: signal to score. Shape: (..., time).
-        clean: clean speech. Shape: (..., time).
-        sample_rate: sample rate in Hz.
-        lengths: number of samples of each item in a padded batch, which are limited to the common
+        processed: Signal to score. Shape: (..., time).
+        clean: Clean speech. Shape: (..., time).
+        sample_rate: Sample rate in Hz.
+        lengths: Number of samples of each item in a padded batch, which are limited to the common
             length.
 
     Raises:
-        ValueError: the lengths differ by more than 0.1 s.
+        ValueError: The lengths differ by more than 0.1 s.
 
     >>> output, clean, _ = cut_to_common_length(torch.ones(9000), torch.ones(9000), 16000, None)
     >>> output.shape
@@ -93,10 +93,10 @@ def match_pair(
     """Cut two signals to their common length, and convert clean speech to the wider precision.
 
     Args:
-        processed: signal to score. Shape: (..., time).
-        clean: clean speech. Shape: (..., time).
-        sample_rate: sample rate in Hz.
-        lengths: number of samples of each item in a padded batch.
+        processed: Signal to score. Shape: (..., time).
+        clean: Clean speech. Shape: (..., time).
+        sample_rate: Sample rate in Hz.
+        lengths: Number of samples of each item in a padded batch.
 
     Raises:
         ValueError: ``processed`` is not a waveform, or the lengths differ by more than 0.1 s.
@@ -116,7 +116,7 @@ def check_seed(seed: int) -> int:
     """Return a seed that NumPy accepts.
 
     Raises:
-        ValueError: the seed is not a whole number from 0 to 2 ** 32 - 1.
+        ValueError: The seed is not a whole number from 0 to 2 ** 32 - 1.
 
     >>> check_seed(3)
     3
@@ -132,11 +132,11 @@ def item_seeds(seed: int | Sequence[int], shape: torch.Size) -> list[int]:
     """Return one seed for each item.
 
     Args:
-        seed: one seed, or one for each item.
-        shape: shape of the batch of items.
+        seed: One seed, or one for each item.
+        shape: Shape of the batch of items.
 
     Raises:
-        ValueError: the number of seeds is another one, or a seed is out of range.
+        ValueError: The number of seeds is another one, or a seed is out of range.
 
     >>> item_seeds(3, torch.Size([2]))
     [3, 3]

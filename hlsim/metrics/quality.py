@@ -55,9 +55,9 @@ class QualityParts(NamedTuple):
     """Score of quality and its two parts. Shape of all: (...,).
 
     Attributes:
-        combined: the score, 0 to 1.
-        nonlinear: similarity of envelopes and fine structure, which noise and distortion reduce.
-        linear: similarity of long-term spectra, which colour reduces.
+        combined: The score, 0 to 1.
+        nonlinear: Similarity of envelopes and fine structure, which noise and distortion reduce.
+        linear: Similarity of long-term spectra, which colour reduces.
 
     >>> QualityParts(torch.tensor(0.4), torch.tensor(0.5), torch.tensor(0.8)).nonlinear
     tensor(0.5000)
@@ -72,10 +72,10 @@ class Comparison(NamedTuple):
     """Features of two signals in one ear, from which a score is computed.
 
     Attributes:
-        clean_levels, processed_levels: smoothed levels in dB over threshold. Shape: (items, 32,
+        clean_levels, processed_levels: Smoothed levels in dB over threshold. Shape: (items, 32,
             segments).
-        coherence: coherence of the fine structures. Shape: (items, 32, segments of 16 ms).
-        energy: mean squares of the clean segments. Shape: (items, 32, segments of 16 ms).
+        coherence: Coherence of the fine structures. Shape: (items, 32, segments of 16 ms).
+        energy: Mean squares of the clean segments. Shape: (items, 32, segments of 16 ms).
         clean_spectrum, processed_spectrum: long-term levels in dB over threshold. Shape: (items,
             32).
 
@@ -97,15 +97,15 @@ class QualityReference(Reference["_Batch"]):
     Subclasses compute the score from a ``Comparison``. In float32 it takes about 18 MB per second.
 
     Args:
-        clean: clean signals, not amplified. The scores have their dtype and their device. Their
+        clean: Clean signals, not amplified. The scores have their dtype and their device. Their
             gradient is not computed.
-        audiogram: the impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         settings: ``sample_rate``, ``full_scale_spl``, ``lengths`` and ``whole_khz`` as for
             ``haspi``. ``keep=False`` computes the clean signals' features for each score instead
             of storing them, which takes less memory.
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> from hlsim import example_speech
     >>> from hlsim.metrics import HasqiReference
@@ -139,15 +139,15 @@ class QualityReference(Reference["_Batch"]):
         """Return the score of each processed signal.
 
         Args:
-            processed: signals of the shape, rate and scale of the clean ones. Lengths that differ
+            processed: Signals of the shape, rate and scale of the clean ones. Lengths that differ
                 by 0.1 s at most are cut to the shorter one, with a warning.
-            noise: noise at the threshold of hearing, as in ``hasqi``.
-            seed: one seed, or one for each item.
+            noise: Noise at the threshold of hearing, as in ``hasqi``.
+            seed: One seed, or one for each item.
 
         Shape: (..., time) -> (...,).
 
         Raises:
-            ValueError: signals of another shape, not finite or on another device.
+            ValueError: Signals of another shape, not finite or on another device.
         """
         return self.parts(processed, noise=noise, seed=seed).combined
 
@@ -180,11 +180,11 @@ class _Channels:
     """Features of the clean signal in some channels.
 
     Attributes:
-        channels: the channels.
-        envelope, motion: spectra that find the lags of the processed signal.
-        delays: delays that equalise the filters' group delays. Shape: (items, channels).
-        smooth_levels: smoothed levels. Shape: (items, channels, segments).
-        adapted_motion: motion after adaptation. Shape: (items, channels, padded).
+        channels: The channels.
+        envelope, motion: Spectra that find the lags of the processed signal.
+        delays: Delays that equalise the filters' group delays. Shape: (items, channels).
+        smooth_levels: Smoothed levels. Shape: (items, channels, segments).
+        adapted_motion: Motion after adaptation. Shape: (items, channels, padded).
         segments: ``segment_spectra`` of that motion.
         spectrum: long-term levels in dB over threshold. Shape: (items, channels).
     """
@@ -203,11 +203,11 @@ class _Batch(PreparedBatch[_Channels]):
     """Clean signals of a batch in their impaired ears.
 
     Args:
-        signals: all clean signals.
-        batch: those of the batch.
-        ears, host_ears: ears of the items, on the device of the signals and on the CPU.
+        signals: All clean signals.
+        batch: Those of the batch.
+        ears, host_ears: Ears of the items, on the device of the signals and on the CPU.
             Shape: (items, 8) dB HL.
-        score: the score that is computed.
+        score: The score that is computed.
     """
 
     def __init__(
@@ -321,10 +321,10 @@ def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: f
     pyclarity keeps the motion in the unit of the signals, and so does this function.
 
     Args:
-        motion: motion of the basilar membrane.
-        power: power of its envelope, in multiples of that at 0 dB SPL.
-        levels: adapted levels in dB over threshold.
-        unit: amplitude of 20 uPa in the signals.
+        motion: Motion of the basilar membrane.
+        power: Power of its envelope, in multiples of that at 0 dB SPL.
+        levels: Adapted levels in dB over threshold.
+        unit: Amplitude of 20 uPa in the signals.
 
     Shape: (items, channels, padded) three times -> (items, channels, padded).
 

@@ -40,10 +40,10 @@ class PreparedBatch(Generic[Channels]):
     """Clean signals of a batch in their ears, some channels at a time.
 
     Args:
-        signals: all clean signals.
-        batch: those of the batch.
-        clean: clean signals of the batch as the ears receive them. Shape: (items, padded).
-        cells: hair cells of the ears. Shape: (items, 32) or (32,).
+        signals: All clean signals.
+        batch: Those of the batch.
+        clean: Clean signals of the batch as the ears receive them. Shape: (items, padded).
+        cells: Hair cells of the ears. Shape: (items, 32) or (32,).
 
     >>> issubclass(PreparedBatch, Generic)
     True
@@ -66,8 +66,8 @@ class PreparedBatch(Generic[Channels]):
         """Call a function with the features of some channels at a time, from low to high.
 
         Args:
-            function: function to call.
-            signal: tensor on which the function depends.
+            function: Function to call.
+            signal: Tensor on which the function depends.
         """
         if self._stored is not None:
             return map_on_cores(function, self._stored, signal)
@@ -100,10 +100,10 @@ class PreparedBatch(Generic[Channels]):
         """Compare processed signals with the clean ones.
 
         Args:
-            processed: all processed signals. Shape: (all items, time).
-            noise: kind of noise.
-            seeds: seeds of all items.
-            ears: hair cells of all items, where they are not those of the clean signals.
+            processed: All processed signals. Shape: (all items, time).
+            noise: Kind of noise.
+            seeds: Seeds of all items.
+            ears: Hair cells of all items, where they are not those of the clean signals.
 
         Returns:
             Features of each item of the batch. Shape: (items, features).
@@ -121,15 +121,15 @@ class Reference(Generic[Batch]):
     uses, if no gradient is needed. The scores do not depend on it.
 
     Args:
-        clean: clean signals, whose dtype and device are those of the scores. Their gradient is not
+        clean: Clean signals, whose dtype and device are those of the scores. Their gradient is not
             computed. Shape: (..., time).
-        audiogram: the ear in which they are prepared, or one for each item; None for a normal ear.
-        sample_rate, full_scale_spl, lengths, whole_khz: the arguments of ``haspi``.
-        keep: store the clean signals' features; otherwise they are computed for each score, which
+        audiogram: The ear in which they are prepared, or one for each item; None for a normal ear.
+        sample_rate, full_scale_spl, lengths, whole_khz: The arguments of ``haspi``.
+        keep: Store the clean signals' features; otherwise they are computed for each score, which
             takes less memory.
 
     Raises:
-        ValueError: as for ``haspi``.
+        ValueError: As for ``haspi``.
 
     >>> from hlsim.metrics import HaspiReference
     >>> issubclass(HaspiReference, Reference)
@@ -195,9 +195,9 @@ def map_on_cores(
     another, each in many threads, which wait for each other after every operation.
 
     Args:
-        function: function to call.
-        arguments: arguments of the calls.
-        signal: tensor on which the function depends. If it is not on a CPU or has a gradient, the
+        function: Function to call.
+        arguments: Arguments of the calls.
+        signal: Tensor on which the function depends. If it is not on a CPU or has a gradient, the
             calls are made in this thread, to which the hooks of autograd belong.
 
     >>> map_on_cores(abs, [-1, -2], torch.zeros(1))

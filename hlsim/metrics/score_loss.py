@@ -31,17 +31,17 @@ def score_loss(
     item with NaN or infinity in ``processed`` gives NaN.
 
     Args:
-        name: key of ``SCORES``.
-        processed: output of the compensator in pascals.
-        clean: clean speech in pascals, whose gradient is not followed.
-        ears: thresholds in dB HL.
-        ends: number of samples of each item.
-        sample_rate: sample rate in Hz.
+        name: Key of ``SCORES``.
+        processed: Output of the compensator in pascals.
+        clean: Clean speech in pascals, whose gradient is not followed.
+        ears: Thresholds in dB HL.
+        ends: Number of samples of each item.
+        sample_rate: Sample rate in Hz.
 
     Shape: (items, time) twice, (items, 8) -> (items,).
 
     Raises:
-        ValueError: an item is shorter than 0.7 s.
+        ValueError: An item is shorter than 0.7 s.
 
     >>> speech = torch.randn(1, 16000)
     >>> loss = score_loss("haspi", speech, speech, torch.zeros(1, 8), [16000], 16000)

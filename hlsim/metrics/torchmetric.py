@@ -126,16 +126,16 @@ class _MeanScore(_Metric):
         and ``ears`` has the mean of each ear.
 
         Args:
-            processed: output of the compensator.
-            clean: clean speech of the same shape.
-            audiogram: one ear, or one per item. For two channels a ``Listener``, whose missing ear
+            processed: Output of the compensator.
+            clean: Clean speech of the same shape.
+            audiogram: One ear, or one per item. For two channels a ``Listener``, whose missing ear
                 is left out, a pair of left and right ear, or one of these per item.
-            lengths: number of samples of each item, or its share of the time, for a padded batch.
+            lengths: Number of samples of each item, or its share of the time, for a padded batch.
 
         Shape: (time,), (batch, time) or (batch, 2, time) twice; ``lengths`` (batch,).
 
         Raises:
-            ValueError: the shapes do not fit, the signals are not what ``haspi`` accepts, or
+            ValueError: The shapes do not fit, the signals are not what ``haspi`` accepts, or
                 ``audiogram`` or ``lengths`` are not as described.
         """
         check_waveform(processed, "processed")
@@ -199,7 +199,7 @@ class _MeanScore(_Metric):
         """Add the state of another metric, given as a metric or as its ``metric_state``.
 
         Raises:
-            ValueError: the other metric has other settings, such as another sample rate.
+            ValueError: The other metric has other settings, such as another sample rate.
         """
         state = incoming_state
         if isinstance(incoming_state, _Metric):
@@ -217,9 +217,9 @@ class _MeanScore(_Metric):
         """Plot one or several values of the metric by matplotlib.
 
         Args:
-            val: value or list of values from calls or from ``compute``; by default that of
+            val: Value or list of values from calls or from ``compute``; by default that of
                 ``compute`` now.
-            ax: axes of matplotlib to draw into; by default those of a new figure.
+            ax: Axes of matplotlib to draw into; by default those of a new figure.
 
         Returns:
             Figure and axes.
@@ -287,19 +287,19 @@ class HASPI(_MeanScore):
     ``validation_step``.
 
     Args:
-        sample_rate: sample rate in Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
-        noise: treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        noise: Treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores
             of pyclarity.
-        seed: seed of the first item since the last reset, for ``noise="seeded"``. It rises by 1
+        seed: Seed of the first item since the last reset, for ``noise="seeded"``. It rises by 1
             with each item, so that epochs can be compared.
-        whole_khz: round the rate to whole kHz, as pyclarity does.
-        limit: number of items that are scored from one reset to the next in each process; the
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
+        limit: Number of items that are scored from one reset to the next in each process; the
             others are passed over. None scores all.
-        options: keyword arguments of ``torchmetrics.Metric``.
+        options: Keyword arguments of ``torchmetrics.Metric``.
 
     Raises:
-        ValueError: a value out of range, or ``dist_sync_on_step=True``.
+        ValueError: A value out of range, or ``dist_sync_on_step=True``.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASPI()

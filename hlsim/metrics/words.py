@@ -35,15 +35,15 @@ class Curve(NamedTuple):
     """Parameters of the model of the words understood.
 
     Attributes:
-        coefficients: intercept of the logit at a HASPI of 0.5, slope within an aid, and slope
+        coefficients: Intercept of the logit at a HASPI of 0.5, slope within an aid, and slope
             between the means of aids.
-        covariance: covariance of the three coefficients.
-        dispersion: parameter of the beta-binomial distribution of the words understood in a
+        covariance: Covariance of the three coefficients.
+        dispersion: Parameter of the beta-binomial distribution of the words understood in a
             sentence. The smaller it is, the more sentences differ.
-        listener: standard deviation of the intercepts of listeners.
-        listener_slope: standard deviation of the slopes of listeners.
-        aid: standard deviation of the intercepts of aids.
-        words: mean number of words per sentence.
+        listener: Standard deviation of the intercepts of listeners.
+        listener_slope: Standard deviation of the slopes of listeners.
+        aid: Standard deviation of the intercepts of aids.
+        words: Mean number of words per sentence.
 
     >>> 7.0 < load_curve().words < 10.0
     True
@@ -62,11 +62,11 @@ class WordsChange(NamedTuple):
     """Proportion of words that a new listener understands with two aids, and its change.
 
     Attributes:
-        before: proportion with the first aid.
-        after: proportion with the second aid.
-        change: mean change over listeners.
-        low: lower end of the interval of the change.
-        high: upper end of the interval of the change.
+        before: Proportion with the first aid.
+        after: Proportion with the second aid.
+        change: Mean change over listeners.
+        low: Lower end of the interval of the change.
+        high: Upper end of the interval of the change.
 
     >>> WordsChange(0.5, 0.7, 0.2, -0.1, 0.5).change
     0.2
@@ -102,13 +102,13 @@ def words_change(
         before: HASPI v2 of each sentence with the first aid, from 0 to 1. Shape: (items,).
         after: HASPI v2 of each sentence with the second aid, from 0 to 1. Shape: (items,), whose
             length may differ.
-        interval: proportion of listeners whose change lies between ``low`` and ``high``. The
+        interval: Proportion of listeners whose change lies between ``low`` and ``high``. The
             interval contains the differences between listeners, aids and sentences, and the
             uncertainty of the coefficients.
-        seed: seed of the simulated listeners.
+        seed: Seed of the simulated listeners.
 
     Raises:
-        ValueError: there are no scores, they have another shape or are outside 0 to 1, or the
+        ValueError: There are no scores, they have another shape or are outside 0 to 1, or the
             interval is outside 0 to 1.
 
     >>> words_change([0.3] * 20, [0.8] * 20).change > 0.3
@@ -133,7 +133,7 @@ def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
     """Return scores as an array, and their mean.
 
     Raises:
-        ValueError: there are no scores, or they are not HASPI scores.
+        ValueError: There are no scores, or they are not HASPI scores.
     """
     array = np.asarray(scores, dtype=np.float64)
     if array.ndim != 1 or not len(array) or not ((array >= 0.0) & (array <= 1.0)).all():
@@ -148,11 +148,11 @@ def simulate_changes(curve: Curve, aids: Sequence[tuple[Array, float]], seed: in
     """Simulate the change of the proportion of words from the first to the second of two aids.
 
     Args:
-        curve: parameters of the model.
+        curve: Parameters of the model.
         aids: HASPI of each sentence, and mean HASPI, with each aid.
-        seed: seed of the simulated listeners.
+        seed: Seed of the simulated listeners.
 
-    Returns: change for each listener. Shape: (draws,).
+    Returns: Change for each listener. Shape: (draws,).
 
     >>> scores = np.full(20, 0.6)
     >>> simulate_changes(load_curve(), [(scores, 0.6), (scores, 0.6)]).shape
@@ -168,11 +168,11 @@ def simulate_proportions(
     """Simulate the proportion of words that listeners understand with each aid.
 
     Args:
-        curve: parameters of the model.
+        curve: Parameters of the model.
         aids: HASPI of each sentence, and mean HASPI, with each aid.
-        seed: seed of the simulated listeners.
+        seed: Seed of the simulated listeners.
 
-    Returns: proportion for each listener, with each aid. Shape: (draws,) each.
+    Returns: Proportion for each listener, with each aid. Shape: (draws,) each.
 
     >>> scores = np.full(20, 0.6)
     >>> len(simulate_proportions(load_curve(), [(scores, 0.6), (scores, 0.6)]))

@@ -40,8 +40,8 @@ def bank_points(length: int, rate: int, step: int = 1) -> int:
     If this costs little, the length is a whole number of samples at another rate, too.
 
     Args:
-        length: number of samples of the signal at 44.1 kHz.
-        rate: the other rate in Hz.
+        length: Number of samples of the signal at 44.1 kHz.
+        rate: The other rate in Hz.
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
 
     >>> bank_points(44100, rate=16000)
@@ -58,10 +58,10 @@ def shared_multiple(rate: int, step: int = 1) -> int:
     """Find the number of samples at 44.1 kHz that are whole steps and whole samples at a rate.
 
     Args:
-        rate: sample rate in Hz.
+        rate: Sample rate in Hz.
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
 
-    Returns: the smallest such number, or 0 if it is above ``MAX_SHARED_MULTIPLE``.
+    Returns: The smallest such number, or 0 if it is above ``MAX_SHARED_MULTIPLE``.
 
     >>> shared_multiple(16000)
     3528
@@ -82,9 +82,9 @@ def simulate_cochlea(spectrum: Tensor, ratios: Tensor, bank: MultirateBank, slig
     Shape: complex (items, bins), (items, channels) -> complex (items, bins).
 
     Args:
-        spectrum: spectrum of the signals.
-        ratios: expansion ratio of each channel.
-        slight: correct the gain's kinks with slight losses (see ``apply_gains``). After smearing,
+        spectrum: Spectrum of the signals.
+        ratios: Expansion ratio of each channel.
+        slight: Correct the gain's kinks with slight losses (see ``apply_gains``). After smearing,
             they are masked.
 
     >>> from hlsim.msbg.filterbank import BANKS
@@ -123,7 +123,7 @@ def filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tensor
     Shape: complex (items, bins) -> (items, channels, time), (items, channels, 3, steps), where time
         is points or, for analytic signals, 2 * points.
 
-    Returns: the channels, where real and imaginary parts of analytic signals alternate, and the
+    Returns: The channels, where real and imaginary parts of analytic signals alternate, and the
         sums for ``smooth``.
 
     >>> from hlsim.msbg.filterbank import BANKS
@@ -152,8 +152,8 @@ def add_spectra(signals: dict[tuple[int, bool], Tensor], like: Tensor) -> Tensor
     Shape: (items, time) each, complex (items, bins) -> complex (items, bins).
 
     Args:
-        signals: signals by FFT length and by whether they are analytic.
-        like: tensor with the shape and the type of the result.
+        signals: Signals by FFT length and by whether they are analytic.
+        like: Tensor with the shape and the type of the result.
 
     >>> tone = torch.tensor([[1.0, 0.0, -1.0, 0.0]])
     >>> add_spectra({(4, False): tone}, like=torch.zeros(1, 3, dtype=torch.complex64)).real
@@ -178,8 +178,8 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
     Shape: (items, time), (items, channels) -> (items, time).
 
     Args:
-        waveform: signals at 44.1 kHz in Pa.
-        ratios: expansion ratio of each channel.
+        waveform: Signals at 44.1 kHz in Pa.
+        ratios: Expansion ratio of each channel.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> waveform = torch.randn(1, 1000)
@@ -206,6 +206,6 @@ def _before_advanced_end(bank: FilterBank, points: int, length: int) -> NDArray[
 
     The reference advances each channel by dropping its first samples, and fills the end with zeros.
 
-    Returns: mask of shape (channels, points).
+    Returns: Mask of shape (channels, points).
     """
     return np.arange(points) < length - np.array(bank.advances)[:, None]

@@ -23,14 +23,14 @@ def estimate_delay(
     Source: the Neuro-MSBG paper, Section III-A.
 
     Args:
-        simulator: simulator with the attributes ``sample_rate`` and ``full_scale_spl``. Build MSBG
+        simulator: Simulator with the attributes ``sample_rate`` and ``full_scale_spl``. Build MSBG
             with ``aligned=False``, because aligned simulators have no delay.
-        audiogram: hearing loss of one ear. By default, it is the simulator's stored one, or 0 dB HL
+        audiogram: Hearing loss of one ear. By default, it is the simulator's stored one, or 0 dB HL
             if there is none.
-        level: peak of the impulse, as the level in dB SPL of a constant signal of this value.
+        level: Peak of the impulse, as the level in dB SPL of a constant signal of this value.
 
     Raises:
-        ValueError: the simulator lacks an attribute, or the audiogram has more than one ear.
+        ValueError: The simulator lacks an attribute, or the audiogram has more than one ear.
 
     >>> from hlsim import MSBG
     >>> estimate_delay(MSBG("NH", sample_rate=44100, aligned=False))

@@ -47,9 +47,9 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     """Design the filter from the frontal free field to the cochlea, or back.
 
     Args:
-        backward: design the inverse filter, from the cochlea to the free field.
+        backward: Design the inverse filter, from the cochlea to the free field.
 
-    Returns: taps at 44.1 kHz. Shape: (1015,).
+    Returns: Taps at 44.1 kHz. Shape: (1015,).
 
     >>> ear_filter().shape
     (1015,)
@@ -72,7 +72,7 @@ def lowpass_filter() -> NDArray[np.float64]:
 
     It is a windowed sinc, as ``scipy.signal.firwin`` designs it.
 
-    Returns: taps at 44.1 kHz. Shape: (133,).
+    Returns: Taps at 44.1 kHz. Shape: (133,).
 
     >>> lowpass_filter().shape
     (133,)

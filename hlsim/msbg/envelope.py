@@ -52,8 +52,8 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
     Shape: complex (...) -> real (...).
 
     Args:
-        signals: analytic signals.
-        harmonics: include the terms of cos 2a and cos 4a. Channels need them if they are so wide
+        signals: Analytic signals.
+        harmonics: Include the terms of cos 2a and cos 4a. Channels need them if they are so wide
             for their centre frequency that these terms reach down to the frequencies of the
             envelope.
 
@@ -116,7 +116,7 @@ def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
     Shape: (..., time), (3, samples) -> (..., 3, steps).
 
     Args:
-        kernel: weights from ``decimation_kernel``.
+        kernel: Weights from ``decimation_kernel``.
 
     >>> decimate(torch.ones(1, 48), torch.from_numpy(decimation_kernel()).float()).shape
     torch.Size([1, 3, 2])
@@ -132,7 +132,7 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
     Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
 
     Args:
-        lowpass: frequency responses from ``envelope_lowpass``.
+        lowpass: Frequency responses from ``envelope_lowpass``.
 
     >>> smooth(torch.ones(1, 3, 4), torch.ones(1, 3))
     tensor([[3., 3., 3., 3.]])
@@ -152,7 +152,7 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
         time is a multiple of 24.
 
     Args:
-        lowpass: frequency responses from ``envelope_lowpass``.
+        lowpass: Frequency responses from ``envelope_lowpass``.
 
     >>> envelope(torch.full((1, 96), -2.0), torch.ones(1, 3)).round(decimals=3)
     tensor([[2., 2., 2., 2.]])
@@ -176,11 +176,11 @@ def envelope_lowpass(
 
     Args:
         points: FFT length at 44.1 kHz, a whole number of steps.
-        samples: number of samples of the rectified signal per step.
-        channels: channels of the bank, by default all of them.
-        step: length of a step in samples at 44.1 kHz.
+        samples: Number of samples of the rectified signal per step.
+        channels: Channels of the bank, by default all of them.
+        step: Length of a step in samples at 44.1 kHz.
 
-    Returns: responses of shape (channels, steps // 2 + 1).
+    Returns: Responses of shape (channels, steps // 2 + 1).
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> envelope_lowpass(BANKS["mild"], points=4800).shape
@@ -206,7 +206,7 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
 
     Its cut-off frequency is 75 Hz, or three quarters of the channel's ERB if this is lower.
 
-    Returns: numerator and denominator for each channel, three coefficients each.
+    Returns: Numerator and denominator for each channel, three coefficients each.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> len(envelope_filters(BANKS["mild"]))
@@ -225,7 +225,7 @@ def elliptic_lowpass(cutoff: float) -> tuple[NDArray[np.float64], NDArray[np.flo
     Args:
         cutoff: cut-off frequency relative to the Nyquist frequency.
 
-    Returns: numerator and denominator, three coefficients each.
+    Returns: Numerator and denominator, three coefficients each.
 
     >>> numerator, denominator = elliptic_lowpass(0.1)
     >>> print((numerator.sum() / denominator.sum()).round(3))  # -0.25 dB at 0 Hz
@@ -253,9 +253,9 @@ def decimation_kernel(samples: int = STEP) -> NDArray[np.float64]:
     """Compute the weights with which the samples of a step contribute to the running means.
 
     Args:
-        samples: number of samples per step.
+        samples: Number of samples per step.
 
-    Returns: weights of shape (3, samples). The rows are the contributions to the mean at the step
+    Returns: Weights of shape (3, samples). The rows are the contributions to the mean at the step
         after, at the same step and at the step before.
 
     >>> print(decimation_kernel(3).sum(-1).round(3))

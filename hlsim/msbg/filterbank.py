@@ -17,14 +17,14 @@ class FilterBank:
     """A gammatone filter bank, and what compensates for its filters' delays and skirts.
 
     Attributes:
-        broadening: bandwidth of the filters relative to that of a normal ear.
-        centre_frequencies: centre frequency of each channel in Hz, in ascending order.
-        advances: number of samples at 44.1 kHz by which each channel is advanced, so that the
+        broadening: Bandwidth of the filters relative to that of a normal ear.
+        centre_frequencies: Centre frequency of each channel in Hz, in ascending order.
+        advances: Number of samples at 44.1 kHz by which each channel is advanced, so that the
             envelopes of all channels are aligned.
-        highpass_corners: corner frequencies of the high-passes of the upper channels, in units of
+        highpass_corners: Corner frequencies of the high-passes of the upper channels, in units of
             44100 / 8192 Hz. The high-passes are Bessel filters of second order, which attenuate the
             channels' lower skirts. The lower channels have none.
-        recombination_db: level of the sum of all channels relative to the input in dB.
+        recombination_db: Level of the sum of all channels relative to the input in dB.
 
     >>> BANKS["severe"].channels
     19
@@ -124,10 +124,10 @@ def gammatone_response(
 
     Args:
         points: FFT length at 44.1 kHz, whose ``rfft`` has the frequencies of the responses.
-        channels: channels of the bank, by default all of them.
-        bins: number of frequencies from 0 Hz up, by default all of them.
+        channels: Channels of the bank, by default all of them.
+        bins: Number of frequencies from 0 Hz up, by default all of them.
 
-    Returns: responses of shape (channels, bins), where bins is points // 2 + 1 by default.
+    Returns: Responses of shape (channels, bins), where bins is points // 2 + 1 by default.
 
     >>> response = gammatone_response(BANKS["mild"], points=44100)
     >>> response.shape
@@ -172,8 +172,8 @@ def _bessel_highpass(
     The bilinear transform that makes them digital is warped to keep the corner frequency in place.
 
     Args:
-        corner_hz: corner frequencies in Hz.
-        omega: frequencies of the response in radians per sample.
+        corner_hz: Corner frequencies in Hz.
+        omega: Frequencies of the response in radians per sample.
     """
     s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner_hz / MSBG_RATE)
     return s**2 / (s**2 + 3.0 * s + 3.0)

@@ -38,10 +38,10 @@ def end_oscillation(channels: Tensor, weights: Tensor, response: Tensor, length:
         time // 24).
 
     Args:
-        channels: channels that are 0 from sample ``length`` on.
-        weights: weights of the last samples from ``end_weights``.
-        response: oscillations from ``end_responses`` for this length.
-        length: number of samples of the signal.
+        channels: Channels that are 0 from sample ``length`` on.
+        weights: Weights of the last samples from ``end_weights``.
+        response: Oscillations from ``end_responses`` for this length.
+        length: Number of samples of the signal.
 
     >>> import torch
     >>> from hlsim.msbg.filterbank import BANKS
@@ -64,7 +64,7 @@ def end_oscillation(channels: Tensor, weights: Tensor, response: Tensor, length:
 def end_weights(bank: FilterBank) -> Array:
     """Compute the weights of the last samples in the two amplitudes of the oscillation.
 
-    Returns: weights of shape (channels, 2, 4096), with the last sample last.
+    Returns: Weights of shape (channels, 2, 4096), with the last sample last.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> end_weights(BANKS["severe"]).shape
@@ -80,10 +80,10 @@ def end_responses(bank: FilterBank, length: int) -> Array:
     the envelopes are, every 24 samples (a step).
 
     Args:
-        length: number of samples of the signal, or a number that leaves the same remainder when
+        length: Number of samples of the signal, or a number that leaves the same remainder when
             it is divided by 24.
 
-    Returns: oscillations of shape (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps
+    Returns: Oscillations of shape (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps
         after the end of the signal.
 
     >>> from hlsim.msbg.filterbank import BANKS
@@ -109,10 +109,10 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
     next state is transition z + input_vector u.
 
     Args:
-        numerator: three coefficients b0, b1, b2.
-        denominator: three coefficients 1, a1, a2.
+        numerator: Three coefficients b0, b1, b2.
+        denominator: Three coefficients 1, a1, a2.
 
-    Returns: weights of shape (2, 4096), and oscillations of shape (samples, 2), which run backwards
+    Returns: Weights of shape (2, 4096), and oscillations of shape (samples, 2), which run backwards
         in time from ``AHEAD`` steps behind the end.
     """
     transition = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
@@ -123,8 +123,8 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
         """Compute the state of the backward pass at the end of the signal.
 
         Args:
-            state: state of the forward pass at the end of the signal.
-            newest: last nine samples of the signal, the last one first.
+            state: State of the forward pass at the end of the signal.
+            newest: Last nine samples of the signal, the last one first.
         """
         outputs = []
         for sample in 2.0 * newest[0] - newest[1:]:

@@ -88,15 +88,15 @@ class MSBG(nn.Module):
     on an FFT grid.
 
     Args:
-        audiogram: ear or ears; they may be passed with each call instead. Like pyclarity, the model
+        audiogram: Ear or ears; they may be passed with each call instead. Like pyclarity, the model
             takes an ``Audiogram`` at the frequencies at which it was measured: the severity from
             those that lie between 2 and 8 kHz, and the threshold of each channel by linear
             interpolation in Hz. A tensor has the thresholds at the eight ``FREQUENCIES``.
-        sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000. Inside, the model runs
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Inside, the model runs
             at 44.1 kHz or, aligned and at rates up to 20000, at 22.05 kHz. At rates below 44100 the
             last 80 Hz below half the rate fade out.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-        aligned: remove the delay of the model and return as many samples as the input has.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+        aligned: Remove the delay of the model and return as many samples as the input has.
             Otherwise the output is that of the reference, sample by sample at 44.1 kHz, with its
             delay and, if it smears, 64 * (ceil(time / 64) + 3) samples long (in a mixed batch the
             shorter ones end in zeros). Signals under 1000 samples are all onset of the first
@@ -104,16 +104,16 @@ class MSBG(nn.Module):
             ``filtfilt``, and high-passes that begin after the advance. From 701 samples such
             signals were up to 0.03 off, from 501 0.1, from 441 0.2; with fewer, pyclarity returns
             NaN or fails.
-        rescale_active: first scale each signal by the ratio of its overall to its active RMS, a
+        rescale_active: First scale each signal by the ratio of its overall to its active RMS, a
             gain of 1 to 3 dB down that depends on the utterance, as the reference does with one
             channel. It scales two channels by one gain.
 
     Attributes:
-        checkpoint: compute activations again in the backward pass, a few items or one block at a
+        checkpoint: Compute activations again in the backward pass, a few items or one block at a
             time, instead of storing them. False by default.
 
     Raises:
-        ValueError: a rate, level or audiogram out of range.
+        ValueError: A rate, level or audiogram out of range.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()[:16000]
@@ -162,13 +162,13 @@ class MSBG(nn.Module):
         """Return what the ear perceives.
 
         Args:
-            waveform: input at the level that ``full_scale_spl`` declares.
-            audiogram: one ear, or (..., 8) that broadcasts over the leading dimensions.
+            waveform: Input at the level that ``full_scale_spl`` declares.
+            audiogram: One ear, or (..., 8) that broadcasts over the leading dimensions.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
+            ValueError: No audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids
@@ -185,10 +185,10 @@ class MSBG(nn.Module):
         """Return the structural delay in samples at 44.1 kHz: that of filters and frames.
 
         Args:
-            severity: one of ``SEVERITIES``.
+            severity: One of ``SEVERITIES``.
 
         Raises:
-            ValueError: the severity is unknown.
+            ValueError: The severity is unknown.
         """
         if severity not in SEVERITIES:
             raise ValueError(f"expected a severity of {', '.join(SEVERITIES)}, got {severity!r}")
@@ -206,9 +206,9 @@ class MSBG(nn.Module):
         """Return the perceived signals. Shape: (..., time), (..., 8) -> (..., time).
 
         Args:
-            waveform: input.
-            thresholds: ears at the eight frequencies in dB HL.
-            grids: ears at other frequencies, from ``ears_on_other_grids``.
+            waveform: Input.
+            thresholds: Ears at the eight frequencies in dB HL.
+            grids: Ears at other frequencies, from ``ears_on_other_grids``.
         """
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
@@ -265,10 +265,10 @@ class MSBG(nn.Module):
         """Return the perceived signals of items of one group.
 
         Args:
-            signals: signals in pascals.
-            ears: thresholds at the frequencies of the group in dB HL.
-            is_last: whether the signals end here, and are not cut from longer ones.
-            group: properties that the ears share.
+            signals: Signals in pascals.
+            ears: Thresholds at the frequencies of the group in dB HL.
+            is_last: Whether the signals end here, and are not cut from longer ones.
+            group: Properties that the ears share.
 
         Shape: (items, time), (items, levels) -> (items, time).
         """
@@ -368,15 +368,15 @@ def _group_items(
     """Group items that can run together.
 
     Args:
-        ears: thresholds on the CPU in dB HL. Shape: (items, 8).
-        is_trained: whether the ears require a gradient. Then no ear counts as one without a loss.
-        grids: for each item its ear if it is not at the eight frequencies; or an empty list.
+        ears: Thresholds on the CPU in dB HL. Shape: (items, 8).
+        is_trained: Whether the ears require a gradient. Then no ear counts as one without a loss.
+        grids: For each item its ear if it is not at the eight frequencies; or an empty list.
 
     Returns:
         Indices of the items of each group.
 
     Raises:
-        ValueError: a threshold was out of range, and a GPU has turned it into NaN.
+        ValueError: A threshold was out of range, and a GPU has turned it into NaN.
     """
     if bool(ears.isnan().any()):
         raise ValueError(

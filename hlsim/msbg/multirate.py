@@ -76,13 +76,13 @@ class RateBand:
     """Neighbouring channels that run at one sample rate.
 
     Attributes:
-        channels: indices of the channels in the bank.
+        channels: Indices of the channels in the bank.
         points: FFT length at the band's rate.
-        detector: signal from which envelopes are computed.
-        response: responses of the channels with shape (channels, points // 2 + 1), or of their
+        detector: Signal from which envelopes are computed.
+        response: Responses of the channels with shape (channels, points // 2 + 1), or of their
             analytic signals with shape (channels, points).
-        decimation: weights of the samples of a step. Shape: (3, samples).
-        interpolation: weights from ``interpolation_kernel``, repeated for the real and imaginary
+        decimation: Weights of the samples of a step. Shape: (3, samples).
+        interpolation: Weights from ``interpolation_kernel``, repeated for the real and imaginary
             parts of analytic signals.
 
     >>> from hlsim.msbg.filterbank import BANKS
@@ -106,8 +106,8 @@ class MultirateBank:
     """Filter bank for signals of one length.
 
     Attributes:
-        bands: rate bands, from the lowest channels up.
-        lowpass: responses of the envelopes' low-passes, one row per channel of the bands. Shape:
+        bands: Rate bands, from the lowest channels up.
+        lowpass: Responses of the envelopes' low-passes, one row per channel of the bands. Shape:
             (channels, steps // 2 + 1).
 
     >>> from hlsim.msbg.filterbank import BANKS
@@ -135,7 +135,7 @@ def assign_rates(
 
     Args:
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: highest frequency of interest in Hz, at most 11025 if ``step`` is 2.
+        highest: Highest frequency of interest in Hz, at most 11025 if ``step`` is 2.
 
     Returns: channels, samples per step and detector of each band, from the lowest channels up.
 
@@ -165,10 +165,10 @@ def _rate_and_detector(
     """Choose the samples per step and the detector of a channel.
 
     Args:
-        centre: centre frequency in Hz.
-        top: frequency in Hz up to which the channel is kept.
-        is_wide: whether harmonics of the channel reach down to 0 Hz.
-        step, highest: arguments of ``assign_rates``.
+        centre: Centre frequency in Hz.
+        top: Frequency in Hz up to which the channel is kept.
+        is_wide: Whether harmonics of the channel reach down to 0 Hz.
+        step, highest: Arguments of ``assign_rates``.
     """
     steps_per_second = MSBG_RATE / envelope_step(step)
     if centre < _RECTIFIED_BELOW_HZ:
@@ -195,9 +195,9 @@ def multirate_bank(
     Args:
         points: FFT length at 44.1 kHz, a whole number of the envelopes' steps.
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: highest frequency of interest in Hz.
-        dtype: precision of real tensors, and of the parts of complex ones.
-        device: device of the tensors.
+        highest: Highest frequency of interest in Hz.
+        dtype: Precision of real tensors, and of the parts of complex ones.
+        device: Device of the tensors.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> device = torch.device("cpu")
@@ -279,7 +279,7 @@ def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
     """Compute the factor on the envelope of merged channels that gives them the gain of their sum.
 
     Args:
-        responses: responses of the channels at one frequency. Shape: (channels,).
+        responses: Responses of the channels at one frequency. Shape: (channels,).
     """
     exponent = _MERGED_RATIO - 1.0
     total = abs(responses.sum())
@@ -295,7 +295,7 @@ def total_response(bank: FilterBank, points: int, step: int) -> NDArray[np.compl
         points: FFT length at 44.1 kHz.
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
 
-    Returns: response of shape (points // step // 2 + 1,).
+    Returns: Response of shape (points // step // 2 + 1,).
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> total_response(BANKS["none"], points=4800, step=2).shape
@@ -314,8 +314,8 @@ def _split_for_cache(
     """Split bands on a CPU into parts whose samples fit into its cache.
 
     Args:
-        bands: result of ``assign_rates``.
-        steps: number of steps of the envelopes.
+        bands: Result of ``assign_rates``.
+        steps: Number of steps of the envelopes.
     """
     if device.type != "cpu":
         return bands

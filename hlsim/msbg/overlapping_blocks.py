@@ -43,11 +43,11 @@ def in_blocks(
     Blocks of long signals are computed again in the backward pass.
 
     Args:
-        process: function of signals, ears, and whether the signals end where their block does.
-        signals: signals of all items.
-        ears: thresholds of all items.
-        rate: sample rate in Hz.
-        checkpoints_short: compute signals of one block again in the backward pass, too.
+        process: Function of signals, ears, and whether the signals end where their block does.
+        signals: Signals of all items.
+        ears: Thresholds of all items.
+        rate: Sample rate in Hz.
+        checkpoints_short: Compute signals of one block again in the backward pass, too.
 
     Shape: (items, time), (items, levels) -> (items, time).
 
@@ -80,8 +80,8 @@ def block_bounds(samples: int, rate: int) -> list[Block]:
     the filters take to settle.
 
     Args:
-        samples: length of the signal.
-        rate: sample rate in Hz.
+        samples: Length of the signal.
+        rate: Sample rate in Hz.
 
     >>> [(block.input_start, block.input_stop) for block in block_bounds(320000, rate=16000)]
     [(0, 133120), (102400, 256000), (225280, 320000)]

@@ -52,8 +52,8 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     Shape: (..., frequencies), (frequencies, channels) -> (..., channels).
 
     Args:
-        thresholds: audiograms in dB HL.
-        weights: interpolation weights from ``threshold_weights``.
+        thresholds: Audiograms in dB HL.
+        weights: Interpolation weights from ``threshold_weights``.
 
     >>> expansion_ratios(torch.full((8,), 35.0), torch.full((8, 1), 0.125))
     tensor([1.5000])
@@ -69,7 +69,7 @@ def threshold_weights(
 ) -> NDArray[np.float64]:
     """Compute the weights of the thresholds at some frequencies in the threshold of each channel.
 
-    Returns: weights of shape (frequencies, channels).
+    Returns: Weights of shape (frequencies, channels).
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> threshold_weights(BANKS["severe"]).shape
@@ -84,8 +84,8 @@ def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
 
     Args:
-        envelopes: envelopes in Pa.
-        ratios: expansion ratio of each channel.
+        envelopes: Envelopes in Pa.
+        ratios: Expansion ratio of each channel.
 
     >>> envelopes = torch.tensor([[100.0, 3.5481, 0.35481]])
     >>> recruitment_gains(envelopes, torch.tensor([2.0])).round(decimals=3)
@@ -102,8 +102,8 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
     Shape: (..., steps + 5), (rows, columns) -> (..., time).
 
     Args:
-        values: values from ``pad_periodically``.
-        kernel: weights from ``interpolation_kernel``.
+        values: Values from ``pad_periodically``.
+        kernel: Weights from ``interpolation_kernel``.
 
     >>> kernel = torch.from_numpy(interpolation_kernel(samples=2)).float()
     >>> interpolate(pad_periodically(torch.ones(8)), kernel)[:3].round(decimals=3)
@@ -135,9 +135,9 @@ def apply_gains(
     Shape: (..., channels, time), (..., channels, steps + 5), (rows, columns) -> (..., time).
 
     Args:
-        gains: gains at each step from ``pad_periodically``.
-        kernel: weights from ``interpolation_kernel``.
-        slight: envelopes of shape (..., channels, steps) and ratios of shape (..., channels), which
+        gains: Gains at each step from ``pad_periodically``.
+        kernel: Weights from ``interpolation_kernel``.
+        slight: Envelopes of shape (..., channels, steps) and ratios of shape (..., channels), which
             are needed if some ears have a slight loss.
 
     >>> kernel = torch.from_numpy(interpolation_kernel()).float()
@@ -243,8 +243,8 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
 
     Args:
-        envelopes: envelopes in Pa at the beginning of each step.
-        ratios: expansion ratio of each channel.
+        envelopes: Envelopes in Pa at the beginning of each step.
+        ratios: Expansion ratio of each channel.
 
     >>> tone = torch.ones(1, 8 * STEP)
     >>> expand(tone, torch.full((1, 8), 0.35481), torch.tensor([2.0]))[:3].round(decimals=3)
@@ -264,13 +264,13 @@ def interpolation_kernel(
     Each sample is interpolated from six values by Lagrange's polynomial of fifth order.
 
     Args:
-        samples: number of samples per step.
-        repeats: number of times that each interpolated value is repeated. Analytic signals need 2,
+        samples: Number of samples per step.
+        repeats: Number of times that each interpolated value is repeated. Analytic signals need 2,
             for their real and imaginary parts.
-        steps_per_window: number of steps that one row of the matrix product interpolates. A
+        steps_per_window: Number of steps that one row of the matrix product interpolates. A
             divisor of the number of all steps is best.
 
-    Returns: weights of shape (steps_per_window + 5, steps_per_window * samples * repeats).
+    Returns: Weights of shape (steps_per_window + 5, steps_per_window * samples * repeats).
 
     >>> interpolation_kernel().shape
     (13, 192)

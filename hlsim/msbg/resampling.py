@@ -27,8 +27,8 @@ def to_cochlea(signals: Tensor, rate: int, length: int, step: int) -> Tensor:
     Shape: (items, time) -> (items, length).
 
     Args:
-        rate: sample rate of the signals in Hz.
-        length: number of samples of the result.
+        rate: Sample rate of the signals in Hz.
+        length: Number of samples of the result.
         step: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
 
     >>> to_cochlea(torch.randn(2, 16000), rate=16000, length=44100, step=1).shape
@@ -60,10 +60,10 @@ def from_spectrum(
     Args:
         points: FFT length of the spectrum, in samples at 44.1 kHz.
         step: 1 for the spectrum of a signal at 44.1 kHz, 2 for that of a signal at 22.05 kHz.
-        rate: sample rate of the result in Hz.
-        samples: number of samples of the result.
-        gain: linear gain of the result.
-        delay: samples at 44.1 kHz by which the result is advanced.
+        rate: Sample rate of the result in Hz.
+        samples: Number of samples of the result.
+        gain: Linear gain of the result.
+        delay: Samples at 44.1 kHz by which the result is advanced.
 
     >>> spectrum = torch.fft.rfft(torch.randn(1, 49392))
     >>> from_spectrum(spectrum, 49392, 1, 16000, 16000, gain=1.0, delay=1047).shape
@@ -88,11 +88,11 @@ def from_cochlea(
     Shape: (items, length) -> (items, samples).
 
     Args:
-        rate: sample rate of the result in Hz.
-        samples: number of samples of the result.
-        gain: linear gain of the result.
+        rate: Sample rate of the result in Hz.
+        samples: Number of samples of the result.
+        gain: Linear gain of the result.
         step: 1 for a waveform at 44.1 kHz, 2 for a waveform at 22.05 kHz.
-        delay: samples at 44.1 kHz by which the result is advanced.
+        delay: Samples at 44.1 kHz by which the result is advanced.
 
     >>> from_cochlea(torch.randn(1, 44100), rate=16000, samples=16000, gain=1.0).shape
     torch.Size([1, 16000])
@@ -112,7 +112,7 @@ def resample_to_model_rate(signals: Tensor, rate: int) -> Tensor:
     """Resample signals to 44.1 kHz. Shape: (items, time) -> (items, ceil(time * 44100 / rate)).
 
     Args:
-        rate: sample rate of the signals in Hz.
+        rate: Sample rate of the signals in Hz.
 
     >>> resample_to_model_rate(torch.randn(2, 1600), rate=16000).shape
     torch.Size([2, 4410])
@@ -138,9 +138,9 @@ def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[
 
     Args:
         points: FFT length at 44.1 kHz.
-        rate: sample rate in Hz from which signals are resampled.
+        rate: Sample rate in Hz from which signals are resampled.
 
-    Returns: response of shape (bins,).
+    Returns: Response of shape (bins,).
     """
     return gain * np.fft.rfft(ear_filter(), points)[:bins] * _band_end(points, bins, rate)
 
@@ -152,10 +152,10 @@ def _outward_response(
 
     Args:
         points: FFT length at 44.1 kHz.
-        delay: samples at 44.1 kHz by which signals are advanced.
-        rate: sample rate in Hz to which signals are resampled.
+        delay: Samples at 44.1 kHz by which signals are advanced.
+        rate: Sample rate in Hz to which signals are resampled.
 
-    Returns: response of shape (bins,).
+    Returns: Response of shape (bins,).
     """
     inverse_ear = np.fft.rfft(ear_filter(backward=True), points)
     response = inverse_ear * np.fft.rfft(lowpass_filter(), points)
@@ -175,9 +175,9 @@ def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
 
     Args:
         points: FFT length at 44.1 kHz.
-        rate: sample rate in Hz of signals outside the model.
+        rate: Sample rate in Hz of signals outside the model.
 
-    Returns: weights of shape (bins,).
+    Returns: Weights of shape (bins,).
     """
     if rate == MSBG_RATE:
         return np.ones(bins)
@@ -195,9 +195,9 @@ def _fft_grid(samples: int, up: int, down: int) -> tuple[int, int]:
     """FFT lengths outside and inside the model that span the same time.
 
     Args:
-        samples: smallest length outside the model.
-        up: rate inside the model, in the same unit as ``down``.
-        down: rate outside the model.
+        samples: Smallest length outside the model.
+        up: Rate inside the model, in the same unit as ``down``.
+        down: Rate outside the model.
     """
     units = fft_length(math.ceil(samples / down), 4)
     return units * down, units * up

@@ -37,10 +37,10 @@ def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.compl
     """Compute the response of aligned MSBG with a gain of 1 in all channels.
 
     Args:
-        rate: sample rate in Hz.
+        rate: Sample rate in Hz.
         points: FFT length at ``rate``, whose duration is a whole number of samples at 44.1 kHz.
 
-    Returns: response of shape (points // 2 + 1,), which is 0 above 22.05 kHz.
+    Returns: Response of shape (points // 2 + 1,), which is 0 above 22.05 kHz.
 
     >>> response = fixed_response(BANKS["none"], rate=16000, points=16000)
     >>> print(abs(response[1000]).round(2))
@@ -68,9 +68,9 @@ def apply_bank_phase(
     Shape: (items, time), (items, 8) -> (items, time).
 
     Args:
-        thresholds: audiograms in dB HL, whose severity selects the bank.
-        rate: sample rate in Hz.
-        normal: the waveform is MSBG's output for a normal ear, so that the phase of the bank for
+        thresholds: Audiograms in dB HL, whose severity selects the bank.
+        rate: Sample rate in Hz.
+        normal: The waveform is MSBG's output for a normal ear, so that the phase of the bank for
             normal ears is removed.
 
     >>> apply_bank_phase(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
@@ -97,8 +97,8 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
     Shape: (items, time), (items, 8) -> (items, time).
 
     Args:
-        thresholds: audiograms in dB HL, whose severity selects the bank.
-        rate: sample rate in Hz.
+        thresholds: Audiograms in dB HL, whose severity selects the bank.
+        rate: Sample rate in Hz.
 
     >>> simulate_normal_ear(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
     torch.Size([1, 1600])
@@ -110,7 +110,7 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
 def _normal_ear_taps(rate: int) -> NDArray[np.float64]:
     """Compute impulse responses with a normal ear's magnitude and each severity's phase.
 
-    Returns: taps of shape (severities, 2 * half).
+    Returns: Taps of shape (severities, 2 * half).
     """
     responses, points = _responses(rate)
     phases = np.exp(1j * np.angle(responses))
@@ -121,9 +121,9 @@ def _phase_taps(rate: int, normal: bool) -> NDArray[np.float64]:
     """Compute impulse responses with each severity's phase.
 
     Args:
-        normal: subtract the phase of the bank for normal ears.
+        normal: Subtract the phase of the bank for normal ears.
 
-    Returns: taps of shape (severities, 2 * half).
+    Returns: Taps of shape (severities, 2 * half).
     """
     responses, points = _responses(rate)
     if normal:
@@ -138,7 +138,7 @@ def _phase_taps(rate: int, normal: bool) -> NDArray[np.float64]:
 def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
     """Compute the response of each severity's bank.
 
-    Returns: responses of shape (severities, points // 2 + 1), and the FFT length ``points``.
+    Returns: Responses of shape (severities, points // 2 + 1), and the FFT length ``points``.
     """
     common = math.gcd(rate, MSBG_RATE)
     points = rate // common * 2 * math.ceil(common / (2.0 * MAX_SPACING_HZ))
@@ -164,7 +164,7 @@ def impulse_responses(
 
     Args:
         points: FFT length of the responses.
-        rate: sample rate in Hz.
+        rate: Sample rate in Hz.
 
     >>> impulse_responses(np.ones((1, 4001)), points=8000, rate=16000)[0, 1023:1026]
     array([0., 1., 0.])

@@ -59,12 +59,12 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
     """Compute rounded-exponential auditory filters (1 + g) exp(-g) divided by their bandwidths.
 
     Args:
-        lower: factor by which the lower sides of the filters are wider than normal.
-        upper: factor by which the upper sides of the filters are wider than normal.
-        count: number of filters, and of frequencies.
-        spacing: distance in Hz between frequencies, the first of which is 0 Hz.
+        lower: Factor by which the lower sides of the filters are wider than normal.
+        upper: Factor by which the upper sides of the filters are wider than normal.
+        count: Number of filters, and of frequencies.
+        spacing: Distance in Hz between frequencies, the first of which is 0 Hz.
 
-    Returns: filters of shape (count, count), one filter per row.
+    Returns: Filters of shape (count, count), one filter per row.
 
     >>> roex_filters(1.0, 1.0, count=256, spacing=44100 / 512).shape
     (256, 256)
@@ -96,8 +96,8 @@ def smearing_from_filters(
     Shape: (count, count), (count, count) -> (count, count).
 
     Args:
-        normal: filters of a normal ear, one per row.
-        wide: filters of an impaired ear, one per row.
+        normal: Filters of a normal ear, one per row.
+        wide: Filters of an impaired ear, one per row.
 
     >>> filters = roex_filters(1.0, 1.0, count=8, spacing=1000.0)
     >>> print(smearing_from_filters(filters, filters).shape)
@@ -121,10 +121,10 @@ def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
     """Compute the matrix that smears MSBG's power spectra.
 
     Args:
-        lower: factor by which the lower sides of the filters are wider than normal.
-        upper: factor by which the upper sides of the filters are wider than normal.
+        lower: Factor by which the lower sides of the filters are wider than normal.
+        upper: Factor by which the upper sides of the filters are wider than normal.
 
-    Returns: matrix of shape (256, 256).
+    Returns: Matrix of shape (256, 256).
 
     >>> smearing_matrix(*BROADENING["mild"]).shape
     (256, 256)
@@ -140,9 +140,9 @@ def smearing_matrix_below(severity: str, step: int, highest: float) -> NDArray[n
     """Cut the part for low frequencies out of the smearing matrix of a severity.
 
     Args:
-        severity: a key of ``BROADENING``.
+        severity: A key of ``BROADENING``.
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: highest frequency in Hz of the input. The part is larger by the skirts of the
+        highest: Highest frequency in Hz of the input. The part is larger by the skirts of the
             spectra.
 
     >>> smearing_matrix_below("mild", step=2, highest=8000.0).shape
@@ -210,12 +210,12 @@ def smear_spectrum(
         (..., bins).
 
     Args:
-        matrix: smearing matrix of all items, or one per item.
-        gradient_floor: bound of the gradients, which are computed as if smearing multiplied each
+        matrix: Smearing matrix of all items, or one per item.
+        gradient_floor: Bound of the gradients, which are computed as if smearing multiplied each
             power by this factor at least and by its reciprocal at most. With 0, gradients have no
             bound where smearing changes the sign of a power or fills an empty frequency.
 
-    Returns: the smeared spectrum and its power.
+    Returns: The smeared spectrum and its power.
 
     >>> spectrum = torch.tensor([3.0 + 4.0j, 0.0])
     >>> mixing = torch.tensor([[0.5, 0.5], [0.0, 1.0]])
@@ -234,7 +234,7 @@ def _smear_spectrum(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Compute ``smear_spectrum`` and what its gradient needs.
 
-    Returns: the smeared spectrum, its power, the real and the imaginary part of the factor on the
+    Returns: The smeared spectrum, its power, the real and the imaginary part of the factor on the
         spectrum, and the power of the spectrum.
     """
     spectrum_power = power(spectrum)
@@ -331,7 +331,7 @@ def _window(step: int) -> Tensor:
 
     The squares of four windows that are one hop apart add up to 1.
 
-    Returns: window of shape (512 // step,).
+    Returns: Window of shape (512 // step,).
     """
     phase = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
     window = (0.5 - 0.5 * phase.cos()) / math.sqrt(1.5)

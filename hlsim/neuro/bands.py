@@ -61,10 +61,10 @@ class BandCorrection(nn.Module):
             frequencies).
 
         Args:
-            spectrum: spectra of the output of ``prior.filter``.
-            ears: audiograms in dB HL.
-            severity: index of each ear's severity.
-            prior: known gains of MSBG.
+            spectrum: Spectra of the output of ``prior.filter``.
+            ears: Audiograms in dB HL.
+            severity: Index of each ear's severity.
+            prior: Known gains of MSBG.
         """
         smeared, smeared_power = prior.smear(spectrum, severity)
         levels = prior.channel_levels(smeared_power, severity)
@@ -137,7 +137,7 @@ def _interpolate_steps(values: Tensor, step: int) -> Tensor:
     Shape: (items, steps, ...) -> (items, steps * step, ...).
 
     Args:
-        step: number of frames per step.
+        step: Number of frames per step.
     """
     following = torch.cat((values[:, 1:], values[:, -1:]), 1)
     interpolated = [values.lerp(following, frame / step) for frame in range(1, step)]

@@ -23,10 +23,10 @@ class ConvPath(nn.Module):
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
-        channels: number of channels.
+        channels: Number of channels.
         axis: 0 for time, 1 for frequency.
-        kernel: length of the convolution, an odd number.
-        expansion: factor by which the linear expansion increases the number of channels.
+        kernel: Length of the convolution, an odd number.
+        expansion: Factor by which the linear expansion increases the number of channels.
 
     >>> ConvPath(8, axis=0, kernel=7, expansion=2)(torch.randn(1, 20, 5, 8)).shape
     torch.Size([1, 20, 5, 8])
@@ -55,10 +55,10 @@ class SequencePath(nn.Module):
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
-        channels: number of channels.
+        channels: Number of channels.
         axis: 0 for time, 1 for frequency. Each row along this axis is a sequence.
-        core: layer for sequences, (sequences, length, channels) -> (sequences, length, width).
-        width: number of channels of the layer's output.
+        core: Layer for sequences, (sequences, length, channels) -> (sequences, length, width).
+        width: Number of channels of the layer's output.
 
     >>> path = SequencePath(8, axis=0, core=BidirectionalLSTM(8, hidden=4), width=8)
     >>> path(torch.randn(1, 20, 5, 8)).shape
@@ -87,9 +87,9 @@ class BidirectionalMamba(nn.Module):
     Shape: (sequences, length, channels) -> (sequences, length, 2 * channels).
 
     Args:
-        channels: number of channels of the input.
-        states: number of states per inner channel.
-        expansion: number of inner channels relative to ``channels``.
+        channels: Number of channels of the input.
+        states: Number of states per inner channel.
+        expansion: Number of inner channels relative to ``channels``.
 
     >>> BidirectionalMamba(8, states=4, expansion=2)(torch.randn(3, 20, 8)).shape
     torch.Size([3, 20, 16])
@@ -108,8 +108,8 @@ class BidirectionalLSTM(nn.Module):
     """An LSTM in both directions. Shape: (sequences, length, channels) -> (..., 2 * hidden).
 
     Args:
-        channels: number of channels of the input.
-        hidden: size of the state in each direction.
+        channels: Number of channels of the input.
+        hidden: Size of the state in each direction.
 
     >>> BidirectionalLSTM(8, hidden=4)(torch.randn(3, 20, 8)).shape
     torch.Size([3, 20, 8])
@@ -146,9 +146,9 @@ class EncoderLayer(nn.TransformerEncoderLayer):
     Shape: (sequences, length, channels) -> (sequences, length, channels).
 
     Args:
-        channels: number of channels.
-        heads: number of attention heads, a divisor of ``channels``.
-        hidden: width of the feed-forward layer.
+        channels: Number of channels.
+        heads: Number of attention heads, a divisor of ``channels``.
+        hidden: Width of the feed-forward layer.
 
     >>> EncoderLayer(8, heads=2, hidden=16)(torch.randn(3, 20, 8)).shape
     torch.Size([3, 20, 8])
@@ -176,8 +176,8 @@ class DualPathBlock(nn.Sequential):
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
-        config: kind and sizes of the paths.
-        time_alone: leave out the path along frequency, as in the monolithic baselines.
+        config: Kind and sizes of the paths.
+        time_alone: Leave out the path along frequency, as in the monolithic baselines.
 
     >>> from hlsim.neuro.config import NeuroConfig
     >>> DualPathBlock(NeuroConfig(channels=8))(torch.randn(1, 20, 5, 8)).shape

@@ -46,7 +46,7 @@ class ModelConfig:
         """Return a configuration, or the default one in place of None.
 
         Raises:
-            ValueError: the configuration is of another class.
+            ValueError: The configuration is of another class.
         """
         if config is None:
             return cls()
@@ -66,10 +66,10 @@ class ModelConfig:
         """Build a configuration from a dictionary of ``to_dict``.
 
         Args:
-            data: values of settings by name. Missing settings have their default values.
+            data: Values of settings by name. Missing settings have their default values.
 
         Raises:
-            ValueError: a name is unknown, or a value is not accepted.
+            ValueError: A name is unknown, or a value is not accepted.
         """
         if not isinstance(data, Mapping):
             raise ValueError(
@@ -84,23 +84,23 @@ class NetworkConfig(ModelConfig):
     """Sizes that simulators and compensators share.
 
     Attributes:
-        fft: length of the Fourier transform in samples at 16 kHz.
-        window: length of the window in samples at 16 kHz.
-        hop: samples at 16 kHz from one frame to the next, at most a quarter of ``window``.
-        channels: number of feature maps of the network.
-        dense_depth: number of dilated convolutions of the encoder and of each decoder.
-        stride: time and frequency steps of the encoder, which the decoders undo.
-        block: kind of the layers along each axis.
-        blocks: number of dual-path blocks.
-        kernel: lengths of a ``cnn`` block's convolutions along time and frequency, odd numbers.
-        expansion: width inside a block relative to ``channels``. It applies to the pointwise layers
+        fft: Length of the Fourier transform in samples at 16 kHz.
+        window: Length of the window in samples at 16 kHz.
+        hop: Samples at 16 kHz from one frame to the next, at most a quarter of ``window``.
+        channels: Number of feature maps of the network.
+        dense_depth: Number of dilated convolutions of the encoder and of each decoder.
+        stride: Time and frequency steps of the encoder, which the decoders undo.
+        block: Kind of the layers along each axis.
+        blocks: Number of dual-path blocks.
+        kernel: Lengths of a ``cnn`` block's convolutions along time and frequency, odd numbers.
+        expansion: Width inside a block relative to ``channels``. It applies to the pointwise layers
             of a ``cnn`` block, the scan of a ``mamba`` block, the state of an ``lstm`` block in
             each direction, and the feed-forward layer of a ``transformer`` block.
-        states: number of states per channel of a ``mamba`` block's scan.
-        heads: number of attention heads of a ``transformer`` block, a divisor of ``channels``.
+        states: Number of states per channel of a ``mamba`` block's scan.
+        heads: Number of attention heads of a ``transformer`` block, a divisor of ``channels``.
 
     Raises:
-        ValueError: a value is out of range, or values do not fit together.
+        ValueError: A value is out of range, or values do not fit together.
 
     >>> NetworkConfig(fft=400, hop=100, stride=(2, 3)).step
     200
@@ -201,14 +201,14 @@ class NeuroConfig(NetworkConfig):
             (its Table IV).
         phase: ``predicted``, or ``input`` for a network that changes the magnitude only (Table
             III).
-        prior: start from MSBG's known gains (``hlsim.neuro.prior``), which the network corrects.
+        prior: Start from MSBG's known gains (``hlsim.neuro.prior``), which the network corrects.
             Without them it learns everything, as in the paper.
-        level_aware: use the log magnitude and no normalisation. Otherwise the level does not affect
+        level_aware: Use the log magnitude and no normalisation. Otherwise the level does not affect
             the network, as in MP-SENet: each utterance is scaled to unit RMS and back, and instance
             normalisation follows the convolutions.
 
     Raises:
-        ValueError: a value is out of range, or values do not fit together.
+        ValueError: A value is out of range, or values do not fit together.
 
     >>> NeuroConfig(block="lstm").hop
     32

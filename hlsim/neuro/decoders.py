@@ -20,11 +20,11 @@ class Decoder(nn.Module):
         frequency).
 
     Args:
-        channels: number of channels of the feature maps.
-        outputs: number of values per point of the spectrum.
-        depth: number of convolutions of the dense block.
-        stride: time and frequency steps of the encoder, which the decoder undoes.
-        normalise: normalise the features in the dense block.
+        channels: Number of channels of the feature maps.
+        outputs: Number of values per point of the spectrum.
+        depth: Number of convolutions of the dense block.
+        stride: Time and frequency steps of the encoder, which the decoder undoes.
+        normalise: Normalise the features in the dense block.
 
     >>> decoder = Decoder(8, 1, depth=0, stride=(4, 3), normalise=False)
     >>> decoder(torch.randn(2, 8, 5, 22), (20, 65)).shape
@@ -53,7 +53,7 @@ class MaskDecoder(Decoder):
     """Decoder of the logarithm of a factor on the magnitude.
 
     Args:
-        recruiting: decode two maps a and b, and return a x + b, where x is the exponent of
+        recruiting: Decode two maps a and b, and return a x + b, where x is the exponent of
             recruitment at each frequency. The effect of an error of the envelope is proportional to
             it. Otherwise decode one map.
 
@@ -75,8 +75,8 @@ class MaskDecoder(Decoder):
             time, frequency).
 
         Args:
-            size: number of frames and frequencies of the spectrum.
-            exponents: exponent of recruitment at each frequency.
+            size: Number of frames and frequencies of the spectrum.
+            exponents: Exponent of recruitment at each frequency.
         """
         maps = self(features, size).to(exponents.dtype)
         if not self.recruiting:
@@ -104,8 +104,8 @@ class PhaseDecoder(Decoder):
             complex (items, time, frequency).
 
         Args:
-            size: number of frames and frequencies of the spectrum.
-            log_gain: logarithm of the factor's magnitude.
+            size: Number of frames and frequencies of the spectrum.
+            log_gain: Logarithm of the factor's magnitude.
         """
         # Autocast may return maps of lower precision than that of the weights.
         maps = self(features, size).to(self.leave.weight.dtype)

@@ -24,7 +24,7 @@ def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
     Shape: complex (...), (...) -> (...).
 
     Args:
-        squared: squared magnitude of the spectra.
+        squared: Squared magnitude of the spectra.
 
     >>> spectrum = torch.tensor([2.0j, 0.0j])
     >>> sine_of_phase(spectrum, torch.tensor([4.0, 0.0])).round(decimals=3)
@@ -41,7 +41,7 @@ class AudiogramEncoder(nn.Module):
     Source: the Neuro-MSBG paper, Equation 1.
 
     Args:
-        frequencies: number of frequencies of the spectrum.
+        frequencies: Number of frequencies of the spectrum.
 
     >>> AudiogramEncoder(201)(torch.full((2, 8), 40.0)).shape
     torch.Size([2, 201])
@@ -66,9 +66,9 @@ class Unit(nn.Sequential):
     Shape: (items, inputs, time, frequency) -> (items, channels, time, frequency).
 
     Args:
-        conv: the convolution.
-        channels: number of channels of its output.
-        normalise: add the normalisation, which makes the output independent of the level.
+        conv: The convolution.
+        channels: Number of channels of its output.
+        normalise: Add the normalisation, which makes the output independent of the level.
 
     >>> Unit(DilatedConv(2, 8, 1), 8, normalise=True)(torch.randn(1, 2, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
@@ -85,9 +85,9 @@ class DilatedConv(nn.Conv2d):
     Shape: (items, inputs, time, frequency) -> (items, outputs, time, frequency).
 
     Args:
-        inputs: number of channels of the input.
-        outputs: number of channels of the output.
-        dilation: frames between the points of the kernel.
+        inputs: Number of channels of the input.
+        outputs: Number of channels of the output.
+        dilation: Frames between the points of the kernel.
 
     >>> DilatedConv(2, 8, dilation=4)(torch.randn(1, 2, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
@@ -117,9 +117,9 @@ class DenseBlock(nn.Module):
     Shape: (items, channels, time, frequency) -> (items, channels, time, frequency).
 
     Args:
-        channels: number of channels.
-        depth: number of convolutions. With 0, the output is the input.
-        normalise: normalise the output of each convolution.
+        channels: Number of channels.
+        depth: Number of convolutions. With 0, the output is the input.
+        normalise: Normalise the output of each convolution.
 
     >>> DenseBlock(8, depth=2, normalise=False)(torch.randn(1, 8, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
@@ -148,11 +148,11 @@ class DenseEncoder(nn.Module):
     Source: MP-SENet (Lu, Ai and Ling 2023).
 
     Args:
-        inputs: number of input channels.
-        channels: number of feature maps.
-        depth: number of convolutions of the dense block.
-        stride: time and frequency steps of the feature maps.
-        normalise: normalise the output of each convolution.
+        inputs: Number of input channels.
+        channels: Number of feature maps.
+        depth: Number of convolutions of the dense block.
+        stride: Time and frequency steps of the feature maps.
+        normalise: Normalise the output of each convolution.
 
     >>> encoder = DenseEncoder(3, 8, depth=0, stride=(4, 3), normalise=False)
     >>> encoder(torch.randn(1, 3, 20, 65)).shape
@@ -179,9 +179,9 @@ class FrameEncoder(nn.Module):
     Shape: (items, inputs, time, frequency) -> (items, channels, time, 1).
 
     Args:
-        inputs: number of input channels.
-        frequencies: number of frequencies.
-        channels: length of the vectors.
+        inputs: Number of input channels.
+        frequencies: Number of frequencies.
+        channels: Length of the vectors.
 
     >>> FrameEncoder(3, 65, 8)(torch.randn(1, 3, 20, 65)).shape
     torch.Size([1, 8, 20, 1])

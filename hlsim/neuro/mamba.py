@@ -18,9 +18,9 @@ class Mamba(nn.Module):
     Shape: (items, time, d_model) -> (items, time, d_model).
 
     Args:
-        d_model: number of channels of the sequence.
-        d_state: number of states per inner channel.
-        expand: number of inner channels relative to ``d_model``.
+        d_model: Number of channels of the sequence.
+        d_state: Number of states per inner channel.
+        expand: Number of inner channels relative to ``d_model``.
 
     >>> Mamba(16, d_state=4)(torch.randn(2, 20, 16)).shape
     torch.Size([2, 20, 16])

@@ -49,20 +49,20 @@ class NeuroMSBG(EarNetwork):
     Source: the Neuro-MSBG paper, Section III and Equation 1.
 
     Args:
-        config: sizes and choices.
-        sample_rate: sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
+        config: Sizes and choices.
+        sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
             the frequencies below 8 kHz only.
-        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
-        compute_prior: compute MSBG's known gains, which takes half a second. Otherwise they are
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        compute_prior: Compute MSBG's known gains, which takes half a second. Otherwise they are
             undefined until a state dict is loaded.
 
     Attributes:
-        emulates_msbg: whether the simulator emulates MSBG.
-        highest_frequency: highest frequency of outputs in Hz.
-        needs_exact_lengths: whether silence after the end of a signal changes the output before.
+        emulates_msbg: Whether the simulator emulates MSBG.
+        highest_frequency: Highest frequency of outputs in Hz.
+        needs_exact_lengths: Whether silence after the end of a signal changes the output before.
 
     Raises:
-        ValueError: the rate or the level is out of range, or the configuration is of another class.
+        ValueError: The rate or the level is out of range, or the configuration is of another class.
 
     >>> simulator = NeuroMSBG(NeuroConfig(channels=8, blocks=1))
     >>> simulator(torch.randn(2, 16000), "N3").shape

@@ -41,16 +41,16 @@ class EarNetwork(nn.Module):
     gradients, the memory that the network needs beside its output.
 
     Args:
-        sample_rate: sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
+        sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
             the frequencies below 8 kHz only.
-        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Attributes:
-        checkpoint: compute activations again in the backward pass, a few items or one block at a
+        checkpoint: Compute activations again in the backward pass, a few items or one block at a
             time, instead of storing them. False by default.
 
     Raises:
-        ValueError: the rate or the level is out of range.
+        ValueError: The rate or the level is out of range.
 
     >>> from hlsim import NeuroMSBG
     >>> isinstance(NeuroMSBG(), EarNetwork)
@@ -71,12 +71,12 @@ class EarNetwork(nn.Module):
         Shape: (..., time) -> (..., time).
 
         Args:
-            audiogram: one audiogram, or audiograms of shape (..., 8) in dB HL that broadcast to the
+            audiogram: One audiogram, or audiograms of shape (..., 8) in dB HL that broadcast to the
                 leading dimensions of the waveform. Of an ``Audiogram``, the levels at eight
                 frequencies count, ``Audiogram.thresholds``, from which networks learn.
 
         Raises:
-            ValueError: there is no audiogram, its levels are outside -10 to 100 dB HL, the shapes
+            ValueError: There is no audiogram, its levels are outside -10 to 100 dB HL, the shapes
                 do not broadcast, or the waveform is on another device than the weights.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)

@@ -73,12 +73,12 @@ class Prior(nn.Module):
     fixed filter, which ``filter`` applies to the waveform beforehand.
 
     Args:
-        stft: transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
-        compute: compute the known values. Otherwise they are undefined until a state dict is
+        stft: Transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
+        compute: Compute the known values. Otherwise they are undefined until a state dict is
             loaded.
 
     Attributes:
-        receptive_field: number of samples on either side on which a sample of the output depends,
+        receptive_field: Number of samples on either side on which a sample of the output depends,
             besides those of the transform.
 
     >>> stft = STFT(128, 128, 32)
@@ -135,7 +135,7 @@ class Prior(nn.Module):
         Shape: (items, time), (items,) -> (items, time).
 
         Args:
-            severity: degree of loss of each ear, 0 (none) to 3 (severe).
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
         return filter_without_delay(waveform, self.response[severity].to(waveform))
 
@@ -148,9 +148,9 @@ class Prior(nn.Module):
             frequencies).
 
         Args:
-            powers: powers of the bins in Pa^2, after MSBG's filter of the outer and middle ear.
-            thresholds: audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
-            severity: degree of loss of each ear, 0 (none) to 3 (severe).
+            powers: Powers of the bins in Pa^2, after MSBG's filter of the outer and middle ear.
+            thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
         smeared_powers = powers @ self._smearing()[severity].mT
         levels = self.channel_levels(smeared_powers, severity)
@@ -166,7 +166,7 @@ class Prior(nn.Module):
         Shape: complex (items, frames, frequencies), (items,) -> complex (items, frames,
             frequencies), (items, frames, frequencies).
 
-        Returns: the smeared spectra and their powers.
+        Returns: The smeared spectra and their powers.
         """
         return smear_spectrum(spectrum, self._smearing()[severity], SMEARING_GRADIENT_FLOOR)
 
@@ -185,7 +185,7 @@ class Prior(nn.Module):
         Shape: (items, channels, frames), (items,) -> (items, channels, ceil(frames / step)).
 
         Args:
-            step: number of frames from one value of an envelope to the next.
+            step: Number of frames from one value of an envelope to the next.
         """
         items, channels, _ = levels.shape
         kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
@@ -201,9 +201,9 @@ class Prior(nn.Module):
         Shape: (items, channels, steps), (items, 8), (items,) -> (items, channels, steps).
 
         Args:
-            log_envelope: natural logarithm of envelopes in Pa.
-            thresholds: audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
-            severity: degree of loss of each ear, 0 (none) to 3 (severe).
+            log_envelope: Natural logarithm of envelopes in Pa.
+            thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
         weights = constant_like(thresholds, _threshold_weights)[severity]
         exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
@@ -215,10 +215,10 @@ class Prior(nn.Module):
         Shape: (items, 2 * channels, steps), (items,) -> (items, steps, frequencies, 2).
 
         Args:
-            gains: real parts of all channels' gains, followed by the imaginary parts.
-            severity: degree of loss of each ear, 0 (none) to 3 (severe).
+            gains: Real parts of all channels' gains, followed by the imaginary parts.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
 
-        Returns: real and imaginary parts of the factors.
+        Returns: Real and imaginary parts of the factors.
         """
         real, imaginary = self._corrected("relative")[:, severity]
         # One matrix product computes real and imaginary parts, which alternate in its columns.
@@ -232,7 +232,7 @@ class Prior(nn.Module):
 
         MSBG smears after these filters, so the matrices apply their power response and undo it.
 
-        Returns: matrices of shape (severities, frequencies, frequencies), first the identity matrix
+        Returns: Matrices of shape (severities, frequencies, frequencies), first the identity matrix
             for ears without a loss.
         """
         ear_ratio = self.ear_power / self.ear_power.unsqueeze(-1)
@@ -297,9 +297,9 @@ def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
     """Compute the low-passes of the envelopes at the frame rate.
 
     Args:
-        hop: samples at 16 kHz from one frame to the next.
+        hop: Samples at 16 kHz from one frame to the next.
 
-    Returns: kernels of shape (channels, 2 * half length + 1), each with a sum of 1.
+    Returns: Kernels of shape (channels, 2 * half length + 1), each with a sum of 1.
     """
     points = 4096
     length = 2 * _ENVELOPE_HALF_LENGTH + 1
@@ -317,7 +317,7 @@ def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
 def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
     """Compute MSBG's smearing matrix at the frequencies of a transform.
 
-    Returns: matrix of shape (frequencies, frequencies).
+    Returns: Matrix of shape (frequencies, frequencies).
     """
     spacing = NEURO_RATE / stft.fft
     # As MSBG's, the filters cover more than the frequencies of the transform, up to about 20 kHz.
@@ -331,7 +331,7 @@ def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
 def _threshold_weights() -> NDArray[np.float64]:
     """Compute the weights of thresholds in each channel, 0 for channels that a bank lacks.
 
-    Returns: weights of shape (severities, 8, channels).
+    Returns: Weights of shape (severities, 8, channels).
     """
     weights = [threshold_weights(BANKS[severity]) for severity in SEVERITIES]
     return np.stack([_pad_channels(bank_weights.T).T for bank_weights in weights])

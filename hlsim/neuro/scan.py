@@ -52,19 +52,19 @@ def selective_scan(
     Shape: (items, channels, time) -> (items, channels, time).
 
     Args:
-        u: input. Shape: (items, channels, time).
-        delta: step sizes. Shape: (items, channels, time).
-        A: rates, negative so that the states are bounded. Shape: (channels, states).
-        B: weights of the input in the states. Shape: (items, states, time).
-        C: weights of the states in the result. Shape: (items, states, time).
-        D: weight of the input in the result, 0 by default. Shape: (channels,).
-        z: gate of the result, no gate by default. Shape: (items, channels, time).
-        delta_bias: value added to the step sizes, 0 by default. Shape: (channels,).
-        delta_softplus: apply softplus to the step sizes and their bias.
+        u: Input. Shape: (items, channels, time).
+        delta: Step sizes. Shape: (items, channels, time).
+        A: Rates, negative so that the states are bounded. Shape: (channels, states).
+        B: Weights of the input in the states. Shape: (items, states, time).
+        C: Weights of the states in the result. Shape: (items, states, time).
+        D: Weight of the input in the result, 0 by default. Shape: (channels,).
+        z: Gate of the result, no gate by default. Shape: (items, channels, time).
+        delta_bias: Value added to the step sizes, 0 by default. Shape: (channels,).
+        delta_softplus: Apply softplus to the step sizes and their bias.
 
     Raises:
-        ValueError: the shapes do not fit together.
-        RuntimeError: a second derivative is computed.
+        ValueError: The shapes do not fit together.
+        RuntimeError: A second derivative is computed.
 
     >>> u = torch.ones(1, 1, 3)
     >>> selective_scan(u, delta=u, A=torch.zeros(1, 1), B=u, C=u)  # a cumulative sum
@@ -117,9 +117,9 @@ def _forward_steps(decay: Tensor, states: Tensor, scratch: Tensor) -> list[_Step
     Shape: (items, time, ...) for all tensors.
 
     Args:
-        decay: decays, which are at most 1.
-        states: drive, which the steps replace by the states.
-        scratch: memory for products of decays.
+        decay: Decays, which are at most 1.
+        states: Drive, which the steps replace by the states.
+        scratch: Memory for products of decays.
     """
     time = states.shape[1]
     half = time // 2
@@ -270,13 +270,13 @@ class _Workspace:
 
     Args:
         shape: (items, time, states, channels) of the block.
-        memory: three flat tensors, or four if the gradient is computed.
+        memory: Three flat tensors, or four if the gradient is computed.
 
     Attributes:
-        decay: decays of the states.
-        states: states, which overwrite the drive.
-        scratch: memory for products of decays.
-        grad_states: gradient with respect to the states, if it is computed.
+        decay: Decays of the states.
+        states: States, which overwrite the drive.
+        scratch: Memory for products of decays.
+        grad_states: Gradient with respect to the states, if it is computed.
     """
 
     def __init__(self, shape: tuple[int, ...], memory: list[Tensor]) -> None:
@@ -310,7 +310,7 @@ def _blocks(
 ) -> Iterator[tuple[slice, slice, _Workspace]]:
     """Divide items and channels into blocks, either of all channels or of one item.
 
-    Yields: items and channels of the block, and the workspace for it.
+    Yields: Items and channels of the block, and the workspace for it.
     """
     items, time, channels = u.shape
     states = len(A)

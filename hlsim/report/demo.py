@@ -61,11 +61,11 @@ def demo_page(
     """Return the page: three numbers, verdict, sounds, pictures, details.
 
     Args:
-        evaluation: study of the demo's conditions, with the detail ``gain_curves``.
-        ear_name: name of the ear, for the title.
-        outputs: outputs of the aid for each item, by condition.
-        perceived: perceived signals of each item, by condition.
-        sentence: words of the last item, which is played.
+        evaluation: Study of the demo's conditions, with the detail ``gain_curves``.
+        ear_name: Name of the ear, for the title.
+        outputs: Outputs of the aid for each item, by condition.
+        perceived: Perceived signals of each item, by condition.
+        sentence: Words of the last item, which is played.
     """
     headline = evaluation.headline
     assert headline is not None

@@ -68,10 +68,10 @@ class Picture:
     """Contents of an SVG or PNG file, with a text for readers who do not see it.
 
     Attributes:
-        data: contents of the file.
-        alt: text in place of the picture.
-        title: heading above the picture.
-        note: sentence below the picture.
+        data: Contents of the file.
+        alt: Text in place of the picture.
+        title: Heading above the picture.
+        note: Sentence below the picture.
 
     >>> Picture(b"<svg/>", "An empty picture").title
     ''
@@ -88,13 +88,13 @@ class Sound:
     """One sound of a player.
 
     Attributes:
-        label: name on the button.
-        level: level in dB SPL.
-        audio: contents of a FLAC or WAV file.
-        loudness: level in dB relative to full scale with which it is played.
-        spectrogram: contents of a PNG file whose edges are the edges of the spectrogram; empty if
+        label: Name on the button.
+        level: Level in dB SPL.
+        audio: Contents of a FLAC or WAV file.
+        loudness: Level in dB relative to full scale with which it is played.
+        spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram; empty if
             there is none.
-        note: words over the spectrogram.
+        note: Words over the spectrogram.
 
     >>> Sound("unaided", 10.2, b"fLaC").note
     ''
@@ -113,13 +113,13 @@ class Player:
     """Sounds of one item, between which a listener switches at the same position.
 
     Attributes:
-        groups: sounds with one gain by the heading of their group, which may be empty.
-        seconds: length of the sounds.
-        full_scale: peak level in dB SPL of full scale in the first group.
-        sentence: words that are spoken.
-        volume: volume to start with, from 0 to 1.
-        levels: lowest and highest level in dB SPL of the spectrograms.
-        colours: colours of the spectrograms in CSS, from the lowest to the highest level.
+        groups: Sounds with one gain by the heading of their group, which may be empty.
+        seconds: Length of the sounds.
+        full_scale: Peak level in dB SPL of full scale in the first group.
+        sentence: Words that are spoken.
+        volume: Volume to start with, from 0 to 1.
+        levels: Lowest and highest level in dB SPL of the spectrograms.
+        colours: Colours of the spectrograms in CSS, from the lowest to the highest level.
 
     >>> player = Player({"": [Sound("unaided", 10.2, b"fLaC")]}, seconds=4.0, full_scale=94.0)
     >>> [sound.label for sound in player.sounds]
@@ -149,10 +149,10 @@ class Card:
     """A number that a reader should remember, over the same number of all conditions.
 
     Attributes:
-        title: name of the number.
-        value: the number, as text.
-        meaning: sentence that explains the number.
-        bars: label, text and length from 0 to 1 for each condition; the last one is highlighted.
+        title: Name of the number.
+        value: The number, as text.
+        meaning: Sentence that explains the number.
+        bars: Label, text and length from 0 to 1 for each condition; the last one is highlighted.
 
     >>> card = Card("HASPI", "0.93", "Predicted intelligibility.", [("NAL-R", "0.93", 0.93)])
     >>> "width: 93.0%" in Page("Aids", "", [], [card]).html()
@@ -230,10 +230,10 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
 
     Files of these names are replaced; others stay.
 
-    Returns: the path of ``report.html``.
+    Returns: The path of ``report.html``.
 
     Raises:
-        ValueError: the files cannot be written, or JSON cannot hold the data.
+        ValueError: The files cannot be written, or JSON cannot hold the data.
         MissingExtraError: jinja2 is not installed.
 
     >>> import tempfile

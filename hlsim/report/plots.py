@@ -71,11 +71,11 @@ def draw_picture(
     """Return what a function draws on matplotlib axes, as SVG.
 
     Args:
-        draw: function that is called with the axes.
-        title: heading above the picture.
-        alt: text in place of the picture; by default the title.
-        note: sentence below the picture.
-        height: height in inches.
+        draw: Function that is called with the axes.
+        title: Heading above the picture.
+        alt: Text in place of the picture; by default the title.
+        note: Sentence below the picture.
+        height: Height in inches.
 
     >>> draw_picture(lambda axes: axes.plot([1, 2]), "A line").alt
     'A line'
@@ -131,10 +131,10 @@ def spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """Move labels up and down until none covers another; they keep their order.
 
     Args:
-        ends: wanted middle of each label, from 0 to 1. Shape: (labels,).
-        heights: height of each label. Shape: (labels,).
+        ends: Wanted middle of each label, from 0 to 1. Shape: (labels,).
+        heights: Height of each label. Shape: (labels,).
 
-    Returns: the middle of each label. Shape: (labels,).
+    Returns: The middle of each label. Shape: (labels,).
 
     >>> spread_labels(np.array([0.5, 0.5]), np.array([0.1, 0.1])).round(2).tolist()
     [0.5, 0.6]
@@ -202,12 +202,12 @@ def curves_picture(
     """Draw curves over frequency, or over what ``over`` names, with their names beside them.
 
     Args:
-        curves: curves by name.
-        title: heading above the picture.
-        axis: title of the vertical axis.
-        over: title of the horizontal axis; by default, it is frequency in Hz.
-        ends: lower and upper end of the vertical axis.
-        note: sentence below the picture.
+        curves: Curves by name.
+        title: Heading above the picture.
+        axis: Title of the vertical axis.
+        over: Title of the horizontal axis; by default, it is frequency in Hz.
+        ends: Lower and upper end of the vertical axis.
+        note: Sentence below the picture.
     """
 
     def draw(axes: Any) -> None:
@@ -255,7 +255,7 @@ def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, ov
 def pictures_sections(evaluation: Evaluation) -> list[Section]:
     """Draw the scores of a study; a picture that would show a single group or item is left out.
 
-    Returns: one section, or none if there is nothing to compare.
+    Returns: One section, or none if there is nothing to compare.
     """
     c = evaluation.headline
     if c is None or c.overall.n < 2:

@@ -33,15 +33,15 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
     """Write the evaluation as ``report.html``, ``report.md`` and ``report.json`` into a folder.
 
     Args:
-        evaluation: result of ``haspi_report``.
-        out: folder of the files.
-        listen: number of items with players and spectrograms.
+        evaluation: Result of ``haspi_report``.
+        out: Folder of the files.
+        listen: Number of items with players and spectrograms.
 
-    Returns: the path of ``report.html``.
+    Returns: The path of ``report.html``.
 
     Raises:
-        ValueError: the files cannot be written.
-        MissingExtraError: matplotlib or jinja2 is not installed.
+        ValueError: The files cannot be written.
+        MissingExtraError: Matplotlib or jinja2 is not installed.
     """
     return write_page(report_page(evaluation, listen), evaluation.to_dict(), out)
 
@@ -73,9 +73,9 @@ def score_details(
     """Return all comparisons, scores of items and of ears, failures and notes, folded.
 
     Args:
-        evaluation: the study.
-        texts: paragraphs to begin with.
-        tables: tables to begin with.
+        evaluation: The study.
+        texts: Paragraphs to begin with.
+        tables: Tables to begin with.
     """
     item_tables = [items_table(evaluation, "Scores and levels of every item")]
     better_ear = ""

@@ -87,11 +87,11 @@ def summary_table(
     """Return one row of statistics for each part of a study's table.
 
     Args:
-        caption: caption of the table.
-        rows: parts of the study's table by name.
-        columns: statistics by title.
-        first: title of the names.
-        folded: whether the table is shown only when it is opened.
+        caption: Caption of the table.
+        rows: Parts of the study's table by name.
+        columns: Statistics by title.
+        first: Title of the names.
+        folded: Whether the table is shown only when it is opened.
     """
     cells = []
     for name, part in rows.items():
@@ -209,11 +209,11 @@ def detail_section(
     """Return texts, tables, sections, failures and notes, folded.
 
     Args:
-        evaluation: the study.
-        sections: inner sections.
-        notes: sentences about the origin of the values; empty ones are left out.
-        texts: paragraphs to begin with.
-        tables: tables to begin with.
+        evaluation: The study.
+        sections: Inner sections.
+        notes: Sentences about the origin of the values; empty ones are left out.
+        texts: Paragraphs to begin with.
+        tables: Tables to begin with.
     """
     further = list(sections)
     failures = evaluation.failures[["name", "condition", "failure"]].to_numpy().tolist()

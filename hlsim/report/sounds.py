@@ -46,11 +46,11 @@ def listening_sections(
     """Return players of some items, from the largest rise of the score to the largest fall.
 
     Args:
-        evaluation: the study.
-        count: number of items.
-        conditions: names of the conditions to be played, by default all.
+        evaluation: The study.
+        count: Number of items.
+        conditions: Names of the conditions to be played, by default all.
 
-    Returns: one section, or none if there is nothing to play.
+    Returns: One section, or none if there is nothing to play.
     """
     headline = evaluation.headline
     if headline is None or not count:
@@ -101,14 +101,14 @@ def make_player(
     different gains: the output of an aid is much louder than what the ear perceives of it.
 
     Args:
-        groups: signals in pascals by label, for each heading of a group.
-        sample_rate: sample rate in Hz.
-        sentence: words that are spoken.
+        groups: Signals in pascals by label, for each heading of a group.
+        sample_rate: Sample rate in Hz.
+        sentence: Words that are spoken.
 
     Shape: (time,) for each signal.
 
     Raises:
-        ValueError: all signals of a group are silent.
+        ValueError: All signals of a group are silent.
 
     >>> tone = torch.sin(torch.arange(16000) * 0.2)
     >>> player = make_player({"": {"tone": tone, "soft tone": 0.1 * tone}}, 16000)
@@ -168,8 +168,8 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     """Return levels up to 8 kHz in windows of 20 ms, every 10 ms; silence has -46 dB SPL.
 
     Args:
-        signal: signal in pascals.
-        sample_rate: sample rate in Hz.
+        signal: Signal in pascals.
+        sample_rate: Sample rate in Hz.
 
     Shape: (time,) -> (bins of 50 Hz, frames) in dB SPL.
 

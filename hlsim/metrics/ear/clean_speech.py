@@ -36,13 +36,13 @@ class CleanBatch:
     """Clean signals that are processed together.
 
     Attributes:
-        items: indices of the signals among all items.
-        extent: lengths at the rate of the input.
-        resampled: lengths at 24 kHz.
-        starts: first samples at 24 kHz that are not silence.
-        audible: lengths at 24 kHz from there to the last sample that is not silence.
-        spectrum: spectra for the bulk alignment.
-        signals: audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
+        items: Indices of the signals among all items.
+        extent: Lengths at the rate of the input.
+        resampled: Lengths at 24 kHz.
+        starts: First samples at 24 kHz that are not silence.
+        audible: Lengths at 24 kHz from there to the last sample that is not silence.
+        spectrum: Spectra for the bulk alignment.
+        signals: Audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
 
     >>> speech = CleanSpeech(torch.randn(2, 16000), None, 16000, 94.0, False, "HASPI")
     >>> speech.batches[0].signals.shape
@@ -65,17 +65,17 @@ class CleanSpeech:
     items as fit into memory with all their channels.
 
     Args:
-        clean: clean signals. Shape: (..., time).
-        lengths: number of samples of each item in a padded batch.
-        sample_rate: sample rate in Hz.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
-        whole_khz: round the rate to whole kHz.
-        name: name of the score, for messages.
+        clean: Clean signals. Shape: (..., time).
+        lengths: Number of samples of each item in a padded batch.
+        sample_rate: Sample rate in Hz.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        whole_khz: Round the rate to whole kHz.
+        name: Name of the score, for messages.
 
     Raises:
-        ValueError: the signals are too short or not finite, or a rate, level or length is out of
+        ValueError: The signals are too short or not finite, or a rate, level or length is out of
             range.
-        UnscorableError: the signals are silent, too soft or too short to be scored.
+        UnscorableError: The signals are silent, too soft or too short to be scored.
 
     >>> CleanSpeech(torch.randn(2, 16000), None, 16000, 94.0, False, "HASPI").shape
     torch.Size([2])
@@ -181,13 +181,13 @@ class CleanSpeech:
         """Cut signals to their common length, with a warning, if it differs by 0.1 s at most.
 
         Args:
-            processed: signals of the same rate. Shape: (..., time).
+            processed: Signals of the same rate. Shape: (..., time).
 
         Returns:
             Both signals. The clean ones are prepared again if they are longer.
 
         Raises:
-            ValueError: the lengths differ by more than 0.1 s.
+            ValueError: The lengths differ by more than 0.1 s.
         """
         ends = torch.tensor(self._ends).reshape(self.shape)
         processed, clean, lengths = cut_to_common_length(
@@ -221,8 +221,8 @@ class CleanSpeech:
         """Return the ear of each item.
 
         Args:
-            audiogram: one ear, or one for each item.
-            host: return them on the CPU. The host waits for ears that lie on a GPU.
+            audiogram: One ear, or one for each item.
+            host: Return them on the CPU. The host waits for ears that lie on a GPU.
 
         Returns:
             Thresholds. Shape: (items, 8) dB HL.
@@ -243,8 +243,8 @@ class CleanSpeech:
         """Return the parts of processed signals that match the audible parts of the clean ones.
 
         Args:
-            processed: all processed signals. Shape: (items, time).
-            batch: batch whose items are returned.
+            processed: All processed signals. Shape: (items, time).
+            batch: Batch whose items are returned.
 
         Returns:
             Aligned parts in multiples of 20 uPa. Shape: (items of the batch, padded).

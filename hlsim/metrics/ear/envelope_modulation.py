@@ -59,9 +59,9 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
     """Delay the levels of channels, smooth them, and sample them at 24000 / 9 Hz.
 
     Args:
-        levels: levels in dB over threshold. Shape: (items, channels, padded).
-        delays: delays in samples. Shape: (items, channels), int64.
-        extent: lengths of the items.
+        levels: Levels in dB over threshold. Shape: (items, channels, padded).
+        delays: Delays in samples. Shape: (items, channels), int64.
+        extent: Lengths of the items.
 
     Returns:
         Frames. Shape: (items, channels, ceil(longest / 9)).
@@ -96,8 +96,8 @@ class ChannelSum(NamedTuple):
     """Features of frames that are sums over channels, and can be added over chunks of channels.
 
     Attributes:
-        loudness: mean over the channels of the amplitude over threshold. Shape: (items, frames).
-        cosines: five cosines over frequency. Shape: (items, 5, frames).
+        loudness: Mean over the channels of the amplitude over threshold. Shape: (items, frames).
+        cosines: Five cosines over frequency. Shape: (items, 5, frames).
 
     >>> sum_over_channels(torch.zeros(1, 32, 4), slice(0, 32)).loudness
     tensor([[1., 1., 1., 1.]])
@@ -111,8 +111,8 @@ def sum_over_channels(levels: Tensor, channels: slice) -> ChannelSum:
     """Sum the frames of some channels.
 
     Args:
-        levels: frames in dB over threshold. Shape: (items, channels, frames).
-        channels: the channels.
+        levels: Frames in dB over threshold. Shape: (items, channels, frames).
+        channels: The channels.
 
     >>> sum_over_channels(torch.zeros(1, 8, 4), slice(0, 8)).cosines.shape
     torch.Size([1, 5, 4])
@@ -148,15 +148,15 @@ def find_audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Exten
     The host waits for the device once.
 
     Args:
-        loudness: loudness of the reference. Shape: (items, frames).
-        extent: number of samples of each item.
+        loudness: Loudness of the reference. Shape: (items, frames).
+        extent: Number of samples of each item.
 
     Returns:
         Indices of the frames of each item, followed by other indices, (items, audible), and the
         number of audible frames of each item.
 
     Raises:
-        UnscorableError: an item has fewer than two audible frames.
+        UnscorableError: An item has fewer than two audible frames.
 
     >>> indices, audible = find_audible_frames(torch.tensor([[0.0, 9.0, 9.0]]), Extent((27,)))
     >>> indices, audible.ends
@@ -197,10 +197,10 @@ class ModulationCovariance(NamedTuple):
     """Covariances of the filtered cosines of two signals.
 
     Attributes:
-        xx, yy, xy: sums of squares and of products, without the means. Shape: (items, 10, 5).
+        xx, yy, xy: Sums of squares and of products, without the means. Shape: (items, 10, 5).
         waves: zero-mean cosines before the filters. Shape: (items, 5, audible) twice.
-        spectra: spectra of these cosines. Shape: (items, 5, bins) twice.
-        extent: number of audible frames of each item.
+        spectra: Spectra of these cosines. Shape: (items, 5, bins) twice.
+        extent: Number of audible frames of each item.
 
     >>> waves = torch.randn(1, 5, 900)
     >>> modulation_covariance(waves, waves, Extent((900,))).xx.shape
@@ -221,8 +221,8 @@ def modulation_covariance(
     """Filter the cosines over time by ten band-passes without delay, and compute covariances.
 
     Args:
-        reference, processed: cosines of the audible frames. Shape: (items, 5, audible).
-        extent: number of audible frames of each item.
+        reference, processed: Cosines of the audible frames. Shape: (items, 5, audible).
+        extent: Number of audible frames of each item.
 
     >>> waves = torch.randn(1, 5, 900)
     >>> modulation_covariance(waves, waves, Extent((900,))).xy.shape
@@ -273,8 +273,8 @@ def zero_phase_responses(
     """Return the frequency responses of symmetric filters without their delay, which are real.
 
     Args:
-        filters: taps of each filter, an odd number, symmetric about the middle one.
-        points: length of the Fourier transform.
+        filters: Taps of each filter, an odd number, symmetric about the middle one.
+        points: Length of the Fourier transform.
 
     Returns:
         Responses of the filters. Shape: (filters, points // 2 + 1).

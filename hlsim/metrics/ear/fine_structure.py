@@ -52,8 +52,8 @@ def count_segments(samples: int, segment: int = SEGMENT) -> int:
     """Return the number of segments of a signal.
 
     Args:
-        samples: length of the signal.
-        segment: length of a segment in samples, an even number.
+        samples: Length of the signal.
+        segment: Length of a segment in samples, an even number.
 
     >>> count_segments(1000)
     5
@@ -65,8 +65,8 @@ def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
     """Return the number of segments of each item.
 
     Args:
-        extent: number of samples of each item.
-        segment: length of a segment in samples, an even number.
+        extent: Number of samples of each item.
+        segment: Length of a segment in samples, an even number.
 
     >>> segments_of(Extent((1000, 800))).ends
     (5, 4)
@@ -81,9 +81,9 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
     """Compute the Hann-weighted means of segments, which overlap by half.
 
     Args:
-        levels: levels of the envelopes in dB.
-        extent: number of samples of each item.
-        segment: length of a segment in samples, an even number.
+        levels: Levels of the envelopes in dB.
+        extent: Number of samples of each item.
+        segment: Length of a segment in samples, an even number.
 
     Shape: (items, channels, longest) -> (items, channels, segments).
 
@@ -114,9 +114,9 @@ class Cepstra(NamedTuple):
     """Five cosines over frequency of the audible segments of two signals, without their means.
 
     Attributes:
-        reference, processed: cosines over time. Shape: (items, 5, audible segments).
-        audible: number of audible segments of each item.
-        extent: the same, but at least 1.
+        reference, processed: Cosines over time. Shape: (items, 5, audible segments).
+        audible: Number of audible segments of each item.
+        extent: The same, but at least 1.
 
     >>> levels = 40.0 + torch.randn(1, 32, 5)
     >>> compute_cepstra(levels, levels, Extent((5,))).audible.ends
@@ -135,8 +135,8 @@ def compute_cepstra(reference: Tensor, processed: Tensor, counts: Extent) -> Cep
     The host waits for the device once.
 
     Args:
-        reference, processed: levels by ``smooth_levels``. Shape: (items, 32, segments).
-        counts: number of segments of each item.
+        reference, processed: Levels by ``smooth_levels``. Shape: (items, 32, segments).
+        counts: Number of segments of each item.
 
     >>> levels = 40.0 + torch.randn(1, 32, 5)
     >>> compute_cepstra(levels, levels, Extent((5,))).reference.shape
@@ -173,8 +173,8 @@ def envelope_correlation(reference: Tensor, processed: Tensor, counts: Extent) -
     two. The host waits for the device once.
 
     Args:
-        reference, processed: levels by ``smooth_levels``. Shape: (items, 32, segments).
-        counts: number of segments of each item.
+        reference, processed: Levels by ``smooth_levels``. Shape: (items, 32, segments).
+        counts: Number of segments of each item.
 
     Returns:
         Correlation of each item, 0 to 1. Shape: (items,).
@@ -232,8 +232,8 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
     motion.
 
     Args:
-        motion: motion of the basilar membrane, zero after the end of each item.
-        extent: number of samples of each item.
+        motion: Motion of the basilar membrane, zero after the end of each item.
+        extent: Number of samples of each item.
 
     Shape: (items, channels, longest) -> (items, channels, segments, bins), (items, channels,
     segments).
@@ -280,8 +280,8 @@ def coherence(
     """Compute the largest normalised cross-covariance over lags of up to 1 ms.
 
     Args:
-        reference, processed: spectra and mean squares by ``segment_spectra``.
-        counts: number of segments of each item.
+        reference, processed: Spectra and mean squares by ``segment_spectra``.
+        counts: Number of segments of each item.
 
     Returns:
         Coherence from 0 to 1. Shape: (items, channels, segments).
@@ -317,9 +317,9 @@ def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor
     segments are audible.
 
     Args:
-        coherences: values by ``coherence``. Shape: (items, 32, segments).
-        mean_square: mean squares of the reference's segments. Shape: (items, 32, segments).
-        counts: number of segments of each item.
+        coherences: Values by ``coherence``. Shape: (items, 32, segments).
+        mean_square: Mean squares of the reference's segments. Shape: (items, 32, segments).
+        counts: Number of segments of each item.
 
     Returns:
         Mean of each item, 0 to 1. Shape: (items,).
@@ -364,8 +364,8 @@ def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
     channels, and at least 0.
 
     Args:
-        differences: one spectrum minus the other. Shape: (..., channels).
-        scale: value of 32 s at which the similarity is 0.
+        differences: One spectrum minus the other. Shape: (..., channels).
+        scale: Value of 32 s at which the similarity is 0.
 
     Shape: (..., channels) -> (...).
 

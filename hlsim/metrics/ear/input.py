@@ -48,9 +48,9 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
     sinc as in scipy's ``resample_poly``.
 
     Args:
-        signals: signals, zero after the end of each item. Shape: (items, time).
-        sample_rate: sample rate of the signals in Hz.
-        extent: lengths of the items at that rate.
+        signals: Signals, zero after the end of each item. Shape: (items, time).
+        sample_rate: Sample rate of the signals in Hz.
+        extent: Lengths of the items at that rate.
 
     Returns:
         Resampled signals, zero after the end of each item. Shape: (items, longest).
@@ -139,8 +139,8 @@ def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
     """Return the spectra of zero-mean signals, zero-padded for correlations over all lags.
 
     Args:
-        signals: signals. Shape: (items, time).
-        extent: lengths of the items.
+        signals: Signals. Shape: (items, time).
+        extent: Lengths of the items.
 
     Returns:
         Spectra. Shape: (items, bins).
@@ -158,9 +158,9 @@ def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -
     They follow from the largest magnitude of the cross-covariance.
 
     Args:
-        reference_spectrum: spectra of the references by ``spectrum_for_alignment``.
-        processed: processed signals. Shape: (items, time).
-        extent: lengths of the items, equal for references and processed signals.
+        reference_spectrum: Spectra of the references by ``spectrum_for_alignment``.
+        processed: Processed signals. Shape: (items, time).
+        extent: Lengths of the items, equal for references and processed signals.
 
     Returns:
         Delays in samples; negative ones advance the signal. Shape: (items,), int64.

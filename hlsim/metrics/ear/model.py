@@ -101,11 +101,11 @@ class HairCells:
     """State of the hair cells in each channel. Shape of all: (..., 32), float64.
 
     Attributes:
-        attenuation: attenuation by the outer hair cells in dB.
-        bandwidth: bandwidth of the filters at low levels, relative to normal hearing.
-        knee: level in dB SPL above which the channel compresses.
-        ratio: compression ratio.
-        inner: attenuation by the inner hair cells in dB.
+        attenuation: Attenuation by the outer hair cells in dB.
+        bandwidth: Bandwidth of the filters at low levels, relative to normal hearing.
+        knee: Level in dB SPL above which the channel compresses.
+        ratio: Compression ratio.
+        inner: Attenuation by the inner hair cells in dB.
 
     >>> cells = hair_cells(torch.zeros(8))
     >>> cells[0:2].knee
@@ -180,7 +180,7 @@ class Extent:
     """Lengths of the items of a padded batch.
 
     Args:
-        ends: number of samples of each item.
+        ends: Number of samples of each item.
 
     >>> extent = Extent((100, 30))
     >>> extent.longest, extent.padded
@@ -293,8 +293,8 @@ def control_power(signal: Tensor, channels: slice) -> Tensor:
     """Return the power of the control filters' envelopes.
 
     Args:
-        signal: output of the middle ear.
-        channels: channels to compute.
+        signal: Output of the middle ear.
+        channels: Channels to compute.
 
     Shape: (items, padded) -> (items, channels, padded).
 
@@ -311,10 +311,10 @@ def bandwidths(control: Tensor, ear: HairCells, channels: slice, extent: Extent)
     """Return the bandwidths of the filters, which widen with the level, relative to normal hearing.
 
     Args:
-        control: power of the control filters' envelopes.
-        ear: hair cells of these channels.
-        channels: the channels.
-        extent: lengths of the items.
+        control: Power of the control filters' envelopes.
+        ear: Hair cells of these channels.
+        channels: The channels.
+        extent: Lengths of the items.
 
     Shape: (items, channels, padded) -> (items, channels).
 
@@ -333,13 +333,13 @@ class CochlearOutput:
     """Output of the cochlea in some channels.
 
     Attributes:
-        power: power of the compressed envelope. Shape: (items, channels, padded).
-        motion: compressed motion of the basilar membrane, or None where it was not requested.
+        power: Power of the compressed envelope. Shape: (items, channels, padded).
+        motion: Compressed motion of the basilar membrane, or None where it was not requested.
             Shape: (items, channels, padded).
-        bandwidth: bandwidth of the filters, relative to normal hearing. Shape: (items, channels),
+        bandwidth: Bandwidth of the filters, relative to normal hearing. Shape: (items, channels),
             float64.
-        mean_power: mean power of the envelope before compression. Shape: (items, channels).
-        mean_control: mean power of the control filters' envelope. Shape: (items, channels).
+        mean_power: Mean power of the envelope before compression. Shape: (items, channels).
+        mean_control: Mean power of the control filters' envelope. Shape: (items, channels).
 
     >>> ear = hair_cells(torch.zeros(8))
     >>> cochlea = simulate_cochlea(torch.zeros(1, 128), ear, slice(0, 3), Extent((128,)))
@@ -360,11 +360,11 @@ def simulate_cochlea(
     """Filter the output of the middle ear in some channels, and compress it.
 
     Args:
-        signal: output of the middle ear. Shape: (items, padded).
-        ear: hair cells of all channels. Shape: (items, 32) or (32,).
-        channels: channels to compute.
-        extent: lengths of the items.
-        motion: return the motion of the basilar membrane, too.
+        signal: Output of the middle ear. Shape: (items, padded).
+        ear: Hair cells of all channels. Shape: (items, 32) or (32,).
+        channels: Channels to compute.
+        extent: Lengths of the items.
+        motion: Return the motion of the basilar membrane, too.
 
     >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
     >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)
@@ -393,8 +393,8 @@ def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     """Return the gain of the outer hair cells on amplitudes.
 
     Args:
-        control: power of the control filters' envelopes.
-        cells: hair cells of these channels.
+        control: Power of the control filters' envelopes.
+        cells: Hair cells of these channels.
 
     Shape: (..., channels, padded) -> (..., channels, padded).
 
@@ -417,8 +417,8 @@ def mean_level(cochlea: CochlearOutput, cells: HairCells) -> Tensor:
     """Return the long-term level of each channel in dB over threshold.
 
     Args:
-        cochlea: output of ``simulate_cochlea`` with ``motion=True``.
-        cells: hair cells of these channels.
+        cochlea: Output of ``simulate_cochlea`` with ``motion=True``.
+        cells: Hair cells of these channels.
 
     Returns:
         Levels of 0 dB or more. Shape: (items, channels).
@@ -449,8 +449,8 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     steps, but not its values.
 
     Args:
-        reference: envelope or motion.
-        extent: lengths of the items.
+        reference: Envelope or motion.
+        extent: Lengths of the items.
 
     Shape: (items, channels, padded) -> (items, channels, bins).
 
@@ -478,8 +478,8 @@ def channel_lags(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor
 
     Args:
         reference: ``lag_spectrum`` of the reference's envelope or motion.
-        processed: envelope or motion. Shape: (items, channels, padded).
-        extent: lengths of the items.
+        processed: Envelope or motion. Shape: (items, channels, padded).
+        extent: Lengths of the items.
 
     Returns:
         Samples by which to delay each channel, from -2399 to 2400, int64. Shape: (items, channels).
@@ -507,11 +507,11 @@ def shift(
     The output is ``signal[t - delay]`` before the stop of each item, and 0 elsewhere.
 
     Args:
-        signal: signals. Shape: (items, channels, time).
-        delays: delays in samples; negative ones advance. Shape: (items, channels), int64.
-        ends: number of samples of each item; later ones count as 0.
-        stops: number of samples of each item's output; later ones are 0.
-        size: length of the output.
+        signal: Signals. Shape: (items, channels, time).
+        delays: Delays in samples; negative ones advance. Shape: (items, channels), int64.
+        ends: Number of samples of each item; later ones count as 0.
+        stops: Number of samples of each item's output; later ones are 0.
+        size: Length of the output.
 
     Returns:
         Delayed signals. Shape: (items, channels, size).
@@ -581,8 +581,8 @@ def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
     Channels are shifted to 0 Hz before they are filtered, so it is the group delay at 0 Hz.
 
     Args:
-        bandwidth: bandwidths of the filters, relative to normal hearing.
-        channels: the channels.
+        bandwidth: Bandwidths of the filters, relative to normal hearing.
+        channels: The channels.
 
     Shape: (items, channels) -> int64 (items, channels).
 
@@ -602,9 +602,9 @@ def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tenso
     and the fourth filter is 1.37 times as wide as the first.
 
     Args:
-        signal: output of the middle ear.
-        ear: hair cells of all channels.
-        extent: lengths of the items.
+        signal: Output of the middle ear.
+        ear: Hair cells of all channels.
+        extent: Lengths of the items.
 
     Shape: (items, padded) -> int64 (items, 1).
 
@@ -623,8 +623,8 @@ def sensation(power: Tensor, inner: Tensor) -> Tensor:
     """Return the level over the threshold in dB, 0 or more.
 
     Args:
-        power: power of the compressed envelopes. Shape: (items, channels, padded).
-        inner: attenuation by the inner hair cells in dB. Shape: (items or 1, channels).
+        power: Power of the compressed envelopes. Shape: (items, channels, padded).
+        inner: Attenuation by the inner hair cells in dB. Shape: (items or 1, channels).
 
     Returns:
         Levels. Shape: (items, channels, padded).

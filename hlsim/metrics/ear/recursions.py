@@ -59,12 +59,12 @@ class Recursion(NamedTuple):
     changes to ``state @ step + block @ inward``.
 
     Attributes:
-        through: response to the same block. Shape: (..., BLOCK, BLOCK), or (..., BLOCK, 2 BLOCK)
+        through: Response to the same block. Shape: (..., BLOCK, BLOCK), or (..., BLOCK, 2 BLOCK)
             with the real and the imaginary part side by side.
-        inward: influence of a block on the state. Shape: (..., BLOCK, states).
-        outward: response to the state. Shape: (..., states, outputs).
-        step: change of the state from block to block. Shape: (..., states, states).
-        memory: samples after which the influence of an input has vanished.
+        inward: Influence of a block on the state. Shape: (..., BLOCK, states).
+        outward: Response to the state. Shape: (..., states, outputs).
+        step: Change of the state from block to block. Shape: (..., states, states).
+        memory: Samples after which the influence of an input has vanished.
 
     >>> lowpass = gain_lowpass(torch.device("cpu"), torch.float64)
     >>> lowpass(torch.ones(1, 192, dtype=torch.float64)).shape
@@ -225,10 +225,10 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     block mixes only its four powers, therefore four complex states suffice.
 
     Args:
-        decay: decay per sample, 2 pi 1.019 ERB / rate for normal bandwidth. Shape: (rows,).
-        angle: phase per sample, 2 pi centre frequency / rate. Shape: (rows,).
-        memory: samples after which the response has vanished, 50 over the smallest decay.
-        dtype: dtype of the matrices, which are computed in that of ``decay``.
+        decay: Decay per sample, 2 pi 1.019 ERB / rate for normal bandwidth. Shape: (rows,).
+        angle: Phase per sample, 2 pi centre frequency / rate. Shape: (rows,).
+        memory: Samples after which the response has vanished, 50 over the smallest decay.
+        dtype: Dtype of the matrices, which are computed in that of ``decay``.
 
     >>> filters = gammatone(torch.tensor([0.05]), torch.tensor([0.3]), 1000, torch.float32)
     >>> filters(torch.zeros(1, 128)).shape
