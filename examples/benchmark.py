@@ -222,8 +222,8 @@ def main(arguments: list[str] | None = None) -> None:
     size = f"{options.batch} x {options.seconds:g} s"
     print(
         f"{size} on {options.device}, {torch.get_num_threads()} threads, torch "
-        f"{torch.__version__}, "
-        f"{time.strftime('%Y-%m-%d')}; median (minimum to maximum) of {options.repeats} rounds"
+        f"{torch.__version__}, {time.strftime('%Y-%m-%d')}; median (minimum to maximum) of "
+        f"{options.repeats} rounds"
     )
     for name in options.what:
         print_table(name, TABLES[name](options), options.repeats, options.device)

@@ -190,8 +190,7 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
         raise ValueError(
             f"expected shape (time,) and samples from -1 to 1, got shape {tuple(samples.shape)} "
-            "and a "
-            f"peak of {float(samples.abs().max()):.3g}"
+            f"and a peak of {float(samples.abs().max()):.3g}"
         )
     data = io.BytesIO()
     try:

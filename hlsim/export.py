@@ -138,9 +138,8 @@ def export_program(
     if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
         raise ValueError(
             f"expected a NeuroMSBG with sample_rate {NEURO_RATE}, got a "
-            f"{type(simulator).__name__}; "
-            "the exact MSBG cannot be exported, because its filters depend on the audiogram's "
-            "values"
+            f"{type(simulator).__name__}; the exact MSBG cannot be exported, because its filters "
+            "depend on the audiogram's values"
         )
     if not (seconds * NEURO_RATE >= 1 and items >= 1):
         raise ValueError(

@@ -97,8 +97,8 @@ def read_checkpoint(
     device = torch.get_default_device()
     try:
         # Gradients may flow through the model later, hence no inference mode. A default device
-        # "meta"
-        # would discard the weights. Initialisation must not advance the caller's random numbers.
+        # "meta" would discard the weights. Initialisation must not advance the caller's random
+        # numbers.
         with torch.inference_mode(False), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))

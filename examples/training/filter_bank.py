@@ -116,9 +116,8 @@ def describe_aid(aid: Aid, ear: Audiogram, speech: Tensor) -> str:
             quality = float(hasqi(output, clean, ear).mean())
             output_level = float(level_spl(output).mean())
     return (
-        f"HASPI {intelligibility:.3f}, HASQI {quality:.3f}, "
-        f"output level {output_level:.1f} dB SPL, "
-        f"loudness error at 50 / 65 / 80 dB SPL {' / '.join(loudness_errors)} dB"
+        f"HASPI {intelligibility:.3f}, HASQI {quality:.3f}, output level {output_level:.1f} dB "
+        f"SPL, loudness error at 50 / 65 / 80 dB SPL {' / '.join(loudness_errors)} dB"
     )
 
 

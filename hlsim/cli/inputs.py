@@ -97,9 +97,8 @@ def read_listener(text: str) -> Listener:
     for missing, other in (("left", "right"), ("right", "left")):
         if getattr(listener, missing) is None:
             raise ValueError(
-                f"--listener {text}: the {missing} ear is missing; use --audiogram for the "
-                f"{other} ear, and a "
-                "file with that channel"
+                f"--listener {text}: the {missing} ear is missing; use --audiogram for the {other} "
+                "ear, and a file with that channel"
             )
     return listener
 

@@ -141,10 +141,8 @@ class Parser(argparse.ArgumentParser):
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
             "path/to/file.py:name, which is a function (waveform, audiogram) -> waveform, or a "
-            "class of "
-            "such functions; waveforms (items, time) are in pascals, audiograms (items, 8) in "
-            "dB HL, and "
-            "the sample rate is its attribute sample_rate or else 16000 Hz"
+            "class of such functions; waveforms (items, time) are in pascals, audiograms (items, "
+            "8) in dB HL, and the sample rate is its attribute sample_rate or else 16000 Hz"
         )
         self.option("--teacher", teacher_name, help_, default, metavar="NAME")
 
@@ -152,8 +150,7 @@ class Parser(argparse.ArgumentParser):
         """Declare ``--audiogram``, one ear."""
         help_ = (
             "NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, "
-            "4000, 6000 "
-            f"and 8000 Hz, separated by commas{text}"
+            f"4000, 6000 and 8000 Hz, separated by commas{text}"
         )
         self.option("--audiogram", str, help_, default, metavar="EAR", **settings)
 
@@ -161,8 +158,7 @@ class Parser(argparse.ArgumentParser):
         """Declare ``--listener``, two ears."""
         help_ = (
             f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
-            "Clarity's "
-            "listeners.json; write FILE:NAME if the file holds several listeners"
+            "Clarity's listeners.json; write FILE:NAME if the file holds several listeners"
         )
         self.option("--listener", str, help_, metavar="FILE[:NAME]", **settings)
 

@@ -19,16 +19,15 @@ def prepare(parser: Parser) -> None:
     option(
         "corpus",
         Path,
-        "folder of VoiceBank-DEMAND, LibriSpeech or LibriTTS, or another folder with the "
-        "folders train, valid and "
-        "test; or a CSV file with the column path, and optionally noisy, speaker and split",
+        "folder of VoiceBank-DEMAND, LibriSpeech or LibriTTS, or another folder with the folders "
+        "train, valid and test; or a CSV file with the column path, and optionally noisy, speaker "
+        "and split",
     )
     option(
         "--folders",
         str,
         "levels of folders in any other corpus, each split, speaker, condition (clean or noisy) "
-        "or other; for example "
-        "speaker, or split/speaker",
+        "or other; for example speaker, or split/speaker",
         metavar="LEVEL/LEVEL",
     )
     option(

@@ -100,9 +100,8 @@ def _train_simulator(options: argparse.Namespace) -> None:
 def _train_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and (options.audiograms or options.valid_audiograms):
         raise ValueError(
-            "--audiogram excludes --audiograms and --valid-audiograms, because it trains for "
-            "one ear; "
-            "leave one or the other out"
+            "--audiogram excludes --audiograms and --valid-audiograms, because it trains for one "
+            "ear; leave one or the other out"
         )
     _check_options(options)
     recipe = read_recipe(options, CompensatorRecipe)
