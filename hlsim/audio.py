@@ -55,6 +55,8 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     """
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"expected the path of an audio file, got {type(path).__name__}")
+    if os.path.isdir(path):
+        raise ValueError(f"{path}: expected an audio file, got a folder")
     if not os.path.isfile(path):
         raise ValueError(f"{path}: there is no such file")
     try:

@@ -117,7 +117,7 @@ def simulate(
     """
     model = build_simulator(simulator, sample_rate, full_scale_spl)
     with torch.no_grad():
-        return _as_input(model(_as_tensor(audio), ear), audio)
+        return _as_input(model(_as_finite_tensor(audio), ear), audio)
 
 
 def compensate(
@@ -153,7 +153,7 @@ def compensate(
     """
     aid = load_compensator(compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     with torch.no_grad():
-        return _as_input(aid(_as_tensor(audio), ear), audio)
+        return _as_input(aid(_as_finite_tensor(audio), ear), audio)
 
 
 def listen(
@@ -255,6 +255,18 @@ def info() -> str:
     lines.append(f"CUDA {cuda or 'not available'}")
     lines.append(f"{torch.get_num_threads()} threads")
     return "\n".join(lines)
+
+
+def _as_finite_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
+    """Return the samples as a tensor, without NaN and infinity."""
+    samples = _as_tensor(audio)
+    invalid = int((~samples.isfinite()).sum())
+    if invalid:
+        raise ValueError(
+            f"expected finite samples, got NaN or infinity in {invalid} of {samples.numel()}; "
+            "remove or replace them"
+        )
+    return samples
 
 
 def _as_tensor(audio: Tensor | NDArray[Any]) -> Tensor:

@@ -1,6 +1,7 @@
 """The functions for a notebook give what the modules behind them give, for tensors and arrays."""
 
 import inspect
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,3 +111,12 @@ def test_all_modules_and_functions_have_the_same_default_rate() -> None:
                 defaults[name] = parameter.default
     assert {"MSBG", "NALR", "HearingLossLoss", "NeuroMSBG", "simulate"} <= defaults.keys()
     assert set(defaults.values()) == {16000}
+
+
+@pytest.mark.parametrize("process", [hlsim.simulate, hlsim.compensate])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_samples_that_are_not_finite_are_rejected(process: Any, value: float) -> None:
+    speech = hlsim.example_speech()[:8000].clone()
+    speech[100] = value
+    with pytest.raises(ValueError, match="1 of 8000"):
+        process(speech, "N3")

@@ -78,7 +78,7 @@ simulate {speech} {speech} --audiogram N3 | refusing to overwrite
 simulate {speech} {folder} --audiogram N3 | expected a file
 simulate {folder} {text} --audiogram N3 | expected a folder
 simulate {folder} {folder}/new --audiogram N3 | neither inside
-simulate {folder} {folder}/.. --audiogram N3 | nor around
+simulate {folder} {folder}/.. --audiogram N3 | nor contains
 simulate {folder} {folder}-new --audiogram N3 | no audio in it
 simulate {speech} {out} --audiogram N3 --simulator no-such-model | no-such-model
 simulate {speech} {out} --audiogram 10,20,30,40,50,60,70 | --audiogram

@@ -366,7 +366,7 @@ LEFT_EAR_ONLY = "listener,ear,hl_500,hl_4000\nL0001,left,20,40\n"
         ({"listeners": {"../x": LISTENERS["L0001"]}}, "a name that no file can have"),
         ({"stride": 0}, "stride is 0"),
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
-        ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "different names"),
+        ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
     ],
