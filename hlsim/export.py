@@ -167,7 +167,7 @@ def export_onnx(
         ValueError: The simulator or the size is unsuitable, see ``export_program``; ONNX lacks an
             operation; or the output of onnxruntime for noise at 64 dB SPL differs by more than
             ``TOLERANCE``.
-        MissingExtraError: Onnx, onnxscript or onnxruntime is not installed.
+        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> import hlsim
     >>> simulator = hlsim.load_pretrained("neuro-msbg-light")
@@ -259,7 +259,7 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
             differs by more than ``TOLERANCE`` in the last of 16 hops of noise at 64 dB SPL.
-        MissingExtraError: Onnx, onnxscript or onnxruntime is not installed.
+        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
     >>> export_aid(WDRC(), "aid.onnx")  # doctest: +SKIP
@@ -285,7 +285,9 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
 def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     """Write the computation of an aid's parameters for an ear as an ONNX file.
 
-    Its input is ``thresholds`` (items, 8) in dB HL, its output ``fitted`` (items, n).
+    Its input is ``thresholds`` (items, 8), in dB HL at ``hlsim.audiogram.FREQUENCIES``. Its output
+    ``fitted`` (items, n) contains the n parameters of the aid for each ear, which the program of
+    ``export_aid`` takes as an input.
 
     Args:
         aid: Aid at any sample rate.
@@ -293,8 +295,9 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
         items: Number of ears.
 
     Raises:
-        ValueError: The output of onnxruntime differs by more than ``TOLERANCE``.
-        MissingExtraError: Onnx, onnxscript or onnxruntime is not installed.
+        ValueError: The output of onnxruntime differs from that of torch by more than
+            ``TOLERANCE``.
+        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
     >>> export_fit(WDRC(), "fit.onnx")  # doctest: +SKIP

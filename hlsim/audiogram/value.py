@@ -188,7 +188,7 @@ class Audiogram:
             The axes.
 
         Raises:
-            MissingExtraError: Matplotlib is not installed.
+            MissingExtraError: matplotlib is not installed.
         """
         if ear is not None:
             style = {"label": f"{ear}, PTA {self.pta:.0f} dB HL"} | style
@@ -256,7 +256,7 @@ class Audiogram:
         """Return pyclarity's ``Audiogram`` with the same levels and frequencies.
 
         Raises:
-            MissingExtraError: Pyclarity is not installed.
+            MissingExtraError: pyclarity is not installed.
         """
         module = require("clarity.utils.audiogram", "dev")
         return module.Audiogram(np.array(self.levels), np.array(self.frequencies))

@@ -163,10 +163,12 @@ class Parser(argparse.ArgumentParser):
         self.option("--listener", str, help_, metavar="FILE[:NAME]", **settings)
 
     def levels(self, levelled: str) -> None:
-        """Declare ``--full-scale-spl`` and, instead, ``--spl``, the level of each file.
+        """Declare ``--full-scale-spl`` and ``--spl``, of which a user sets at most one.
+
+        The first is the level of a file whose RMS is 1.0, the second the level of each file.
 
         Args:
-            levelled: Noun for the signal with the level.
+            levelled: Name of the signal that has the level ``--spl``, for the help text.
         """
         group = self.add_mutually_exclusive_group()
         text = "level in dB SPL of a file whose RMS is 1.0"

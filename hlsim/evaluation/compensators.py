@@ -225,7 +225,10 @@ def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
     table = evaluation.table[~evaluation.table["item"].isin(evaluation.failures["item"])]
     if table.empty:
         first = evaluation.failures.iloc[0]
-        raise ValueError(f"no item has all its values; the first: {first['failure']}")
+        raise ValueError(
+            "every item lacks at least one value, so that nothing can be compared; the first "
+            f"failure: {first['failure']}"
+        )
     unaided = table[table["condition"] == UNAIDED].set_index("item")
     members = {
         "clean": unaided["speech"] == "clean",

@@ -71,7 +71,7 @@ def run_parallel(
 
     Raises:
         ValueError: ``jobs`` is less than 1, or no scheduler answers.
-        MissingExtraError: Joblib (extra ``eval``) or distributed (extra ``cluster``) is not
+        MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not
             installed.
 
     >>> list(run_parallel(abs, [-1, 2], jobs=1))

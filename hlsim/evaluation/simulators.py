@@ -74,7 +74,7 @@ def evaluate_simulators(
 
     Raises:
         ValueError: Data or settings are not valid, or no item has a value.
-        MissingExtraError: Pandas or pystoi is not installed. Without pesq, that measure is left
+        MissingExtraError: pandas or pystoi is not installed. Without pesq, that measure is left
             out.
     """
     require("pandas", "eval")

@@ -148,7 +148,7 @@ def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
 
     Raises:
         ValueError: The shapes differ.
-        MissingExtraError: Pystoi is not installed.
+        MissingExtraError: pystoi is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
     >>> round(stoi(noise, noise, 16000).value)
@@ -174,7 +174,7 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
 
     Raises:
         ValueError: The shapes differ.
-        MissingExtraError: Pesq is not installed.
+        MissingExtraError: pesq is not installed.
 
     >>> pesq_wb(np.zeros(16000), np.ones(16000), 16000).reason
     'clean is silent'

@@ -160,7 +160,8 @@ def impulse_responses(
 ) -> NDArray[np.float64]:
     """Compute impulse responses with time 0 in the middle from frequency responses.
 
-    Shape: (severities, points // 2 + 1) -> (severities, 2 * half).
+    Shape: (severities, points // 2 + 1) -> (severities, 2 * half), where half is ``half_length``
+        of the rate.
 
     Args:
         points: FFT length of the responses.

@@ -41,7 +41,7 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 
     Raises:
         ValueError: The files cannot be written.
-        MissingExtraError: Matplotlib or jinja2 is not installed.
+        MissingExtraError: matplotlib or jinja2 is not installed.
     """
     return write_page(report_page(evaluation, listen), evaluation.to_dict(), out)
 

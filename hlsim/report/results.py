@@ -89,8 +89,8 @@ def summary_table(
     Args:
         caption: Caption of the table.
         rows: Parts of the study's table by name.
-        columns: Statistics by title.
-        first: Title of the names.
+        columns: Statistics by the heading of their column.
+        first: Heading of the first column, which contains the names.
         folded: Whether the table is shown only when it is opened.
     """
     cells = []
@@ -240,7 +240,7 @@ def items_table(evaluation: Evaluation, caption: str) -> Table:
 
 
 def scored_by(evaluation: Evaluation) -> str:
-    """Return a sentence about the origin of HASPI and HASQI."""
+    """Return a sentence that says which software computed HASPI and HASQI."""
     names = [title_of(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
     version = evaluation.versions["hlsim"]
     text = (

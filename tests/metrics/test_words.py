@@ -24,7 +24,7 @@ def test_bundled_parameters_are_those_of_a_new_fit() -> None:
     # The docstring of the module says 0.97.
     assert means_of_aids.corr().iloc[0, 1] > 0.96
     # The logistic function of the challenge has an RMS error of 26.4 points per sentence.
-    error = 100.0 * (example["expected"](fit.curve, rows) - rows.hits / rows.n_words)
+    error = 100.0 * (example["predict"](fit.curve, rows) - rows.hits / rows.n_words)
     assert np.sqrt(np.square(error).mean()) < 26.4
 
 
