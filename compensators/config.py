@@ -49,6 +49,9 @@ class MappingConfig(NetworkConfig):
 class HearingAidConfig(ModelConfig):
     """Settings of a ``HearingAid``.
 
+    The gain of a band is a restoring gain, which brings the loudness of the band back to that of a
+    normal ear, plus a correction by a small network.
+
     Attributes:
         bands: Number of bands with a gain, an equal number of ERBs but at least 125 Hz apart, 4 to
             40.
@@ -56,7 +59,7 @@ class HearingAidConfig(ModelConfig):
             reduction sees in addition to those of the bands.
         width: Width of the layer before the recurrent one of noise reduction.
         hidden: Width of the recurrent layer.
-        inner: Width of the three layers of the correction.
+        inner: Width of the three layers of the network that computes the correction.
         reach_db: Largest correction of the restoring gain up or down in dB.
         reduction_db: Largest attenuation of a band by noise reduction in dB.
         attack: Time constant in seconds with which the levels behind the gain rise.

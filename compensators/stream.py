@@ -17,8 +17,8 @@ class Stream:
 
     The output is delayed by ``aid.latency`` samples. The sliders of the aid, such as
     ``noise_reduction`` and ``amplification``, are attributes that may be set at any time: they move
-    from end to end in 0.1 s, so that nothing clicks. Chunks for more than eight items have more
-    than eight samples.
+    from end to end in 0.1 s, so that nothing clicks. For more than eight items, a chunk has nine
+    samples or more, because a smaller one looks like an array with time first.
 
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
 

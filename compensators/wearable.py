@@ -124,9 +124,12 @@ class Wearable(nn.Module):
     def advance(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> dict[str, Tensor]:
-        """Return the state after whole hops, in which ``gains`` covers all of these hops.
+        """Process a whole number of hops, and return the new state.
 
-        Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders).
+        Its entry ``gains`` contains the gains of all these hops, not only of the last one.
+
+        Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders), where n is the number
+            of parameters that are fitted to an ear.
         """
         padded = torch.cat((state["past"], samples), -1)
         powers = frame_power(padded)

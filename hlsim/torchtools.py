@@ -74,7 +74,9 @@ def constant(
 
 
 def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any) -> Tensor:
-    """Return ``constant`` in the precision and on the device of a real or complex tensor.
+    """Return an array that a function computes, as a tensor like another one.
+
+    The result has the precision and the device of ``tensor``, which may be complex.
 
     >>> constant_like(torch.zeros(1).double(), np.hanning, 3)
     tensor([0., 1., 0.], dtype=torch.float64)

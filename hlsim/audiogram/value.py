@@ -326,6 +326,11 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
 def check_range(levels: Iterable[float], highest: float, user: str) -> None:
     """Validate levels in dB HL.
 
+    Args:
+        levels: Levels to validate.
+        highest: Highest level that is valid.
+        user: Name of the model that uses the levels, for the message.
+
     Raises:
         ValueError: A level is below -10 or above ``highest``, or NaN.
 

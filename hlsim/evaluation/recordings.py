@@ -222,7 +222,8 @@ def haspi_report(
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns:
-        The evaluation. The comparison of the first with the last condition is planned.
+        The evaluation. The comparison of the last condition with the first counts as planned
+        before the scores were known, so its p values are not adjusted.
 
     Raises:
         ValueError: Files do not match, a row of the manifest is not valid, or nothing could be
@@ -415,7 +416,8 @@ def read_manifest(
     """Read the recordings of a manifest, in the order of their first rows.
 
     Args:
-        path: CSV file.
+        path: CSV file with the columns ``clean`` and ``processed`` (files) and ``condition``, and
+            optionally ``utterance``, ``listener``, ``ear``, ``snr`` and ``hl_250``, ....
         root: Folder to which the paths are relative and which contains them; by default that of
             the manifest.
         audiogram: The ear of rows without an audiogram.

@@ -93,7 +93,7 @@ class Item:
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def load(self) -> Item:
-        """Return the item, without the results of ``once``."""
+        """Return a copy of the item without the values that ``once`` has computed for it."""
         return replace(self)
 
     def digest(self, condition: str) -> str:

@@ -99,9 +99,12 @@ class PreparedBatch(Generic[Channels]):
     ) -> Tensor:
         """Compare processed signals with the clean ones.
 
+        This object has some of the items. Arguments are for all items, and the result is for its
+        own ones.
+
         Args:
             processed: All processed signals. Shape: (all items, time).
-            noise: Kind of noise.
+            noise: Kind of the internal noise of the ear.
             seeds: Seeds of all items.
             ears: Hair cells of all items, where they are not those of the clean signals.
 

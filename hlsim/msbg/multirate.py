@@ -131,13 +131,15 @@ def assign_rates(
 ) -> list[tuple[slice, int, Detector]]:
     """Divide the channels of a bank into bands with a common rate and detector.
 
-    The last channel stands for all channels above it, if there are any.
+    Channels above ``highest`` are left out; the last channel of the result is used for them.
 
     Args:
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
         highest: Highest frequency of interest in Hz, at most 11025 if ``step`` is 2.
 
-    Returns: channels, samples per step and detector of each band, from the lowest channels up.
+    Returns: The channels of each band, the number of its samples in 24 samples at 44.1 kHz, and the
+        signal from which its envelopes are computed: the channel itself, or the modulus of its
+        analytic signal. The lowest band comes first.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> for channels, samples, detector in assign_rates(BANKS["moderate"], step=2, highest=8000.0):
@@ -193,7 +195,8 @@ def multirate_bank(
     """Build a filter bank for signals of one length, with each channel at its own rate.
 
     Args:
-        points: FFT length at 44.1 kHz, a whole number of the envelopes' steps.
+        points: FFT length at 44.1 kHz, a multiple of the 24 samples between two values of an
+        envelope.
         step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
         highest: Highest frequency of interest in Hz.
         dtype: Precision of real tensors, and of the parts of complex ones.

@@ -293,9 +293,10 @@ def zero_phase_responses(
 
 
 def correlation(covariance: ModulationCovariance) -> Tensor:
-    """Return the magnitude of the correlation by rate of modulation, averaged over the cosines.
+    """Compute the correlation of clean and processed envelopes at each rate of modulation.
 
-    Constant cosines count 0.
+    Its magnitude is averaged over the cepstral coefficients, which are the projections of the
+    spectrum on cosines. A coefficient that is constant over time counts as 0.
 
     Returns:
         Correlations. Shape: (items, 10).
