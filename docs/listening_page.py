@@ -1,6 +1,6 @@
-"""Files of the listening page that are not in the repository: models, onnxruntime-web and speech.
+"""Build the listening page: export its models, and add onnxruntime-web and speech.
 
-As a hook of mkdocs, this file adds them to the site. Without npm, the site is built without the page.
+As a hook of mkdocs, this file adds the page to the site. Without npm, the site is built without the page.
 This command writes the page with them into a folder:
 
     python docs/listening_page.py build/listen
