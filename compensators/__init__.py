@@ -2,9 +2,9 @@
 
 from compensators.config import HearingAidConfig, MappingConfig
 from compensators.hearing_aid import HearingAid
+from compensators.loading import load_compensator, save_compensator, trained_for
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
-from compensators.pretrained import load_compensator, save_compensator, trained_for
 from compensators.wdrc import WDRC
 
 __all__ = [

@@ -71,12 +71,12 @@ from torch import Tensor, nn
 from compensators import load_compensator
 from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
+from hlsim.checkpoint import SIMULATOR, shipped_checkpoints
 from hlsim.losses.criteria import CRITERIA, weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics import haspi, hasqi, mbstoi
 from hlsim.neuro import NeuroConfig
 from hlsim.neuro.scan import _kernel as mamba_kernel
-from hlsim.pretrained import SIMULATOR, shipped_checkpoints
 
 Row = dict[str, Any]
 Step = Callable[[], Any]

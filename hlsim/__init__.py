@@ -19,12 +19,11 @@ if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
     from hlsim.audiogram.listener import Listener
     from hlsim.audiogram.table import read_audiograms
+    from hlsim.checkpoint import list_pretrained
     from hlsim.losses.haspi_loss import HASPILoss
     from hlsim.losses.hearing_loss import HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
-    from hlsim.neuro import NeuroMSBG
-    from hlsim.neuro.pretrained import load_pretrained
-    from hlsim.pretrained import list_pretrained
+    from hlsim.neuro import NeuroMSBG, load_pretrained
     from hlsim.shortcuts import compensate, example_speech, info, listen, load_audio, simulate
 
 
@@ -69,11 +68,11 @@ _MODULES = {
     "estimate_delay": "hlsim.msbg",
     "example_speech": "hlsim.shortcuts",
     "info": "hlsim.shortcuts",
-    "list_pretrained": "hlsim.pretrained",
+    "list_pretrained": "hlsim.checkpoint",
     "listen": "hlsim.shortcuts",
     "load_audio": "hlsim.shortcuts",
     "load_compensator": "compensators",
-    "load_pretrained": "hlsim.neuro.pretrained",
+    "load_pretrained": "hlsim.neuro",
     "read_audiograms": "hlsim.audiogram.table",
     "save_compensator": "compensators",
     "simulate": "hlsim.shortcuts",

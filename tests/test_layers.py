@@ -17,7 +17,7 @@ FLOORS = {
     "goals": "losses metrics",
     "models": "compensators neuro msbg export",
     "ground": (
-        "audiogram dsp calibration audio checks files extras torchtools pretrained plugins version"
+        "audiogram dsp calibration audio checks files extras torchtools checkpoint plugins version"
     ),
 }
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS.values()) for room in rooms.split()}

@@ -91,7 +91,7 @@ def test_cards_are_short(card: Path) -> None:
 def test_recipes_are_readable() -> None:
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("lightning")
-    from compensators.pretrained import CONFIGS
+    from compensators.loading import CONFIGS
     from hlsim.neuro import NeuroConfig
     from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 

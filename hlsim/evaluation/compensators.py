@@ -34,8 +34,8 @@ from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
+from hlsim.neuro import load_pretrained
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.neuro.pretrained import load_pretrained
 from hlsim.plugins import WaveformPlugin
 
 UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"

@@ -14,14 +14,14 @@ from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.devices import on_device
+from hlsim.checkpoint import SIMULATOR, find_checkpoint
 from hlsim.checks import broadcast_shape, check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
+from hlsim.neuro import load_pretrained
 from hlsim.neuro.network import EarNetwork
-from hlsim.neuro.pretrained import load_pretrained
-from hlsim.pretrained import SIMULATOR, find_checkpoint
 from hlsim.torchtools import without_modes
 
 ReferenceName = Literal["clean", "normal-hearing"]

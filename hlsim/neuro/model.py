@@ -1,4 +1,6 @@
-"""Neuro-MSBG, a neural network that emulates MSBG."""
+"""Neuro-MSBG, a neural network that emulates MSBG, and loading of trained ones."""
+
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -6,6 +8,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import PASCAL_SPL
+from hlsim.checkpoint import SIMULATOR, read_checkpoint
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.bands import BandCorrection
@@ -209,3 +212,31 @@ class NeuroMSBG(EarNetwork):
             return features
         levels = (ears / 100.0)[:, None, None].expand(*features.shape[:3], -1)
         return torch.cat((features, levels), -1)
+
+
+def load_pretrained(
+    name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
+) -> NeuroMSBG:
+    """Load a trained Neuro-MSBG, frozen and in eval mode, without downloads.
+
+    Args:
+        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or a checkpoint
+            folder.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: There is no such checkpoint, it is damaged, or it is no simulator.
+
+    >>> import torch
+    >>> load_pretrained("neuro-msbg-light")(torch.randn(2, 16000), "N3").shape
+    torch.Size([2, 16000])
+    """
+
+    def build(config: NeuroConfig) -> NeuroMSBG:
+        return NeuroMSBG(
+            config, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
+        )
+
+    model = read_checkpoint(name, {SIMULATOR: NeuroConfig.from_dict}, build)
+    return model.eval().requires_grad_(False)

@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar, WeightAveraging
 from torch import Tensor
 
-from hlsim.pretrained import save_checkpoint
+from hlsim.checkpoint import save_checkpoint
 
 CHECKPOINT = "checkpoint"
 """Name of the folder that ``load_pretrained`` or ``load_compensator`` reads."""

@@ -9,10 +9,10 @@ from typing import Any, Unpack
 from torch import Tensor, nn
 
 from compensators.hearing_aid import HearingAid
-from compensators.pretrained import CONFIGS, build_compensator, load_compensator
+from compensators.loading import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
+from hlsim.checkpoint import checkpoint_digest
 from hlsim.losses.hearing_loss import HearingLossLoss
-from hlsim.pretrained import checkpoint_digest
 from hlsim.training.batches import TrainingData, compensator_data
 from hlsim.training.data_module import Batch
 from hlsim.training.denoising import attenuation_error, missing_intelligibility

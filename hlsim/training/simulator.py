@@ -9,12 +9,11 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
+from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
-from hlsim.neuro import NeuroConfig, NeuroMSBG
-from hlsim.neuro.pretrained import load_pretrained
-from hlsim.pretrained import SIMULATOR
+from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
 from hlsim.training.batches import TrainingData, simulator_data
 from hlsim.training.callbacks import WeightAverage
 from hlsim.training.data_module import Batch

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from hlsim.pretrained import checkpoint_digest
+from hlsim.checkpoint import checkpoint_digest
 from hlsim.training.callbacks import CHECKPOINT, BestCheckpoint, ProgressBar
 from hlsim.training.data_module import BatchData
 from hlsim.training.module import TrainingModule

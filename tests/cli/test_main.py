@@ -17,8 +17,8 @@ from hlsim import MSBG, Audiogram, Listener
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
+from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
-from hlsim.pretrained import save_checkpoint
 
 N3 = Audiogram.standard("N3")
 

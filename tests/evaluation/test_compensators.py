@@ -11,12 +11,12 @@ from compensators import MappingCompensator
 from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
+from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
 from hlsim.evaluation import Item, aid_properties
 from hlsim.evaluation.aids import Unaided, load_enhancers
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.measures import NORMAL, PERCEPTION, band_error_db, network_loss
-from hlsim.pretrained import save_checkpoint
 from hlsim.report.compensators import compensators_page
 
 for module in ("matplotlib", "joblib", "pandas"):

@@ -11,9 +11,9 @@ from torch import nn
 
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
+from hlsim.checkpoint import SIMULATOR, shipped_checkpoints
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint
-from hlsim.neuro.pretrained import load_pretrained
-from hlsim.pretrained import SIMULATOR, shipped_checkpoints
+from hlsim.neuro import load_pretrained
 
 N3 = Audiogram.standard("N3")
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
+from hlsim.checkpoint import find_checkpoint
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.coherent_bands import DEFAULT_WEIGHTS as COHERENT_WEIGHTS
@@ -23,7 +24,6 @@ from hlsim.losses.coherent_bands import coherent_band_parts
 from hlsim.losses.paper import DEFAULT_WEIGHTS as PAPER_WEIGHTS
 from hlsim.losses.paper import paper_parts
 from hlsim.msbg.response import apply_bank_phase
-from hlsim.pretrained import find_checkpoint
 from tests.losses.signals import add_noise, excerpt, gain_slope
 
 SIMULATORS = {"neuro-msbg": NeuroMSBG, "msbg": MSBG}

@@ -136,7 +136,7 @@ def test_networks_are_deterministic_and_restored_from_a_checkpoint(
     kind: str, tmp_path: Path
 ) -> None:
     from hlsim import load_pretrained
-    from hlsim.pretrained import save_checkpoint
+    from hlsim.checkpoint import save_checkpoint
 
     model = network(kind)
     waveform = 0.02 * torch.randn(1600)

@@ -15,8 +15,8 @@ from compensators import HearingAid, HearingAidConfig, load_compensator, save_co
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.audio import read_audio
 from hlsim.audiogram.table import read_audiograms
+from hlsim.checkpoint import save_checkpoint
 from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import save_checkpoint
 
 TRIALS = 100
 SIZES = (0, 1, 2**31 - 1, 2**31, 2**32 - 1)

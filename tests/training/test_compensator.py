@@ -11,8 +11,8 @@ pytest.importorskip("lightning")
 
 from compensators import HearingAid, MappingCompensator, load_compensator
 from hlsim import Audiogram
+from hlsim.checkpoint import checkpoint_about, checkpoint_digest, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
-from hlsim.pretrained import checkpoint_about, checkpoint_digest, save_checkpoint
 from hlsim.training.batches import CompensatorBatches, TrainingData, compensator_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
 from hlsim.training.data_module import Batch

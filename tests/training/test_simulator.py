@@ -13,9 +13,8 @@ pytest.importorskip("lightning")
 from hlsim.audio import find_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl
-from hlsim.neuro import NeuroMSBG
-from hlsim.neuro.pretrained import load_pretrained
-from hlsim.pretrained import checkpoint_about, checkpoint_digest
+from hlsim.checkpoint import checkpoint_about, checkpoint_digest
+from hlsim.neuro import NeuroMSBG, load_pretrained
 from hlsim.training.batches import (
     TrainingData,
     simulator_data,

@@ -11,8 +11,8 @@ from compensators.wdrc import WDRC
 from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
+from hlsim.checkpoint import checkpoint_about, read_checkpoint, save_checkpoint
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import checkpoint_about, read_checkpoint, save_checkpoint
 from hlsim.version import __version__
 
 Trained = MappingCompensator | HearingAid

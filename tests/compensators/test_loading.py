@@ -14,7 +14,7 @@ from compensators import (
     save_compensator,
     trained_for,
 )
-from hlsim.pretrained import save_checkpoint
+from hlsim.checkpoint import save_checkpoint
 from tests.compensators.aids import EAR, SMALL
 
 

@@ -10,8 +10,7 @@ import torch
 
 from compensators import load_compensator
 from hlsim import NeuroMSBG, list_pretrained, load_pretrained
-from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import (
+from hlsim.checkpoint import (
     checkpoint_about,
     checkpoint_digest,
     checkpoints_folder,
@@ -19,6 +18,7 @@ from hlsim.pretrained import (
     save_checkpoint,
     shipped_checkpoints,
 )
+from hlsim.neuro import NeuroConfig
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -183,7 +183,7 @@ def test_names_do_not_lead_out_of_the_folder_that_ships(
     for place in (package / "checkpoints" / "good", package, package / "beside"):
         place.mkdir(parents=True, exist_ok=True)
         (place / "config.json").write_text("{}")
-    monkeypatch.setattr("hlsim.pretrained.checkpoints_folder", lambda: package / "checkpoints")
+    monkeypatch.setattr("hlsim.checkpoint.checkpoints_folder", lambda: package / "checkpoints")
     monkeypatch.chdir(tmp_path)
     assert find_checkpoint("good") == package / "checkpoints" / "good"
     for name in ("..", "../beside", ".", ""):
