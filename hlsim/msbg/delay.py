@@ -1,4 +1,4 @@
-"""Measurement of a simulator's delay with an impulse, as in the Neuro-MSBG paper."""
+"""Measurement of the delay of a simulator from its response to an impulse."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from hlsim.audiogram.thresholds import AudiogramLike
 def estimate_delay(
     simulator: nn.Module, audiogram: AudiogramLike | None = None, *, level: float = 94.0
 ) -> int:
-    """Estimate the delay of a simulator in samples from its response to an impulse.
+    """Measure by how many samples a simulator delays its output.
 
-    The input is one second of silence with an impulse in the middle. The delay is the time from the
-    impulse to the largest magnitude of the output. It depends on the ear and on the level, because
-    the sum of MSBG's channels is dispersive: at 44.1 kHz it is 1078 samples without a hearing loss
-    and 1237 to 1271 samples with one. To align signals, use ``MSBG.delay``, which does not depend
-    on the ear within a severity.
+    The input is one second of silence with one sample of sound, an impulse, in the middle. The
+    delay is the time from the impulse to the largest magnitude of the output. It depends on the ear
+    and on the level, because MSBG delays low frequencies more than high ones: at 44.1 kHz it is
+    1078 samples without a hearing loss and 1237 to 1271 samples with one. To align signals, use
+    ``MSBG.delay``, which depends on the severity of the loss only.
 
     Source: the Neuro-MSBG paper, Section III-A.
 
@@ -27,7 +27,11 @@ def estimate_delay(
             with ``aligned=False``, because aligned simulators have no delay.
         audiogram: Hearing loss of one ear. By default, it is the simulator's stored one, or 0 dB HL
             if there is none.
-        level: Peak of the impulse, as the level in dB SPL of a constant signal of this value.
+        level: Level of the impulse: its sample is as large as the RMS of a sound of this level in
+            dB SPL.
+
+    Returns:
+        The delay in samples at the simulator's sample rate.
 
     Raises:
         ValueError: The simulator lacks an attribute, or the audiogram has more than one ear.

@@ -1,4 +1,8 @@
-"""The linear stages of MSBG: outer and middle ear, their inverse, and the final low-pass."""
+"""Filters of MSBG before and after the cochlea.
+
+The filter of the outer and middle ear turns sound in front of the listener into what reaches the
+cochlea. Its inverse turns the output of the cochlea back into sound, and a low-pass follows.
+"""
 
 from functools import lru_cache
 
@@ -14,10 +18,10 @@ MSBG_RATE = 44100
 EAR_DELAY = 507
 """Delay in samples of each of the two ear filters, which have 1015 taps and linear phase."""
 
-LOWPASS_HZ = 18000.0
+_LOWPASS_HZ = 18000.0
 """Cut-off frequency of the final low-pass."""
 
-LOWPASS_HALF_SECONDS = 0.0015
+_LOWPASS_HALF_SECONDS = 0.0015
 """Half the length of the final low-pass."""
 
 # The tables are those of the Cambridge hearing-loss simulator in pyclarity 0.9.0
@@ -44,12 +48,13 @@ _FREE_FIELD_GAIN_DB = np.array(
 
 @lru_cache(maxsize=2)
 def ear_filter(backward: bool = False) -> NDArray[np.float64]:
-    """Design the filter from the frontal free field to the cochlea, or back.
+    """Design the FIR filter of the outer and middle ear, or the filter that undoes it.
 
     Args:
-        backward: Design the inverse filter, from the cochlea to the free field.
+        backward: Design the inverse filter, from the cochlea to the sound in front of the listener.
 
-    Returns: Taps at 44.1 kHz. Shape: (1015,).
+    Returns:
+        Coefficients at 44.1 kHz, (1015,).
 
     >>> ear_filter().shape
     (1015,)
@@ -68,17 +73,18 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def lowpass_filter() -> NDArray[np.float64]:
-    """Design the low-pass that removes processing noise above 18 kHz.
+    """Design the FIR low-pass that removes artefacts of the model above 18 kHz.
 
     It is a windowed sinc, as ``scipy.signal.firwin`` designs it.
 
-    Returns: Taps at 44.1 kHz. Shape: (133,).
+    Returns:
+        Coefficients at 44.1 kHz, (133,).
 
     >>> lowpass_filter().shape
     (133,)
     """
-    half = int(LOWPASS_HALF_SECONDS * MSBG_RATE)
-    cutoff = LOWPASS_HZ / (MSBG_RATE / 2.0)
+    half = int(_LOWPASS_HALF_SECONDS * MSBG_RATE)
+    cutoff = _LOWPASS_HZ / (MSBG_RATE / 2.0)
     time = np.arange(2 * half + 1) - float(half)
     taps = cutoff * np.sinc(cutoff * time) * kaiser(len(time), 8.0)
     gain_at_0_hz = taps.sum()

@@ -1,6 +1,13 @@
 """Envelopes of the channels: rectified signals after a low-pass of at most 75 Hz.
 
-Envelopes are so slow that they are computed at every 24th sample only.
+Envelopes vary so slowly that they are computed once per *step* of 24 samples only, in three stages:
+
+1. Rectify each channel. For channels at reduced rates, ``detect`` computes what the rectified
+   channel would be.
+2. Average the rectified samples of each step with three running means, so that few frequencies
+   alias. ``partial_means`` computes the contributions of each step to its own average and to those
+   of its two neighbours.
+3. Add up the contributions and apply the low-pass (``smooth``).
 """
 
 from functools import lru_cache
@@ -21,7 +28,7 @@ STEP = 24
 """Samples at 44.1 kHz from one value of an envelope, and of the gain from it, to the next."""
 
 HALF_RATE_STEP = 24.5
-"""Same as ``STEP``, where signals run at 22.05 kHz: the envelopes have 1800 values per second.
+"""Samples at 44.1 kHz per step where signals run at 22.05 kHz: 1800 steps per second.
 
 With this step, the FFT lengths that 22.05 kHz shares with 16 kHz have fewer factors of 7.
 """
@@ -34,7 +41,7 @@ _PROTOTYPE_POLES = np.array(
 _PROTOTYPE_GAIN = 0.017782794100389257
 
 _RUNNING_MEANS = 3
-"""Number of running means over one step before decimation.
+"""Number of running means over one step, applied one after the other.
 
 Together they have zeros of third order at the frequencies that alias to 0 Hz.
 """
@@ -44,18 +51,18 @@ POWER_FLOOR = 1e-30
 
 
 def detect(signals: Tensor, harmonics: bool) -> Tensor:
-    """Compute pi / 2 times the full-wave rectified real part of signals, without high frequencies.
+    """Rectify signals that are sampled too slowly for the high frequencies of a rectified signal.
 
-    A rectified cosine is |cos a| = 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a + ...). Its slow part,
-    times pi / 2, is the modulus of the analytic signal.
+    A rectified cosine is |cos a| = 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a + ...). Its slow part is
+    2 / pi times the modulus of the analytic signal, exp(i a). Therefore the result is pi / 2 times
+    the rectified real part, without its harmonics or with the first two of them.
 
     Shape: complex (...) -> real (...).
 
     Args:
-        signals: Analytic signals.
-        harmonics: Include the terms of cos 2a and cos 4a. Channels need them if they are so wide
-            for their centre frequency that these terms reach down to the frequencies of the
-            envelope.
+        signals: Analytic signals, complex signals without negative frequencies.
+        harmonics: Include the terms of cos 2a and cos 4a. Wide channels with low centre frequencies
+            need them, because these terms reach down to the frequencies of the envelope.
 
     >>> detect(torch.tensor([3.0 + 4.0j]), harmonics=False)
     tensor([5.])
@@ -66,7 +73,12 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
 
 
 def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
-    """Compute ``detect``, and for harmonics the modulus and squared cosine of the phase."""
+    """Compute the result of ``detect``.
+
+    Returns:
+        The result; with harmonics also the modulus and the squared cosine of the phase, which the
+        gradient needs.
+    """
     squared_modulus = power(signals).add_(POWER_FLOOR)
     if not harmonics:
         # torch's modulus of complex numbers takes four times as long.
@@ -107,32 +119,37 @@ class _Detect(torch.autograd.Function):
         return torch.complex(signals.real * real_factor, signals.imag * imag_factor), None
 
 
-def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
-    """Compute three weighted sums of the samples of each step.
+def partial_means(rectified: Tensor, weights: Tensor) -> Tensor:
+    """Compute three weighted sums of the samples of each step, the contributions to its average.
 
-    ``smooth`` adds the sums of neighbouring steps, which gives one value per step of the running
-    means.
+    They contribute to the average of the step after, of the same step and of the step before.
+    ``smooth`` adds up the three contributions to each step.
 
-    Shape: (..., time), (3, samples) -> (..., 3, steps).
+    Shape: (..., time), (3, samples) -> (..., 3, steps), where time is steps * samples.
 
     Args:
-        kernel: Weights from ``decimation_kernel``.
+        rectified: Rectified channels.
+        weights: Weights from ``mean_weights``.
 
-    >>> decimate(torch.ones(1, 48), torch.from_numpy(decimation_kernel()).float()).shape
+    >>> partial_means(torch.ones(1, 48), torch.from_numpy(mean_weights()).float()).shape
     torch.Size([1, 3, 2])
     """
-    return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
+    return weights @ rectified.unflatten(-1, (-1, weights.shape[-1])).mT
 
 
 def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
-    """Compute envelopes at the beginning of each step from the sums of ``decimate``.
+    """Compute envelopes from the averages of rectified channels, with the low-pass of each channel.
 
-    The signals count as periodic.
+    The signals are treated as periodic: their end is followed by their beginning.
 
     Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
 
     Args:
+        sums: Sums from ``partial_means``.
         lowpass: Frequency responses from ``envelope_lowpass``.
+
+    Returns:
+        Envelopes at the first sample of each step.
 
     >>> smooth(torch.ones(1, 3, 4), torch.ones(1, 3))
     tensor([[3., 3., 3., 3.]])
@@ -144,21 +161,23 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
 
 
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
-    """Compute the envelopes of channels at 44.1 kHz at every 24th sample.
+    """Compute the envelopes of channels that are sampled at 44.1 kHz, at every 24th sample.
 
-    The channels are rectified and low-passed without delay. They count as periodic.
+    The channels are rectified and low-passed without delay. They are treated as periodic: their end
+    is followed by their beginning.
 
     Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), where
         time is a multiple of 24.
 
     Args:
+        channels: Band-pass signals.
         lowpass: Frequency responses from ``envelope_lowpass``.
 
     >>> envelope(torch.full((1, 96), -2.0), torch.ones(1, 3)).round(decimals=3)
     tensor([[2., 2., 2., 2.]])
     """
-    kernel = constant_like(channels, decimation_kernel)
-    return smooth(decimate(channels.abs(), kernel), lowpass)
+    weights = constant_like(channels, mean_weights)
+    return smooth(partial_means(channels.abs(), weights), lowpass)
 
 
 def envelope_lowpass(
@@ -168,19 +187,22 @@ def envelope_lowpass(
     channels: slice = slice(None),
     step: float = STEP,
 ) -> NDArray[np.complex128]:
-    """Compute the responses that turn spectra of ``smooth``'s means into spectra of envelopes.
+    """Compute the frequency responses of the low-passes of envelopes, for ``smooth``.
 
-    They contain the low-pass of each channel and compensate for the running means. The low-pass is
-    run forwards and backwards, as by pyclarity with ``filtfilt``. The effect of ``filtfilt`` on the
-    end of a signal is computed in ``hlsim.msbg.filtfilt_end``.
+    Each low-pass is run forwards and backwards, as by pyclarity with ``scipy.signal.filtfilt``. The
+    responses also compensate for the running means, which attenuate high frequencies and are
+    centred on the middle of a step. ``hlsim.msbg.filtfilt_end`` computes the effect of ``filtfilt``
+    on the end of a signal.
 
     Args:
-        points: FFT length at 44.1 kHz, a whole number of steps.
-        samples: Number of samples of the rectified signal per step.
+        bank: Filter bank to which the channels belong.
+        points: FFT length of the signals at 44.1 kHz, a whole number of steps.
+        samples: Number of samples of a rectified channel per step.
         channels: Channels of the bank, by default all of them.
         step: Length of a step in samples at 44.1 kHz.
 
-    Returns: Responses of shape (channels, steps // 2 + 1).
+    Returns:
+        Complex responses, (channels, steps // 2 + 1).
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> envelope_lowpass(BANKS["mild"], points=4800).shape
@@ -202,34 +224,33 @@ def envelope_lowpass(
 
 @lru_cache(maxsize=4)
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Design the low-pass of each channel's envelope.
+    """Design the recursive low-pass filter of each channel's envelope.
 
-    Its cut-off frequency is 75 Hz, or three quarters of the channel's ERB if this is lower.
+    Its cut-off frequency is 75 Hz, or three quarters of the channel's equivalent rectangular
+    bandwidth if this is lower.
 
-    Returns: Numerator and denominator for each channel, three coefficients each.
+    Returns:
+        Numerator and denominator for each channel, three coefficients each.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> len(envelope_filters(BANKS["mild"]))
     36
     """
     widths = erb(np.array(bank.centre_frequencies))
-    return [elliptic_lowpass(0.75 * min(100.0, width) / (MSBG_RATE / 2.0)) for width in widths]
+    return [_elliptic_lowpass(0.75 * min(100.0, width) / (MSBG_RATE / 2.0)) for width in widths]
 
 
-def elliptic_lowpass(cutoff: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _elliptic_lowpass(cutoff: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Design an elliptic low-pass of second order with 0.25 dB ripple and 35 dB attenuation.
 
     The result equals that of ``scipy.signal.ellip(2, 0.25, 35, cutoff)``. Importing this function
     would take half a second.
 
     Args:
-        cutoff: cut-off frequency relative to the Nyquist frequency.
+        cutoff: Cut-off frequency relative to the Nyquist frequency.
 
-    Returns: Numerator and denominator, three coefficients each.
-
-    >>> numerator, denominator = elliptic_lowpass(0.1)
-    >>> print((numerator.sum() / denominator.sum()).round(3))  # -0.25 dB at 0 Hz
-    0.972
+    Returns:
+        Numerator and denominator, three coefficients each.
     """
     # The analogue prototype is scaled to the cut-off frequency. The bilinear transform with a
     # sample rate of 2 makes it digital.
@@ -249,16 +270,19 @@ def _polynomial_with_roots(roots: NDArray[np.complex128]) -> NDArray[np.float64]
 
 
 @lru_cache(maxsize=8)
-def decimation_kernel(samples: int = STEP) -> NDArray[np.float64]:
-    """Compute the weights with which the samples of a step contribute to the running means.
+def mean_weights(samples: int = STEP) -> NDArray[np.float64]:
+    """Compute the weights of the samples of a step in the averages of rectified channels.
+
+    Three running means, each as long as a step, give the average. It covers three steps.
 
     Args:
         samples: Number of samples per step.
 
-    Returns: Weights of shape (3, samples). The rows are the contributions to the mean at the step
-        after, at the same step and at the step before.
+    Returns:
+        Weights, (3, samples). The rows are the contributions to the average of the step after, of
+        the same step and of the step before.
 
-    >>> print(decimation_kernel(3).sum(-1).round(3))
+    >>> print(mean_weights(3).sum(-1).round(3))
     [0.148 0.704 0.148]
     """
     box = np.full(samples, 1.0 / samples)

@@ -1,4 +1,4 @@
-"""MSBG's gammatone filter banks, one for each severity of hearing loss, on an FFT grid."""
+"""MSBG's gammatone filter banks, one for each severity of hearing loss, as frequency responses."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ _CORNER_STEP_HZ = MSBG_RATE / 8192.0
 
 @dataclass(frozen=True)
 class FilterBank:
-    """A gammatone filter bank, and what compensates for its filters' delays and skirts.
+    """Parameters of a bank of gammatone filters, the band-pass filters of a model of the cochlea.
 
     Attributes:
         broadening: Bandwidth of the filters relative to that of a normal ear.
@@ -112,7 +112,7 @@ BANKS = {"none": _NARROW, "mild": _NARROW, "moderate": _MIDDLE, "severe": _WIDE}
 def gammatone_response(
     bank: FilterBank, points: int, channels: slice = slice(None), bins: int | None = None
 ) -> NDArray[np.complex128]:
-    """Compute the frequency responses of channels.
+    """Compute the frequency responses of the band-pass filters of a bank, its channels.
 
     Each channel is a cascade of four identical gammatone stages with one zero and two poles::
 
@@ -123,11 +123,14 @@ def gammatone_response(
     part of the response (``FilterBank.advances``, ``highpass_corners``).
 
     Args:
-        points: FFT length at 44.1 kHz, whose ``rfft`` has the frequencies of the responses.
+        bank: Filter bank of a severity, a value of ``BANKS``.
+        points: FFT length at 44.1 kHz. The responses are computed at the frequencies of its
+            ``rfft``.
         channels: Channels of the bank, by default all of them.
         bins: Number of frequencies from 0 Hz up, by default all of them.
 
-    Returns: Responses of shape (channels, bins), where bins is points // 2 + 1 by default.
+    Returns:
+        Complex responses, (channels, bins), where bins is points // 2 + 1 by default.
 
     >>> response = gammatone_response(BANKS["mild"], points=44100)
     >>> response.shape
@@ -173,7 +176,7 @@ def _bessel_highpass(
 
     Args:
         corner_hz: Corner frequencies in Hz.
-        omega: Frequencies of the response in radians per sample.
+        omega: Frequencies of the response in radians per sample at 44.1 kHz.
     """
     s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner_hz / MSBG_RATE)
     return s**2 / (s**2 + 3.0 * s + 3.0)

@@ -2,13 +2,13 @@
 
 pyclarity runs the envelope's low-pass forwards and backwards with ``scipy.signal.filtfilt``. At the
 end of a signal, ``filtfilt`` adds eight samples, the last ones reflected about the last sample, and
-starts the backward pass as if the signal had been constant after them. On an FFT grid, a signal is
-followed by silence instead.
+starts the backward pass as if the signal had been constant after them. The Fourier transforms of
+``hlsim.msbg.envelope`` let silence follow the signal instead.
 
-Before the end, the two results differ by a free oscillation of the low-pass. The low-pass is of
-second order, so that two numbers per channel describe the oscillation. They depend linearly on the
-last samples of the channel. With a severe loss, the oscillation changes the last 50 ms by up to
-1e-2 of the whole signal.
+The two envelopes differ by a *free oscillation* of the low-pass, which rings like a struck string.
+The low-pass is of second order, so that two amplitudes per channel describe the oscillation. They
+are weighted sums of the last samples of the channel. With a severe loss, the oscillation changes
+the last 50 ms by up to 1e-2 of the whole signal.
 """
 
 from functools import lru_cache
@@ -21,6 +21,7 @@ from torch.nn import functional
 from hlsim.msbg.envelope import STEP, envelope_filters
 from hlsim.msbg.filterbank import FilterBank
 from hlsim.msbg.recruitment import AHEAD
+from hlsim.torchtools import constant_like
 
 LOOK_BACK = 4096
 """Number of last samples that matter, after which the slowest low-pass has decayed by 70 dB."""
@@ -31,79 +32,69 @@ _PADDING = 8
 Array = NDArray[np.float64]
 
 
-def end_oscillation(channels: Tensor, weights: Tensor, response: Tensor, length: int) -> Tensor:
-    """Compute the oscillation to add to envelopes from ``hlsim.msbg.envelope.envelope``.
+def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
+    """Compute what ``filtfilt`` adds to the envelopes of channels that end abruptly.
 
-    Shape: (..., channels, time), (channels, 2, samples), (channels, steps, 2) -> (..., channels,
-        time // 24).
+    Shape: (..., channels, time) -> (..., channels, time // 24).
 
     Args:
-        channels: Channels that are 0 from sample ``length`` on.
-        weights: Weights of the last samples from ``end_weights``.
-        response: Oscillations from ``end_responses`` for this length.
+        channels: Band-pass signals at 44.1 kHz that are 0 from sample ``length`` on.
+        bank: Filter bank to which the channels belong.
         length: Number of samples of the signal.
+
+    Returns:
+        Summand for the envelopes from ``hlsim.msbg.envelope.envelope``.
 
     >>> import torch
     >>> from hlsim.msbg.filterbank import BANKS
-    >>> bank, channels = BANKS["severe"], torch.zeros(19, 240)
-    >>> weights = torch.from_numpy(end_weights(bank)).float()
-    >>> response = torch.from_numpy(end_responses(bank, 100)).float()
-    >>> end_oscillation(channels, weights, response, 100).shape
+    >>> end_correction(torch.zeros(19, 240), BANKS["severe"], length=100).shape
     torch.Size([19, 10])
     """
+    weights = constant_like(channels, _amplitude_weights, bank)
+    oscillations = constant_like(channels, _sampled_oscillations, bank, (length - 1) % STEP)
     first = max(0, length - LOOK_BACK)
     last_samples = channels[..., first:length].abs().unsqueeze(-1)
     amplitudes = weights[..., -last_samples.shape[-2] :] @ last_samples
-    oscillation = (response @ amplitudes).squeeze(-1)
+    correction = (oscillations @ amplitudes).squeeze(-1)
     steps = channels.shape[-1] // STEP
     end = (length - 1) // STEP + AHEAD + 1
-    oscillation = oscillation[..., -end:]
-    return functional.pad(oscillation, (end - oscillation.shape[-1], steps - end))
+    correction = correction[..., -end:]
+    return functional.pad(correction, (end - correction.shape[-1], steps - end))
 
 
-def end_weights(bank: FilterBank) -> Array:
-    """Compute the weights of the last samples in the two amplitudes of the oscillation.
+def _amplitude_weights(bank: FilterBank) -> Array:
+    """Compute the weights of the last samples in the two amplitudes of each channel.
 
-    Returns: Weights of shape (channels, 2, 4096), with the last sample last.
-
-    >>> from hlsim.msbg.filterbank import BANKS
-    >>> end_weights(BANKS["severe"]).shape
-    (19, 2, 4096)
+    Returns:
+        Weights, (channels, 2, 4096), with the last sample last.
     """
     return np.stack([weights for weights, _ in _oscillations(bank)])
 
 
-def end_responses(bank: FilterBank, length: int) -> Array:
-    """Compute the free oscillations of each channel's low-pass around the end of a signal.
-
-    Each low-pass has two free oscillations, for the two numbers of its state. They are sampled as
-    the envelopes are, every 24 samples (a step).
+def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
+    """Compute the two free oscillations of each channel's low-pass once per step.
 
     Args:
-        length: Number of samples of the signal, or a number that leaves the same remainder when
-            it is divided by 24.
+        bank: Filter bank to which the channels belong.
+        offset: Samples from the first sample of the last step to the last sample of the signal.
 
-    Returns: Oscillations of shape (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps
-        after the end of the signal.
-
-    >>> from hlsim.msbg.filterbank import BANKS
-    >>> end_responses(BANKS["severe"], 100).shape
-    (19, 170, 2)
+    Returns:
+        Oscillations, (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps after the end
+        of the signal.
     """
-    first = (length - 1) % STEP
     count = LOOK_BACK // STEP
-    responses = [response[first::STEP][:count] for _, response in _oscillations(bank)]
-    return np.stack([response[::-1] for response in responses])
+    sampled = [oscillation[offset::STEP][:count] for _, oscillation in _oscillations(bank)]
+    return np.stack([oscillation[::-1] for oscillation in sampled])
 
 
 @lru_cache(maxsize=4)
 def _oscillations(bank: FilterBank) -> list[tuple[Array, Array]]:
-    """``_oscillation`` of each channel's low-pass."""
+    """Compute the result of ``_oscillation`` for the low-pass of each channel."""
     return [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
 
 
 def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
-    """Compute the oscillation of a low-pass and the weights of the last samples in it.
+    """Compute the free oscillations of a low-pass, and the weights of the last samples in them.
 
     The low-pass has a state z of two numbers. With the input u, its output is z[0] + b0 u, and its
     next state is transition z + input_vector u.
@@ -112,8 +103,9 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
         numerator: Three coefficients b0, b1, b2.
         denominator: Three coefficients 1, a1, a2.
 
-    Returns: Weights of shape (2, 4096), and oscillations of shape (samples, 2), which run backwards
-        in time from ``AHEAD`` steps behind the end.
+    Returns:
+        Weights, (2, 4096), and oscillations, (samples, 2), which run backwards in time from
+        ``AHEAD`` steps after the end.
     """
     transition = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
     input_vector = numerator[1:] - denominator[1:] * numerator[0]

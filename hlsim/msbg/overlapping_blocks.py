@@ -1,6 +1,6 @@
-"""Processing of long signals in overlapping blocks.
+"""Processing of long signals in overlapping blocks of 8 s, which bounds the memory.
 
-The blocks are computed again for gradients, so that memory does not grow with the signal.
+For gradients, each block is computed again in the backward pass instead of stored.
 """
 
 import math
@@ -38,16 +38,18 @@ def in_blocks(
     *,
     checkpoints_short: bool = False,
 ) -> Tensor:
-    """Process signals in blocks, whose outputs are those of the whole signals.
+    """Apply a function to overlapping blocks of long signals, and join its outputs.
 
-    Blocks of long signals are computed again in the backward pass.
+    The blocks overlap by so much that the output is the same as that for whole signals.
 
     Args:
-        process: Function of signals, ears, and whether the signals end where their block does.
+        process: Function of the signals of a block, of the ears, and of whether the signals end
+            with this block. It returns the output of the block.
         signals: Signals of all items.
-        ears: Thresholds of all items.
+        ears: Thresholds of all items in dB HL.
         rate: Sample rate in Hz.
-        checkpoints_short: Compute signals of one block again in the backward pass, too.
+        checkpoints_short: Whether signals of one block, too, are computed again in the backward
+            pass.
 
     Shape: (items, time), (items, levels) -> (items, time).
 
@@ -73,11 +75,11 @@ def in_blocks(
 
 
 def block_bounds(samples: int, rate: int) -> list[Block]:
-    """Split a signal into overlapping blocks.
+    """Divide the samples of a signal into overlapping blocks of 8 s.
 
-    Each block begins at a multiple of the hop of the smearing and of the step at which envelopes
-    are sampled, so that frames and steps are those of the whole signal. The overlap is longer than
-    the filters take to settle.
+    Each block begins at a multiple of the hop of smearing and of the step of envelopes, so that
+    frames and steps are those of the whole signal. The overlap is longer than the filters take to
+    settle.
 
     Args:
         samples: Length of the signal.
@@ -108,7 +110,7 @@ def _identity(tensor: Tensor) -> Tensor:
 
 
 def _fade(block: Tensor, rate: int, *, fade_in: bool, fade_out: bool) -> Tensor:
-    """Fade the ends of a block over 0.2 s, as bands with sharp ends would ring at a sharp cut.
+    """Fade the ends of a block over 0.2 s, because filters would ring at a sudden cut.
 
     Shape: (items, time) -> (items, time).
     """

@@ -1,8 +1,12 @@
-"""Loudness recruitment: each channel is expanded by a gain that follows its envelope.
+"""Loudness recruitment: each channel is multiplied by a gain that rises with its envelope.
 
-The envelope is so slow that it and the gain are computed at every 24th sample at 44.1 kHz. The gain
-is interpolated between these samples. Where a small envelope makes the gain change fast, the
-envelope is interpolated instead.
+An impaired ear does not perceive soft sounds, and perceives sounds of 105 dB SPL as loud as a
+normal ear does. Between these, its loudness grows faster than normal. The gain simulates this: it
+is 1 at 105 dB SPL and falls towards soft sounds.
+
+The envelope varies so slowly that it and the gain are computed once per *step* of 24 samples at
+44.1 kHz. The gain is interpolated between steps. Where a small envelope makes the gain change fast,
+the envelope is interpolated instead.
 
 Source: Moore and Glasberg (1993), Journal of the Acoustical Society of America 94, 2050-2062.
 """
@@ -34,26 +38,30 @@ _MAX_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
 """Largest value of an envelope in Pa that changes the gain, where the gain reaches 1."""
 
 _TAPS = 6
-"""Number of values from which one is interpolated."""
+"""Number of steps from whose values that of a sample is interpolated."""
 
 AHEAD = _TAPS // 2
-"""Number of later steps from which the gain of a sample is interpolated."""
+"""Number of these steps that come after the sample."""
 
 _SLIGHT_RATIO = 1.3
-"""Expansion ratio at 24 dB HL, below which kinks of the gain are not masked."""
+"""Expansion ratio at 24 dB HL, below which sudden changes of the gain are audible."""
 
 _DIP_RATIO = 0.3
 """Value of an envelope relative to its neighbours below which it counts as a dip."""
 
 
 def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
-    """Compute the ratio 105 / (105 - threshold) by which the level in each channel is expanded.
+    """Compute how many dB the perceived level of each channel changes per dB of input.
+
+    This expansion ratio is 105 / (105 - threshold), where 105 dB SPL is the level at which an
+    impaired ear perceives sounds as loud as a normal one.
 
     Shape: (..., frequencies), (frequencies, channels) -> (..., channels).
 
     Args:
         thresholds: Audiograms in dB HL.
-        weights: Interpolation weights from ``threshold_weights``.
+        weights: Weights from ``threshold_weights``, which interpolate thresholds to the centre
+            frequencies of the channels.
 
     >>> expansion_ratios(torch.full((8,), 35.0), torch.full((8, 1), 0.125))
     tensor([1.5000])
@@ -67,9 +75,16 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
 def threshold_weights(
     bank: FilterBank, frequencies: tuple[float, ...] = FREQUENCIES
 ) -> NDArray[np.float64]:
-    """Compute the weights of the thresholds at some frequencies in the threshold of each channel.
+    """Compute weights that interpolate an audiogram to the centre frequencies of the channels.
 
-    Returns: Weights of shape (frequencies, channels).
+    The interpolation is linear in Hz, and flat beyond the lowest and the highest frequency.
+
+    Args:
+        bank: Filter bank to which the channels belong.
+        frequencies: Frequencies of the audiogram in Hz.
+
+    Returns:
+        Weights, (frequencies, channels).
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> threshold_weights(BANKS["severe"]).shape
@@ -79,13 +94,13 @@ def threshold_weights(
 
 
 def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """Compute the gains (envelope / catch-up level) ** (ratio - 1).
+    """Compute the gain (envelope / pressure at 105 dB SPL) ** (ratio - 1) of each channel and step.
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
 
     Args:
         envelopes: Envelopes in Pa.
-        ratios: Expansion ratio of each channel.
+        ratios: Expansion ratio of each channel, from ``expansion_ratios``.
 
     >>> envelopes = torch.tensor([[100.0, 3.5481, 0.35481]])
     >>> recruitment_gains(envelopes, torch.tensor([2.0])).round(decimals=3)
@@ -97,24 +112,28 @@ def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
 
 def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
-    """Interpolate values at the beginning of each step to all samples.
+    """Interpolate values at the first sample of each step to all samples.
 
-    Shape: (..., steps + 5), (rows, columns) -> (..., time).
+    The values are treated as periodic: the last one is followed by the first.
+
+    Shape: (..., steps), (rows, columns) -> (..., time).
 
     Args:
-        values: Values from ``pad_periodically``.
-        kernel: Weights from ``interpolation_kernel``.
+        values: Gains or envelopes.
+        kernel: Weights from ``interpolation_kernel``, which also decide the number of samples per
+            step.
 
     >>> kernel = torch.from_numpy(interpolation_kernel(samples=2)).float()
-    >>> interpolate(pad_periodically(torch.ones(8)), kernel)[:3].round(decimals=3)
+    >>> interpolate(torch.ones(8), kernel)[:3].round(decimals=3)
     tensor([1., 1., 1.])
     """
     width, columns = kernel.shape
     steps_per_window = width - _TAPS + 1
-    steps = values.shape[-1] - _TAPS + 1
+    steps = values.shape[-1]
+    padded = _pad_periodically(values)
     if steps % steps_per_window:
-        values = functional.pad(values, (0, -steps % steps_per_window))
-    windows = values.unfold(-1, width, steps_per_window)
+        padded = functional.pad(padded, (0, -steps % steps_per_window))
+    windows = padded.unfold(-1, width, steps_per_window)
     # All windows are rows of one matrix product. Otherwise torch computes one product per channel,
     # which takes twice as long.
     interpolated = (windows.reshape(-1, width) @ kernel).view(*windows.shape[:-2], -1)
@@ -126,22 +145,23 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
 def apply_gains(
     channels: Tensor, gains: Tensor, kernel: Tensor, slight: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Interpolate gains, apply them to the channels and add up the channels.
+    """Interpolate gains, multiply the channels by them and add up the channels.
 
-    Where the envelope goes through zero, because its low-pass overshoots, the gain has kinks. With
-    a slight loss they are not masked, and the inverse of the middle ear amplifies their upper
-    frequencies by 40 dB. There, the envelope is interpolated instead of the gain.
+    Where the envelope goes through zero, because its low-pass overshoots, the gain changes
+    suddenly. After a slight loss this is audible, because the inverse of the middle ear amplifies
+    high frequencies by up to 40 dB. There, the envelope is interpolated instead of the gain.
 
-    Shape: (..., channels, time), (..., channels, steps + 5), (rows, columns) -> (..., time).
+    Shape: (..., channels, time), (..., channels, steps), (rows, columns) -> (..., time).
 
     Args:
-        gains: Gains at each step from ``pad_periodically``.
+        channels: Band-pass signals.
+        gains: Gain of each channel and step.
         kernel: Weights from ``interpolation_kernel``.
-        slight: Envelopes of shape (..., channels, steps) and ratios of shape (..., channels), which
-            are needed if some ears have a slight loss.
+        slight: Envelopes, (..., channels, steps), and expansion ratios, (..., channels). They are
+            needed if some ears have a slight loss.
 
     >>> kernel = torch.from_numpy(interpolation_kernel()).float()
-    >>> gains = pad_periodically(torch.full((2, 8), 0.5))
+    >>> gains = torch.full((2, 8), 0.5)
     >>> apply_gains(torch.ones(2, 8 * STEP), gains, kernel)[:3].round(decimals=3)
     tensor([1., 1., 1.])
     """
@@ -157,7 +177,7 @@ def apply_gains(
 def _correct_kinks(
     sample_gains: Tensor, envelopes: Tensor, ratios: Tensor, kernel: Tensor
 ) -> Tensor:
-    """Replace gains where a slight loss meets a small envelope by those of interpolated envelopes.
+    """Compute gains anew from interpolated envelopes, where a slight loss meets a small envelope.
 
     Shape: (..., channels, time), (..., channels, steps), (..., channels), (rows, columns) ->
         (..., channels, time).
@@ -167,13 +187,13 @@ def _correct_kinks(
     samples = sample_gains.shape[-1] // has_kink.shape[-1]
     if has_kink.device.type == "cpu":
         kink_ratios = ratios.unsqueeze(-1).expand(has_kink.shape)[has_kink]
-        kink_windows = pad_periodically(envelopes).unfold(-1, _TAPS, 1)[has_kink]
+        kink_windows = _pad_periodically(envelopes).unfold(-1, _TAPS, 1)[has_kink]
         kink_envelopes = kink_windows @ kernel[:_TAPS, :samples]
         kink_gains = recruitment_gains(kink_envelopes, kink_ratios)
         sample_gains.unflatten(-1, (-1, samples))[has_kink] = kink_gains
         return sample_gains
     # Indexing by a mask would make the host wait for the device.
-    sample_envelopes = interpolate(pad_periodically(envelopes), kernel)
+    sample_envelopes = interpolate(envelopes, kernel)
     corrected = recruitment_gains(sample_envelopes, ratios)
     return torch.where(has_kink.repeat_interleave(samples, -1), corrected, sample_gains)
 
@@ -213,13 +233,10 @@ class _SumOfProducts(torch.autograd.Function):
         )
 
 
-def pad_periodically(values: Tensor) -> Tensor:
-    """Add the values that interpolation needs at both ends of periodic values.
+def _pad_periodically(values: Tensor) -> Tensor:
+    """Add the values before the first and after the last step that interpolation needs.
 
     Shape: (..., steps) -> (..., steps + 5).
-
-    >>> pad_periodically(torch.arange(4))
-    tensor([2, 3, 0, 1, 2, 3, 0, 1, 2])
     """
     return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1)
 
@@ -238,20 +255,21 @@ def _find_dips(envelopes: Tensor) -> Tensor:
 
 
 def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """Apply recruitment to channels at 44.1 kHz and add up the channels.
+    """Apply recruitment to channels that are sampled at 44.1 kHz, and add up the channels.
 
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
 
     Args:
-        envelopes: Envelopes in Pa at the beginning of each step.
-        ratios: Expansion ratio of each channel.
+        channels: Band-pass signals.
+        envelopes: Envelopes in Pa at the first sample of each step of 24 samples.
+        ratios: Expansion ratio of each channel, from ``expansion_ratios``.
 
     >>> tone = torch.ones(1, 8 * STEP)
     >>> expand(tone, torch.full((1, 8), 0.35481), torch.tensor([2.0]))[:3].round(decimals=3)
     tensor([0.1000, 0.1000, 0.1000])
     """
     kernel = constant_like(channels, interpolation_kernel)
-    gains = pad_periodically(recruitment_gains(envelopes, ratios))
+    gains = recruitment_gains(envelopes, ratios)
     return apply_gains(channels, gains, kernel, (envelopes, ratios))
 
 
@@ -259,23 +277,24 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 def interpolation_kernel(
     samples: int = STEP, repeats: int = 1, steps_per_window: int = 8
 ) -> NDArray[np.float64]:
-    """Compute weights that interpolate values at the beginning of each step to all samples.
+    """Compute the weights with which ``interpolate`` turns values of steps into values of samples.
 
-    Each sample is interpolated from six values by Lagrange's polynomial of fifth order.
+    The value of each sample is interpolated from those of six steps by Lagrange's polynomial of
+    fifth order. One matrix product interpolates a window of several steps.
 
     Args:
         samples: Number of samples per step.
         repeats: Number of times that each interpolated value is repeated. Analytic signals need 2,
             for their real and imaginary parts.
-        steps_per_window: Number of steps that one row of the matrix product interpolates. A
-            divisor of the number of all steps is best.
+        steps_per_window: Number of steps in a window. A divisor of the number of all steps is best.
 
-    Returns: Weights of shape (steps_per_window + 5, steps_per_window * samples * repeats).
+    Returns:
+        Weights, (steps_per_window + 5, steps_per_window * samples * repeats).
 
     >>> interpolation_kernel().shape
     (13, 192)
     """
-    nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
+    nodes = np.arange(_TAPS) - (AHEAD - 1.0)
     positions = np.arange(samples) / samples
     weights = np.ones((_TAPS, samples))
     for i, node in enumerate(nodes):

@@ -1,10 +1,16 @@
-"""The way into the cochlea and out of it, with resampling on the same FFT grids.
+"""From the input to the cochlea and from the cochlea to the output, with resampling on the way.
 
-Where two rates meet, the spectrum at the lower rate fades out towards its Nyquist frequency, and is
-0 at this frequency. The spectrum at the higher rate has this frequency twice.
+Fourier transforms do the filtering and the resampling together: a signal is transformed at its
+sample rate, and the product of its spectrum and a frequency response is transformed back at another
+rate. The *outer* rate is that of input and output, and the *inner* rate that of the cochlea, 44.1
+or 22.05 kHz.
+
+Where the two rates differ, the spectrum fades out towards the lower Nyquist frequency, and is 0 at
+this frequency, which the spectrum at the higher rate has twice.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -13,7 +19,7 @@ from torch import Tensor
 
 from hlsim.dsp.fft import fade_out_weights, fft_length, rfft
 from hlsim.dsp.fir import BLOCK_POINTS, filter_in_blocks
-from hlsim.msbg.cochlea import shared_multiple
+from hlsim.msbg.cochlea import common_period
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant_like
 
@@ -21,58 +27,84 @@ _FIR_TAIL = 2 * EAR_DELAY + 132
 """Samples at 44.1 kHz by which the filters of the way out lengthen a signal."""
 
 
-def to_cochlea(signals: Tensor, rate: int, length: int, step: int) -> Tensor:
-    """Resample signals and filter them with the outer and the middle ear.
+def to_cochlea(signals: Tensor, rate: int, length: int, rate_divisor: int) -> Tensor:
+    """Filter input with the outer and middle ear, and resample it to the rate of the cochlea.
 
     Shape: (items, time) -> (items, length).
 
     Args:
-        rate: Sample rate of the signals in Hz.
+        signals: Input signals.
+        rate: Sample rate of the input in Hz.
         length: Number of samples of the result.
-        step: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
+        rate_divisor: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
 
-    >>> to_cochlea(torch.randn(2, 16000), rate=16000, length=44100, step=1).shape
+    >>> to_cochlea(torch.randn(2, 16000), rate=16000, length=44100, rate_divisor=1).shape
     torch.Size([2, 44100])
     """
-    if rate == MSBG_RATE and step == 1:
+    if rate == MSBG_RATE and rate_divisor == 1:
         return filter_in_blocks(signals, constant_like(signals, _inward_block_response), length)
-    up, down = _ratio(rate, step)
-    tail = math.ceil(_FIR_TAIL * down / up / step)
+    up, down = _rate_ratio(rate, rate_divisor)
+    tail = math.ceil(_FIR_TAIL * down / up / rate_divisor)
     samples = max(signals.shape[-1], math.ceil(length * down / up)) + tail
-    outer_points, inner_points = _fft_grid(samples, up, down)
-    bins = min(outer_points, inner_points) // 2 + 1
-    gain = up / down
-    response = constant_like(signals, _inward_response, inner_points * step, bins, gain, rate)
-    spectrum = rfft(signals, outer_points)[..., :bins] * response
-    return torch.fft.irfft(spectrum, inner_points)[..., :length]
+    return _resample_inward(signals, rate, rate_divisor, samples, _inward_response)[..., :length]
+
+
+def resample_to_model_rate(signals: Tensor, rate: int) -> Tensor:
+    """Resample signals to 44.1 kHz, without any filter of the ear.
+
+    Shape: (items, time) -> (items, ceil(time * 44100 / rate)).
+
+    Args:
+        signals: Signals to resample.
+        rate: Sample rate of the signals in Hz.
+
+    >>> resample_to_model_rate(torch.randn(2, 1600), rate=16000).shape
+    torch.Size([2, 4410])
+    """
+    if rate == MSBG_RATE:
+        return signals
+    samples = signals.shape[-1]
+    up, down = _rate_ratio(rate, 1)
+    resampled = _resample_inward(signals, rate, 1, samples, _resampling_response)
+    return resampled[..., : math.ceil(samples * up / down)]
 
 
 def from_spectrum(
-    spectrum: Tensor, points: int, step: int, rate: int, samples: int, *, gain: float, delay: int
+    spectrum: Tensor,
+    points: int,
+    rate_divisor: int,
+    rate: int,
+    samples: int,
+    *,
+    gain: float,
+    delay: int,
 ) -> Tensor:
-    """Compute the output of MSBG from the spectrum of the cochlea's output.
+    """Compute the output of MSBG from the spectrum of the output of the cochlea.
 
-    The way out filters with the inverse of the ear and the low-pass, removes the delay and
-    resamples.
+    This applies the inverse of the outer and middle ear, the final low-pass and a gain, removes the
+    delay, and resamples to the rate of the output.
 
-    Shape: complex (items, points // (2 * step) + 1) -> (items, samples).
+    Shape: complex (items, points // (2 * rate_divisor) + 1) -> (items, samples).
 
     Args:
+        spectrum: Spectra of signals that are followed by silence.
         points: FFT length of the spectrum, in samples at 44.1 kHz.
-        step: 1 for the spectrum of a signal at 44.1 kHz, 2 for that of a signal at 22.05 kHz.
-        rate: Sample rate of the result in Hz.
-        samples: Number of samples of the result.
-        gain: Linear gain of the result.
-        delay: Samples at 44.1 kHz by which the result is advanced.
+        rate_divisor: 1 for spectra of signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        rate: Sample rate of the output in Hz.
+        samples: Number of samples of the output.
+        gain: Linear gain of the output.
+        delay: Samples at 44.1 kHz by which the output is advanced.
 
     >>> spectrum = torch.fft.rfft(torch.randn(1, 49392))
     >>> from_spectrum(spectrum, 49392, 1, 16000, 16000, gain=1.0, delay=1047).shape
     torch.Size([1, 16000])
     """
-    inner_points = points // step
-    if not shared_multiple(rate, step):
+    inner_points = points // rate_divisor
+    if not common_period(rate, rate_divisor):
         waveform = torch.fft.irfft(spectrum, inner_points)
-        return from_cochlea(waveform, rate, samples, gain=gain, step=step, delay=delay)
+        return from_cochlea(
+            waveform, rate, samples, gain=gain, rate_divisor=rate_divisor, delay=delay
+        )
     outer_points = points * rate // MSBG_RATE
     bins = min(inner_points, outer_points) // 2 + 1
     total_gain = gain * outer_points / inner_points
@@ -81,81 +113,98 @@ def from_spectrum(
 
 
 def from_cochlea(
-    waveform: Tensor, rate: int, samples: int, *, gain: float, step: int = 1, delay: int = 0
+    waveform: Tensor,
+    rate: int,
+    samples: int,
+    *,
+    gain: float,
+    rate_divisor: int = 1,
+    delay: int = 0,
 ) -> Tensor:
-    """Compute the output of MSBG from the cochlea's output.
+    """Compute the output of MSBG from the output of the cochlea, as ``from_spectrum`` does.
 
-    Shape: (items, length) -> (items, samples).
+    Shape: (items, time) -> (items, samples).
 
     Args:
-        rate: Sample rate of the result in Hz.
-        samples: Number of samples of the result.
-        gain: Linear gain of the result.
-        step: 1 for a waveform at 44.1 kHz, 2 for a waveform at 22.05 kHz.
-        delay: Samples at 44.1 kHz by which the result is advanced.
+        waveform: Output of the cochlea.
+        rate: Sample rate of the output in Hz.
+        samples: Number of samples of the output.
+        gain: Linear gain of the output.
+        rate_divisor: 1 for a waveform at 44.1 kHz, 2 for a waveform at 22.05 kHz.
+        delay: Samples at 44.1 kHz by which the output is advanced.
 
     >>> from_cochlea(torch.randn(1, 44100), rate=16000, samples=16000, gain=1.0).shape
     torch.Size([1, 16000])
     """
-    up, down = _ratio(rate, step)
+    up, down = _rate_ratio(rate, rate_divisor)
     outer_samples = math.ceil((waveform.shape[-1] + _FIR_TAIL) * down / up)
-    outer_points, inner_points = _fft_grid(outer_samples, up, down)
+    outer_points, inner_points = _fft_lengths(outer_samples, up, down)
     bins = min(outer_points, inner_points) // 2 + 1
-    points = inner_points * step
+    points = inner_points * rate_divisor
     total_gain = gain * down / up
     response = constant_like(waveform, _outward_response, points, delay, bins, total_gain, rate)
     spectrum = rfft(waveform, inner_points)[..., :bins] * response
     return torch.fft.irfft(spectrum, outer_points)[..., :samples]
 
 
-def resample_to_model_rate(signals: Tensor, rate: int) -> Tensor:
-    """Resample signals to 44.1 kHz. Shape: (items, time) -> (items, ceil(time * 44100 / rate)).
+def _resample_inward(
+    signals: Tensor,
+    rate: int,
+    rate_divisor: int,
+    samples: int,
+    response_function: Callable[..., NDArray[np.inexact]],
+) -> Tensor:
+    """Resample signals to the inner rate, and filter them with a frequency response.
 
     Args:
-        rate: Sample rate of the signals in Hz.
-
-    >>> resample_to_model_rate(torch.randn(2, 1600), rate=16000).shape
-    torch.Size([2, 4410])
+        signals: Signals at the outer rate, (items, time).
+        rate: Outer rate in Hz.
+        rate_divisor: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
+        samples: Smallest length of the Fourier transform at the outer rate.
+        response_function: ``_inward_response`` or ``_resampling_response``.
     """
-    if rate == MSBG_RATE:
-        return signals
-    up, down = _ratio(rate, 1)
-    outer_points, inner_points = _fft_grid(signals.shape[-1], up, down)
+    up, down = _rate_ratio(rate, rate_divisor)
+    outer_points, inner_points = _fft_lengths(samples, up, down)
     bins = min(outer_points, inner_points) // 2 + 1
-    response = constant_like(signals, _resampling_response, inner_points, bins, up / down, rate)
+    points = inner_points * rate_divisor
+    response = constant_like(signals, response_function, points, bins, up / down, rate)
     spectrum = rfft(signals, outer_points)[..., :bins] * response
-    resampled = torch.fft.irfft(spectrum, inner_points)
-    return resampled[..., : math.ceil(signals.shape[-1] * up / down)]
+    return torch.fft.irfft(spectrum, inner_points)
 
 
 def _inward_block_response() -> NDArray[np.complex128]:
-    """Response of outer and middle ear for ``filter_in_blocks``."""
+    """Compute the response of outer and middle ear for ``filter_in_blocks``."""
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 
 def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
-    """Compute the response of outer and middle ear with a gain.
+    """Compute the response of outer and middle ear and of resampling, with a gain, (bins,).
 
     Args:
         points: FFT length at 44.1 kHz.
+        bins: Number of frequencies.
+        gain: Linear gain.
         rate: Sample rate in Hz from which signals are resampled.
-
-    Returns: Response of shape (bins,).
     """
     return gain * np.fft.rfft(ear_filter(), points)[:bins] * _band_end(points, bins, rate)
+
+
+def _resampling_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.float64]:
+    """Compute the response of resampling alone, with a gain, (bins,)."""
+    return gain * _band_end(points, bins, rate)
 
 
 def _outward_response(
     points: int, delay: int, bins: int, gain: float, rate: int
 ) -> NDArray[np.complex128]:
-    """Compute the response of the inverse ear and the low-pass with a gain and an advance.
+    """Compute the response of the inverse ear and the low-pass with a gain and an advance, (bins,).
 
     Args:
         points: FFT length at 44.1 kHz.
         delay: Samples at 44.1 kHz by which signals are advanced.
+        bins: Number of frequencies.
+        gain: Linear gain.
         rate: Sample rate in Hz to which signals are resampled.
-
-    Returns: Response of shape (bins,).
     """
     inverse_ear = np.fft.rfft(ear_filter(backward=True), points)
     response = inverse_ear * np.fft.rfft(lowpass_filter(), points)
@@ -163,41 +212,35 @@ def _outward_response(
     return gain * response[:bins] * advance * _band_end(points, bins, rate)
 
 
-def _resampling_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.float64]:
-    """Compute the response of resampling alone, with a gain. Returns (bins,)."""
-    return gain * _band_end(points, bins, rate)
-
-
 def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
-    """Compute weights that fade a spectrum out at the lower Nyquist frequency.
+    """Compute weights that fade a spectrum out at the lower Nyquist frequency, (bins,).
 
     They are 1 where nothing is resampled.
 
     Args:
         points: FFT length at 44.1 kHz.
-        rate: Sample rate in Hz of signals outside the model.
-
-    Returns: Weights of shape (bins,).
+        bins: Number of frequencies.
+        rate: Outer rate in Hz.
     """
     if rate == MSBG_RATE:
         return np.ones(bins)
     return fade_out_weights(bins, MSBG_RATE / points, min(rate, MSBG_RATE) / 2)
 
 
-def _ratio(rate: int, step: int) -> tuple[int, int]:
-    """Smallest whole numbers in proportion to the rate inside the model and to ``rate``."""
-    inner_rate = MSBG_RATE // step
+def _rate_ratio(rate: int, rate_divisor: int) -> tuple[int, int]:
+    """Return the inner and the outer rate, divided by their greatest common divisor."""
+    inner_rate = MSBG_RATE // rate_divisor
     common = math.gcd(inner_rate, rate)
     return inner_rate // common, rate // common
 
 
-def _fft_grid(samples: int, up: int, down: int) -> tuple[int, int]:
-    """FFT lengths outside and inside the model that span the same time.
+def _fft_lengths(samples: int, up: int, down: int) -> tuple[int, int]:
+    """Return FFT lengths at the outer and at the inner rate that span the same time.
 
     Args:
-        samples: Smallest length outside the model.
-        up: Rate inside the model, in the same unit as ``down``.
-        down: Rate outside the model.
+        samples: Smallest length at the outer rate.
+        up: Inner rate, in the same unit as ``down``.
+        down: Outer rate.
     """
     units = fft_length(math.ceil(samples / down), 4)
     return units * down, units * up

@@ -1,9 +1,10 @@
-"""The linear response that MSBG has where the gains of all channels are 1.
+"""MSBG as a linear filter: its effect on a signal where the gains of all channels are 1.
 
-This is the response of MSBG for a normal ear. The channels of its filter bank add up to a flat
-magnitude within a few decibels, but not to a linear phase: at 1 to 2 kHz the output resembles the
-polarity-inverted input more than the input. Waveforms, phases and complex spectra of the output can
-therefore only be compared with signals that have the same phase.
+This is all that MSBG does for a normal ear. The channels of its filter bank add up to a flat
+magnitude within a few decibels, but they shift the phase: at 1 to 2 kHz the output resembles the
+input with opposite sign more than the input. The phase depends on the filter bank, and so on the
+severity of the loss. Waveforms, phases and complex spectra of the output of MSBG can therefore only
+be compared with signals whose phase was shifted by the same filter bank.
 """
 
 import math
@@ -20,27 +21,29 @@ from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.torchtools import constant_like
 
-HALF_LENGTH_SECONDS = 0.064
+_HALF_LENGTH_SECONDS = 0.064
 """Time in seconds that impulse responses cover before and after time 0."""
 
-MAX_SPACING_HZ = 2.5
+_MAX_SPACING_HZ = 2.5
 """Largest distance in Hz between frequencies on which responses are computed.
 
 Its reciprocal is several times as long as the impulse responses.
 """
 
-MIN_RELATIVE_MAGNITUDE = 0.1
-"""Magnitude of a response relative to its maximum, below which the magnitude is not normalised."""
+_MIN_RELATIVE_MAGNITUDE = 0.1
+"""Magnitude of a response over its maximum, below which the phase filter attenuates."""
 
 
 def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.complex128]:
-    """Compute the response of aligned MSBG with a gain of 1 in all channels.
+    """Compute the frequency response of aligned MSBG where the gains of all channels are 1.
 
     Args:
+        bank: Filter bank of a severity, a value of ``hlsim.msbg.filterbank.BANKS``.
         rate: Sample rate in Hz.
         points: FFT length at ``rate``, whose duration is a whole number of samples at 44.1 kHz.
 
-    Returns: Response of shape (points // 2 + 1,), which is 0 above 22.05 kHz.
+    Returns:
+        Complex response, (points // 2 + 1,), which is 0 above 22.05 kHz.
 
     >>> response = fixed_response(BANKS["none"], rate=16000, points=16000)
     >>> print(abs(response[1000]).round(2))
@@ -60,18 +63,19 @@ def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.compl
 def apply_bank_phase(
     waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False
 ) -> Tensor:
-    """Apply the phase of MSBG's filter bank for each ear, and keep the magnitude.
+    """Shift the phase of signals as MSBG's filter bank for each ear does, and keep the magnitude.
 
-    Where the response of the bank is more than 20 dB below its maximum, the magnitude falls with
-    it.
+    Signals can then be compared with the output of MSBG for the ear. Where the response of the
+    filter bank is more than 20 dB below its maximum, the magnitude falls with it.
 
     Shape: (items, time), (items, 8) -> (items, time).
 
     Args:
-        thresholds: Audiograms in dB HL, whose severity selects the bank.
+        waveform: Signals, such as clean speech.
+        thresholds: Audiograms in dB HL, whose severity selects the filter bank.
         rate: Sample rate in Hz.
-        normal: The waveform is MSBG's output for a normal ear, so that the phase of the bank for
-            normal ears is removed.
+        normal: Whether the waveform is MSBG's output for a normal ear. Then the phase shift of the
+            filter bank for normal ears is replaced by that for the impaired ears.
 
     >>> apply_bank_phase(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
     torch.Size([1, 1600])
@@ -88,7 +92,7 @@ def apply_bank_phase(
 
 
 def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
-    """Simulate a normal ear with the phase of the filter bank for each impaired ear.
+    """Simulate what a normal ear perceives, with the phase shift of each impaired ear.
 
     The result can be compared with MSBG's output for the impaired ear. It takes two Fourier
     transforms, because MSBG is linear at 0 dB HL. For ears without a loss it equals MSBG's output
@@ -97,7 +101,9 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
     Shape: (items, time), (items, 8) -> (items, time).
 
     Args:
-        thresholds: Audiograms in dB HL, whose severity selects the bank.
+        waveform: Clean speech.
+        thresholds: Audiograms of the impaired ears in dB HL, whose severity selects the filter bank
+            that shifts the phase.
         rate: Sample rate in Hz.
 
     >>> simulate_normal_ear(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
@@ -110,7 +116,8 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
 def _normal_ear_taps(rate: int) -> NDArray[np.float64]:
     """Compute impulse responses with a normal ear's magnitude and each severity's phase.
 
-    Returns: Taps of shape (severities, 2 * half).
+    Returns:
+        Coefficients, (severities, 2 * half_length(rate)).
     """
     responses, points = _responses(rate)
     phases = np.exp(1j * np.angle(responses))
@@ -118,53 +125,63 @@ def _normal_ear_taps(rate: int) -> NDArray[np.float64]:
 
 
 def _phase_taps(rate: int, normal: bool) -> NDArray[np.float64]:
-    """Compute impulse responses with each severity's phase.
+    """Compute impulse responses with the phase of each severity's filter bank.
 
     Args:
-        normal: Subtract the phase of the bank for normal ears.
+        rate: Sample rate in Hz.
+        normal: Whether the phase of the filter bank for normal ears is subtracted.
 
-    Returns: Taps of shape (severities, 2 * half).
+    Returns:
+        Coefficients, (severities, 2 * half_length(rate)).
     """
     responses, points = _responses(rate)
     if normal:
         phases = np.exp(1j * (np.angle(responses) - np.angle(responses[0])))
     else:
         magnitude = np.abs(responses)
-        floor = MIN_RELATIVE_MAGNITUDE * magnitude.max(-1, keepdims=True)
+        floor = _MIN_RELATIVE_MAGNITUDE * magnitude.max(-1, keepdims=True)
         phases = responses / np.maximum(magnitude, floor)
     return impulse_responses(phases, points, rate)
 
 
 def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
-    """Compute the response of each severity's bank.
+    """Compute the frequency response of each severity's filter bank.
 
-    Returns: Responses of shape (severities, points // 2 + 1), and the FFT length ``points``.
+    Returns:
+        Responses, (severities, points // 2 + 1), and the FFT length ``points``.
     """
     common = math.gcd(rate, MSBG_RATE)
-    points = rate // common * 2 * math.ceil(common / (2.0 * MAX_SPACING_HZ))
+    points = rate // common * 2 * math.ceil(common / (2.0 * _MAX_SPACING_HZ))
     responses = [fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]
     return np.stack(responses), points
 
 
 def half_length(rate: int) -> int:
-    """Number of samples that impulse responses have before time 0, and from it on.
+    """Return half the length in samples of MSBG's linear impulse responses, 64 ms.
+
+    The responses of MSBG where its gains are 1 have this number of samples before time 0, and as
+    many from time 0 on.
+
+    Args:
+        rate: Sample rate in Hz.
 
     >>> half_length(16000)
     1024
     """
-    return math.ceil(HALF_LENGTH_SECONDS * rate)
+    return math.ceil(_HALF_LENGTH_SECONDS * rate)
 
 
 def impulse_responses(
     spectra: NDArray[np.complex128], points: int, rate: int
 ) -> NDArray[np.float64]:
-    """Compute impulse responses with time 0 in the middle from frequency responses.
+    """Compute impulse responses from frequency responses, with time 0 in the middle.
 
-    Shape: (severities, points // 2 + 1) -> (severities, 2 * half), where half is ``half_length``
-        of the rate.
+    Shape: complex (responses, points // 2 + 1) -> (responses, 2 * half), where half is
+        ``half_length(rate)``.
 
     Args:
-        points: FFT length of the responses.
+        spectra: Frequency responses.
+        points: FFT length of the frequency responses.
         rate: Sample rate in Hz.
 
     >>> impulse_responses(np.ones((1, 4001)), points=8000, rate=16000)[0, 1023:1026]

@@ -1,4 +1,8 @@
-"""Spectral smearing: the power spectrum of each 5.8 ms frame is spread over wider auditory filters.
+"""Spectral smearing: what the wider auditory filters of an impaired ear do to a spectrum.
+
+The signal is cut into frames of 5.8 ms, one every 1.5 ms (a *hop*). The power spectrum of each
+frame is multiplied by a matrix that spreads it over neighbouring frequencies, and the phase is
+kept.
 
 Source: Baer and Moore (1993), Journal of the Acoustical Society of America 94, 1229-1241.
 """
@@ -25,7 +29,7 @@ HOP = 64
 """Samples at 44.1 kHz from one frame to the next."""
 
 FFT = 512
-"""Length of a frame's Fourier transform, of which the second half is zeros."""
+"""Length of the Fourier transform of a frame, which is followed by as many zeros."""
 
 SMEARING_DELAY = 3 * HOP
 """Delay of smearing in samples at 44.1 kHz, because its frames are read three hops late."""
@@ -37,26 +41,29 @@ Without a hearing loss, nothing is smeared. The values are those of pyclarity 0.
 """
 
 SKIRT_HZ = 800.0
-"""Distance in Hz by which smearing reaches beyond its input, through the skirts of the spectra."""
+"""Distance in Hz by which smearing spreads a spectrum beyond its highest frequency."""
 
-POWER_FLOOR = 1e-24
+_POWER_FLOOR = 1e-24
 """Power in Pa^2 that is added to powers before and after smearing, so that silence stays silent."""
 
-MIN_POWER_RATIO = 1e-24
+_MIN_POWER_RATIO = 1e-24
 """Smallest ratio of powers whose square root is computed, because square roots of 0 are slow."""
 
-MAX_POWER_RATIO = 1e30
+_MAX_POWER_RATIO = 1e30
 """Largest ratio of powers, in place of infinity where silence lies next to very loud sounds."""
 
-DIVISION_EPS = 1e-36
+_DIVISION_EPS = 1e-36
 """Power in Pa^2 that keeps divisors away from 0."""
 
-FRAMES_PER_CHUNK = 1200
+_FRAMES_PER_CHUNK = 1200
 """Number of frames that are smeared at once on a CPU, few enough for its cache."""
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
-    """Compute rounded-exponential auditory filters (1 + g) exp(-g) divided by their bandwidths.
+    """Compute the auditory filters of an ear: how much of each frequency each filter passes.
+
+    The filters are rounded exponentials, (1 + g) exp(-g) for a distance g from the centre
+    frequency, divided by their bandwidths.
 
     Args:
         lower: Factor by which the lower sides of the filters are wider than normal.
@@ -64,7 +71,9 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
         count: Number of filters, and of frequencies.
         spacing: Distance in Hz between frequencies, the first of which is 0 Hz.
 
-    Returns: Filters of shape (count, count), one filter per row.
+    Returns:
+        Weights of powers, (count, count). Each row is a filter, centred on the frequency of the
+        same index.
 
     >>> roex_filters(1.0, 1.0, count=256, spacing=44100 / 512).shape
     (256, 256)
@@ -88,16 +97,16 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
 def smearing_from_filters(
     normal: NDArray[np.float64], wide: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Compute the matrix that smears a power spectrum from normal and wide auditory filters.
+    """Compute a matrix that makes a normal ear perceive a spectrum as an impaired ear does.
 
-    A normal ear perceives a smeared spectrum as an impaired ear perceives the original spectrum. To
-    this end, the matrix divides the normal filters out of the wide ones.
+    The filters of the normal ear, applied after the matrix, give what the filters of the impaired
+    ear give.
 
     Shape: (count, count), (count, count) -> (count, count).
 
     Args:
-        normal: Filters of a normal ear, one per row.
-        wide: Filters of an impaired ear, one per row.
+        normal: Filters of a normal ear, from ``roex_filters``.
+        wide: Filters of an impaired ear, from ``roex_filters``.
 
     >>> filters = roex_filters(1.0, 1.0, count=8, spacing=1000.0)
     >>> print(smearing_from_filters(filters, filters).shape)
@@ -116,78 +125,75 @@ def smearing_from_filters(
     return np.asarray(solution[:count], dtype=np.float64)
 
 
-@lru_cache(maxsize=4)
-def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
-    """Compute the matrix that smears MSBG's power spectra.
+def smearing_matrix(
+    severity: str, rate_divisor: int = 1, highest: float = MSBG_RATE / 2.0
+) -> NDArray[np.float64]:
+    """Compute the matrix that smears the power spectra of frames for a severity of hearing loss.
 
     Args:
-        lower: Factor by which the lower sides of the filters are wider than normal.
-        upper: Factor by which the upper sides of the filters are wider than normal.
+        severity: ``"mild"``, ``"moderate"`` or ``"severe"``.
+        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: Highest frequency of the signals in Hz. Above it, the matrix has only the 800 Hz
+            into which smearing spreads them.
 
-    Returns: Matrix of shape (256, 256).
+    Returns:
+        Matrix, (bins, bins), with 86 Hz from bin to bin.
 
-    >>> smearing_matrix(*BROADENING["mild"]).shape
+    >>> smearing_matrix("mild").shape
     (256, 256)
+    >>> smearing_matrix("mild", rate_divisor=2, highest=8000.0).shape
+    (103, 103)
     """
+    bins = min(FFT // 2 // rate_divisor, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
+    return _whole_matrix(severity)[:bins, :bins]
+
+
+@lru_cache(maxsize=4)
+def _whole_matrix(severity: str) -> NDArray[np.float64]:
+    """Compute the smearing matrix for all frequencies of a frame at 44.1 kHz, (256, 256)."""
     count = FFT // 2
     spacing = MSBG_RATE / FFT
     normal = roex_filters(1.0, 1.0, count, spacing)
-    wide = roex_filters(lower, upper, count, spacing)
+    wide = roex_filters(*BROADENING[severity], count, spacing)
     return smearing_from_filters(normal, wide)
 
 
-def smearing_matrix_below(severity: str, step: int, highest: float) -> NDArray[np.float64]:
-    """Cut the part for low frequencies out of the smearing matrix of a severity.
-
-    Args:
-        severity: A key of ``BROADENING``.
-        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: Highest frequency in Hz of the input. The part is larger by the skirts of the
-            spectra.
-
-    >>> smearing_matrix_below("mild", step=2, highest=8000.0).shape
-    (103, 103)
-    """
-    bins = min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
-    return smearing_matrix(*BROADENING[severity])[:bins, :bins]
-
-
-def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
+def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
     """Smear the spectra of waveforms.
 
-    At 44.1 kHz, the result equals that of pyclarity's ``smear3``, with its delay and its irregular
-    first frames.
+    At 44.1 kHz, the result equals that of pyclarity's ``smear3``, with its delay of three hops and
+    its irregular first frames.
 
-    Shape: (..., time), (bins, bins) -> (..., hop * (ceil(time / hop) + 3)), where hop is 64 / step.
+    Shape: (..., time), (bins, bins) -> (..., hop * (ceil(time / hop) + 3)), where hop is
+        64 / rate_divisor.
 
     Args:
-        matrix: ``smearing_matrix`` or its part for the lowest frequencies, at most
-            (256 // step, 256 // step). Higher frequencies, and always the Nyquist frequency, are
-            removed.
-        step: 1 for waveforms at 44.1 kHz, 2 for waveforms at 22.05 kHz.
+        waveform: Signals in Pa.
+        matrix: Matrix from ``smearing_matrix``. Frequencies beyond it, and always the Nyquist
+            frequency, are removed.
+        rate_divisor: 1 for waveforms at 44.1 kHz, 2 for waveforms at 22.05 kHz.
 
-    >>> matrix = torch.from_numpy(smearing_matrix(*BROADENING["severe"])).float()
+    >>> matrix = torch.from_numpy(smearing_matrix("severe")).float()
     >>> smear(torch.randn(2, 640), matrix).shape
     torch.Size([2, 832])
     """
-    hop = HOP // step
+    hop = HOP // rate_divisor
     count = math.ceil(waveform.shape[-1] / hop)
-    window = constant_like(waveform, _window, step)
+    window = constant_like(waveform, _window, rate_divisor)
     frames = _cut_frames(waveform, count, hop, window)
     frames_per_chunk = count
     if waveform.device.type == "cpu":
         # Each step of the computation should find the result of the last one in the cache.
         items = waveform[..., 0].numel()
-        frames_per_chunk = max(1, FRAMES_PER_CHUNK * step // items)
-    if frames_per_chunk >= count:
-        return _overlap_add(_smear_frames(frames, window, matrix), hop)
+        frames_per_chunk = max(1, _FRAMES_PER_CHUNK * rate_divisor // items)
     chunks = frames.split(frames_per_chunk, -2)
-    smeared = torch.cat([_smear_frames(chunk, window, matrix) for chunk in chunks], -2)
-    return _overlap_add(smeared, hop)
+    smeared = [_smear_frames(chunk, window, matrix) for chunk in chunks]
+    all_frames = smeared[0] if len(smeared) == 1 else torch.cat(smeared, -2)
+    return _overlap_add(all_frames, hop)
 
 
 def _smear_frames(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
-    """Smear the spectra of frames.
+    """Smear the spectra of frames that were cut with a window, and apply the window once more.
 
     Shape: (..., frames, 2 n), (2 n,), (bins, bins) -> (..., frames, n).
     """
@@ -201,7 +207,7 @@ def _smear_frames(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
 def smear_spectrum(
     spectrum: Tensor, matrix: Tensor, gradient_floor: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Smear the power of spectra and keep their phase.
+    """Spread the power of spectra over neighbouring frequencies, and keep their phase.
 
     Smearing can give a negative power. Its square root is imaginary, so that the phase turns by 90
     degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is.
@@ -210,12 +216,14 @@ def smear_spectrum(
         (..., bins).
 
     Args:
+        spectrum: Spectra of pressures in Pa.
         matrix: Smearing matrix of all items, or one per item.
         gradient_floor: Bound of the gradients, which are computed as if smearing multiplied each
             power by this factor at least and by its reciprocal at most. With 0, gradients have no
             bound where smearing changes the sign of a power or fills an empty frequency.
 
-    Returns: The smeared spectrum and its power.
+    Returns:
+        The smeared spectrum and its power.
 
     >>> spectrum = torch.tensor([3.0 + 4.0j, 0.0])
     >>> mixing = torch.tensor([[0.5, 0.5], [0.0, 1.0]])
@@ -232,22 +240,23 @@ def smear_spectrum(
 def _smear_spectrum(
     spectrum: Tensor, matrix: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Compute ``smear_spectrum`` and what its gradient needs.
+    """Compute the results of ``smear_spectrum`` and what its gradient needs.
 
-    Returns: The smeared spectrum, its power, the real and the imaginary part of the factor on the
+    Returns:
+        The smeared spectrum, its power, the real and the imaginary part of the factor on the
         spectrum, and the power of the spectrum.
     """
     spectrum_power = power(spectrum)
-    smeared_power = (spectrum_power @ matrix.mT).add_(POWER_FLOOR)
+    smeared_power = (spectrum_power @ matrix.mT).add_(_POWER_FLOOR)
     if matrix.requires_grad:
         # The gradient of the matrix product needs the power unchanged.
-        spectrum_power = spectrum_power + POWER_FLOOR
+        spectrum_power = spectrum_power + _POWER_FLOOR
     else:
-        spectrum_power = spectrum_power.add_(POWER_FLOOR)
+        spectrum_power = spectrum_power.add_(_POWER_FLOOR)
     ratio = smeared_power / spectrum_power
     # The square root of a negative ratio is imaginary.
-    real = ratio.clamp(MIN_POWER_RATIO, MAX_POWER_RATIO).sqrt_()
-    imaginary = ratio.neg().clamp_(MIN_POWER_RATIO, MAX_POWER_RATIO).sqrt_()
+    real = ratio.clamp(_MIN_POWER_RATIO, _MAX_POWER_RATIO).sqrt_()
+    imaginary = ratio.neg().clamp_(_MIN_POWER_RATIO, _MAX_POWER_RATIO).sqrt_()
     factor = torch.complex(real, imaginary)
     return spectrum * factor, smeared_power, real, imaginary, spectrum_power
 
@@ -294,13 +303,13 @@ class _SmearSpectrum(torch.autograd.Function):
             bounded = torch.maximum(magnitude, floor * spectrum_power)
             divisor = torch.copysign(bounded, smeared_power)
             # Where smearing amplifies by more than 1 / floor, the factor counts as 1 / floor.
-            limit = spectrum_power / (floor * magnitude + DIVISION_EPS)
+            limit = spectrum_power / (floor * magnitude + _DIVISION_EPS)
             limit = limit.clamp_max(1.0).sqrt()
             divisor = divisor * limit
             real = real * limit
             imaginary = imaginary * limit
         else:
-            eps = smeared_power.new_full((), DIVISION_EPS)
+            eps = smeared_power.new_full((), _DIVISION_EPS)
             divisor = smeared_power + torch.copysign(eps, smeared_power)
 
         # Real and imaginary parts are computed separately, because torch would first convert the
@@ -326,16 +335,18 @@ class _SmearSpectrum(torch.autograd.Function):
         return spectrum_gradient, matrix_gradient, None
 
 
-def _window(step: int) -> Tensor:
+def _window(rate_divisor: int) -> Tensor:
     """Compute the window of analysis and synthesis, followed by as many zeros.
 
     The squares of four windows that are one hop apart add up to 1.
 
-    Returns: Window of shape (512 // step,).
+    Returns:
+        Window, (512 // rate_divisor,).
     """
-    phase = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
+    samples = torch.arange(0, FRAME, rate_divisor, dtype=torch.float64)
+    phase = 2.0 * math.pi * (samples + 0.5) / FRAME
     window = (0.5 - 0.5 * phase.cos()) / math.sqrt(1.5)
-    return functional.pad(window, (0, (FFT - FRAME) // step))
+    return functional.pad(window, (0, (FFT - FRAME) // rate_divisor))
 
 
 def _cut_frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:

@@ -3,22 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
-from hlsim.msbg.filtfilt_end import LOOK_BACK, end_oscillation, end_responses, end_weights
+from hlsim.msbg.filtfilt_end import LOOK_BACK, end_correction
 from hlsim.msbg.recruitment import AHEAD
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
-
-
-def oscillation(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
-    weights = torch.from_numpy(end_weights(bank)).to(channels)
-    responses = torch.from_numpy(end_responses(bank, length)).to(channels)
-    return end_oscillation(channels, weights, responses, length)
 
 
 def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
@@ -39,31 +32,33 @@ def test_envelopes_of_an_abrupt_end_equal_pyclaritys(name: str, length: int) -> 
     expected = cochlea.compute_envelope(tone[:, :length], bandwidths, MSBG_RATE)[:, ::STEP]
     channels = torch.from_numpy(tone)
     before_silence = envelope(channels, torch.from_numpy(envelope_lowpass(bank, tone.shape[-1])))
-    ours = before_silence + oscillation(channels, bank, length)
+    ours = before_silence + end_correction(channels, bank, length)
     steps = expected.shape[-1]
     error = np.abs(ours.numpy()[:, :steps] - expected)[:, 50:]
     # The envelope is 0.64. The error is aliasing of the decimation, mostly at the abrupt end.
     assert error.max() < 2e-3
-    error_without_oscillation = np.abs(before_silence.numpy()[:, :steps] - expected)
-    assert error_without_oscillation.max() > 0.2
+    error_without_correction = np.abs(before_silence.numpy()[:, :steps] - expected)
+    assert error_without_correction.max() > 0.2
 
 
 @pytest.mark.parametrize("length", [1, 5, STEP, STEP + 1, 100, LOOK_BACK - 1, LOOK_BACK + 1])
-def test_oscillation_has_the_shape_of_the_envelopes_and_stops_behind_the_end(length: int) -> None:
+def test_correction_has_the_shape_of_the_envelopes_and_stops_behind_the_end(length: int) -> None:
     bank = BANKS["severe"]
     points = 2 * STEP * (length // 32 + 100)
     channels = torch.from_numpy(tones(bank, length, points)).expand(2, 3, -1, -1)
-    oscillations = oscillation(channels, bank, length)
-    assert oscillations.shape == (2, 3, bank.channels, points // STEP)
-    assert bool(torch.isfinite(oscillations).all())
+    corrections = end_correction(channels, bank, length)
+    assert corrections.shape == (2, 3, bank.channels, points // STEP)
+    assert bool(torch.isfinite(corrections).all())
     last_step = (length - 1) // STEP
-    assert not bool(oscillations[..., last_step + AHEAD + 1 :].any())
+    assert not bool(corrections[..., last_step + AHEAD + 1 :].any())
 
 
 def test_silence_adds_nothing_and_gradients_are_exact() -> None:
     bank = BANKS["severe"]
-    assert not bool(oscillation(torch.zeros(bank.channels, 320), bank, 100).any())
+    assert not bool(end_correction(torch.zeros(bank.channels, 320), bank, 100).any())
     channels = torch.randn(bank.channels, 320, dtype=torch.float64)
     channels[:, 100:] = 0.0
     channels.requires_grad_()
-    assert torch.autograd.gradcheck(lambda c: oscillation(c, bank, 100), channels, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda c: end_correction(c, bank, 100), channels, fast_mode=True
+    )

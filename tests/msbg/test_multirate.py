@@ -18,10 +18,12 @@ MAX_ERRORS = {(1.4, 2.6): 5e-4, (1.1, 1.1): 1.5e-3, (1.6, 1.6): 4e-3}
 
 
 @pytest.mark.parametrize("name", ["mild", "moderate", "severe"])
-@pytest.mark.parametrize("step", [1, 2])
-def test_every_channel_has_one_rate_that_is_high_enough_for_its_band(name: str, step: int) -> None:
+@pytest.mark.parametrize("rate_divisor", [1, 2])
+def test_every_channel_has_one_rate_that_is_high_enough_for_its_band(
+    name: str, rate_divisor: int
+) -> None:
     bank = BANKS[name]
-    bands = assign_rates(bank, step)
+    bands = assign_rates(bank, rate_divisor)
     starts = [channels.start for channels, *_ in bands]
     stops = [channels.stop for channels, *_ in bands]
     assert [*starts, bank.channels] == [0, *stops]
@@ -30,7 +32,7 @@ def test_every_channel_has_one_rate_that_is_high_enough_for_its_band(name: str, 
         highest = rate / 2.0 if detector == "itself" else rate
         hz = np.array(bank.centre_frequencies)[channels]
         top = hz + 5.0 * bank.broadening * erb(hz)
-        assert np.all(top <= highest) or samples == 24 or step == 2
+        assert np.all(top <= highest) or samples == 24 or rate_divisor == 2
 
 
 # White noise is the worst case, because it is as strong where channels are cut off as in their
@@ -42,7 +44,7 @@ def test_rate_bands_equal_all_channels_at_44_khz(
     name: str, highest: float, ratios: tuple[float, float]
 ) -> None:
     bank = BANKS[name]
-    step = 1 if highest > 11025.0 else 2
+    rate_divisor = 1 if highest > 11025.0 else 2
     bins = round(highest / 44100.0 * POINTS) + 1
     noise = torch.zeros(POINTS, dtype=torch.float64)
     noise[4000:40000] = 0.03 * torch.randn(36000, dtype=torch.float64)
@@ -50,10 +52,12 @@ def test_rate_bands_equal_all_channels_at_44_khz(
     spectrum[:, bins:] = 0.0
     channel_ratios = torch.linspace(*ratios, bank.channels, dtype=torch.float64)[None]
 
-    multirate = multirate_bank(bank, POINTS, step, highest, torch.float64, CPU)
+    multirate = multirate_bank(bank, POINTS, rate_divisor, highest, torch.float64, CPU)
     # The spectrum of a signal at half the rate is half as large.
-    slow_spectrum = spectrum[:, : POINTS // step // 2 + 1] / step
-    output = simulate_cochlea(slow_spectrum, channel_ratios, multirate, False)[:, :bins] * step
+    slow_spectrum = spectrum[:, : POINTS // rate_divisor // 2 + 1] / rate_divisor
+    output = (
+        simulate_cochlea(slow_spectrum, channel_ratios, multirate, False)[:, :bins] * rate_divisor
+    )
 
     response = torch.from_numpy(gammatone_response(bank, POINTS))
     channels = torch.fft.irfft(spectrum.unsqueeze(-2) * response, POINTS)
