@@ -73,6 +73,13 @@ def two_threads() -> Iterator[None]:
     torch.set_num_threads(1)
 
 
+@pytest.fixture
+def every_path_exists(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the command line accept the paths in examples, which do not exist."""
+    monkeypatch.setattr(Path, "exists", lambda path: True)
+    monkeypatch.setattr(Path, "is_dir", lambda path: True)
+
+
 @pytest.fixture(scope="session")
 def speech_dir() -> Path:
     """The folder of the bundled speech, with the subfolders ``train`` and ``valid``."""

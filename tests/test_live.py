@@ -261,7 +261,6 @@ def test_simulated_blocks_equal_the_whole_signal() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "--audiogram"),
         ("--listener nosuch.csv", "nosuch.csv"),
         ("--audiogram N3 --input 7", "--input 7 cannot be used: No input device matching 7"),
         ("--audiogram N3 --output Phones", "--output Phones cannot be used"),

@@ -61,6 +61,7 @@ def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         exec(compile(example, str(page), "exec"), names)
 
 
+@pytest.mark.usefixtures("every_path_exists")
 @pytest.mark.parametrize("page", [page for page in PAGES if _commands(page)], ids=_named)
 def test_commands_parse(page: Path) -> None:
     for command in _commands(page):

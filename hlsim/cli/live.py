@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from types import ModuleType
+from typing import Any
 
-from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ear
-from hlsim.cli.options import Parser, checked_type, number, positive
+from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ears
+from hlsim.cli.options import Parser, checked_type, number, positive_number
 from hlsim.extras import require
 
-RATE = 16000
+_RATE = 16000
 """Sample rate of the stream in Hz."""
 
 _device = checked_type(
@@ -21,16 +22,17 @@ _device = checked_type(
 
 
 def live(parser: Parser) -> None:
-    """Declare the options of ``live``."""
+    """Declare the options of the command ``live``."""
     parser.set_command(
         _live,
         "--audiogram N3",
         "--listener listeners.json:L0001 --simulate --seconds 60",
     )
     option = parser.option
-    ears = parser.add_mutually_exclusive_group()
+    ears = parser.add_mutually_exclusive_group(required=True)
     parser.audiogram(group=ears)
     parser.listener("both ears, for stereo headphones", group=ears)
+    parser.flag("--list-devices", "list the devices and exit", group=ears)
     models = parser.add_mutually_exclusive_group()
     text = "a streaming aid: wdrc (compression in bands), or a hearing aid's name or folder"
     option("--compensator", str, text, "hearing-aid", group=models)
@@ -48,11 +50,10 @@ def live(parser: Parser) -> None:
     option("--input", _device, text, metavar="DEVICE")
     text = "headphones, by number or part of their name; the system's by default"
     option("--output", _device, text, metavar="DEVICE")
-    option("--block-ms", positive, "block size of an aid in ms", 4.0)
+    option("--block-ms", positive_number, "block size of an aid in ms", 4.0)
     text = "buffer of each device in ms, to be increased if there are drop-outs"
-    option("--buffer-ms", positive, text, 20.0)
-    option("--seconds", positive, "stop after this many seconds")
-    parser.flag("--list-devices", "list the devices and exit")
+    option("--buffer-ms", positive_number, text, 20.0)
+    option("--seconds", positive_number, "stop after this many seconds")
 
 
 def _live(options: argparse.Namespace) -> None:
@@ -60,11 +61,9 @@ def _live(options: argparse.Namespace) -> None:
         sounddevice = _import_sounddevice()
         print(sounddevice.query_devices() or "no devices")
         return
-    if options.audiogram is None and options.listener is None:
-        raise ValueError("give an ear with --audiogram, or both ears with --listener")
     if options.simulate and read_sliders(options):
         raise ValueError("--noise-reduction and --amplification have no effect with --simulate")
-    ears = read_ears(options)
+    ears: Any = read_ears(options)
     sounddevice = _import_sounddevice()
     import torch
 
@@ -72,14 +71,14 @@ def _live(options: argparse.Namespace) -> None:
     from hlsim.losses.frozen_simulator import build_simulator
 
     torch.set_num_threads(1)  # Threads would wait for each other for more than 4 ms.
-    block = max(1, round(options.block_ms * RATE / 1000))
+    block = max(1, round(options.block_ms * _RATE / 1000))
     if options.simulate:
-        stream = SimulatedStream(build_simulator("neuro-msbg", RATE, options.full_scale_spl), ears)
+        stream = SimulatedStream(build_simulator("neuro-msbg", _RATE, options.full_scale_spl), ears)
         block = 12 * stream.block
         latency = stream.latency
     else:
-        warn_of_other_ear(options)
-        aid = load_compensator(options, RATE)
+        warn_of_other_ears({options.compensator: options.compensator}, ears)
+        aid = load_compensator(options, _RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(
                 f"{options.compensator} cannot process blocks; choose wdrc or a hearing aid"

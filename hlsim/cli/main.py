@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 
-from hlsim.cli.options import Parser, join_negative_values
-from hlsim.extras import MissingExtraError
+from hlsim.cli.options import Parser
 from hlsim.version import __version__
 
 GROUPS = {
@@ -61,29 +60,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The backend of a notebook may be missing in this environment.
         os.environ["MPLBACKEND"] = "Agg"
     warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
-    signals: list[int] = []
 
     def stop(number: int, frame: object) -> None:
-        signals.append(number)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(number)
 
     is_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGTERM, stop) if is_main_thread else None
     try:
         parser = make_parser()
-        arguments = sys.argv[1:] if arguments is None else arguments
-        options = parser.parse_args(join_negative_values(arguments))
+        options = parser.parse_args(arguments)
         if not hasattr(options, "run"):
             parser.print_help()
             return 0
         options.run(options)
-    except (ValueError, MissingExtraError, OSError) as error:
+    except (ValueError, ImportError, OSError) as error:
         print(f"hlsim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         text = "stopped; run the same command again to continue a training or an evaluation"
         print(f"\nhlsim: {text}", file=sys.stderr)
-        return 128 + (signals[0] if signals else signal.SIGINT)
+        return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
     finally:
         if is_main_thread:
             signal.signal(signal.SIGTERM, previous_handler)
@@ -91,7 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make_parser() -> Parser:
-    """Make the parser of the program, whose commands declare their options when they are used."""
+    """Make the parser of the program, which has one parser per command.
+
+    A command declares its options when it is used, so that other commands need not be imported.
+    """
     lines = []
     for group, commands in GROUPS.items():
         lines.append(f"\n{group}:")
@@ -113,9 +112,5 @@ def make_parser() -> Parser:
 
 
 def _declare(module: str, function: str, parser: Parser) -> None:
-    """Declare the options of a command with the function of its module."""
+    """Import the module of a command, whose function declares the options on the parser."""
     getattr(import_module(f"hlsim.cli.{module}"), function)(parser)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,7 @@ import argparse
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,36 +24,15 @@ EARS_TABLE = (
     "CSV file of ears with columns hl_250, hl_500, ... in dB HL, an empty value where a frequency "
     "was not measured; or standard for Bisgaard's ears N1 to N6 and S1 to S3"
 )
-"""Description of a table of ears, for the help."""
-
-_NEGATIVE_LIST = re.compile(r"-\.?\d.*[,e]")
-
-
-def join_negative_values(arguments: Sequence[str]) -> list[str]:
-    """Join an option and a value such as ``-10,0,20``, which argparse mistakes for an option.
-
-    Args:
-        arguments: Command and options.
-
-    Returns:
-        The arguments, with ``--option -10,0`` replaced by ``--option=-10,0``.
-    """
-    joined: list[str] = []
-    for argument in arguments:
-        previous = joined[-1] if joined else ""
-        follows_option = previous.startswith("--") and "=" not in previous
-        if follows_option and _NEGATIVE_LIST.match(argument):
-            joined[-1] = f"{previous}={argument}"
-        else:
-            joined.append(argument)
-    return joined
+"""Help text of options that take a table of ears."""
 
 
 class Parser(argparse.ArgumentParser):
     """Parser of the program and of each command, whose errors are one line without the usage.
 
     Args:
-        declare: Function that declares the options. It is called when the command is used.
+        declare: Function that declares the options of a command on this parser. It is called only
+            when the command is used, so that other commands do not import its module.
         settings: Arguments of ``argparse.ArgumentParser``.
     """
 
@@ -63,6 +42,8 @@ class Parser(argparse.ArgumentParser):
         self._examples: tuple[str, ...] = ()
         self._prefixes: tuple[str, ...] = ()
         self._required: Any = None
+        # argparse would take a value such as -10,0,20 for an option.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def set_command(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
         """Set the function that runs the command, and the arguments of the examples in the help."""
@@ -70,8 +51,10 @@ class Parser(argparse.ArgumentParser):
         self._examples = examples
 
     def accept_prefixes(self, *prefixes: str) -> None:
-        """Collect undeclared options that begin with a prefix, and their values, as
-        ``undeclared``."""
+        """Accept options that are not declared if their names begin with one of the prefixes.
+
+        The parsed options contain them, with their values, as the list ``undeclared``.
+        """
         self.set_defaults(undeclared=[])
         self._prefixes = prefixes
 
@@ -111,15 +94,15 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Declare an option or, if the name has no dashes, a positional argument.
 
-        The help text ends with the default; required options are listed in a group of their own.
+        Required options have a group of their own in the help.
 
         Args:
-            name: Name, with dashes unless the argument is positional.
-            kind: Function from text to value.
-            text: Description for the help.
+            name: Name, such as ``--speech``; without dashes for a positional argument.
+            kind: Function that converts the text of the command line to a value, such as ``count``.
+            text: Description for the help, which adds the default.
             default: Value if the option is missing.
-            group: Group of options that it joins, such as a mutually exclusive group.
-            settings: Other arguments of ``add_argument``.
+            group: Group of argparse that the option joins, such as a mutually exclusive group.
+            settings: Further arguments of ``argparse.ArgumentParser.add_argument``.
         """
         if settings.get("required"):
             group = self._required = self._required or self.add_argument_group("required options")
@@ -133,11 +116,11 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
-        """Declare an option without a value."""
+        """Declare an option without a value, which is True if it is used and otherwise False."""
         (group or self).add_argument(name, action="store_true", help=text)
 
     def teacher(self, text: str, default: str) -> None:
-        """Declare ``--teacher``."""
+        """Declare ``--teacher``, a simulator. The help text begins with ``text``."""
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
             "path/to/file.py:name, which is a function (waveform, audiogram) -> waveform, or a "
@@ -146,46 +129,51 @@ class Parser(argparse.ArgumentParser):
         )
         self.option("--teacher", teacher_name, help_, default, metavar="NAME")
 
-    def audiogram(self, default: str | None = None, text: str = "", **settings: Any) -> None:
-        """Declare ``--audiogram``, one ear."""
+    def audiogram(self, default: str | None = None, text: str = "", group: Any = None) -> None:
+        """Declare ``--audiogram``, one ear. The help text ends with ``text``."""
         help_ = (
             "NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, "
             f"4000, 6000 and 8000 Hz, separated by commas{text}"
         )
-        self.option("--audiogram", str, help_, default, metavar="EAR", **settings)
+        self.option("--audiogram", ear, help_, default, group=group)
 
-    def listener(self, text: str, **settings: Any) -> None:
-        """Declare ``--listener``, two ears."""
+    def listener(self, text: str, group: Any) -> None:
+        """Declare ``--listener``, two ears. The help text begins with ``text``."""
         help_ = (
             f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
             "Clarity's listeners.json; write FILE:NAME if the file holds several listeners"
         )
-        self.option("--listener", str, help_, metavar="FILE[:NAME]", **settings)
+        self.option("--listener", str, help_, group=group, metavar="FILE[:NAME]")
 
-    def levels(self, levelled: str) -> None:
+    def levels(self, signal: str) -> None:
         """Declare ``--full-scale-spl`` and ``--spl``, of which a user sets at most one.
 
-        The first is the level of a file whose RMS is 1.0, the second the level of each file.
+        The first is the level in dB SPL of a file whose RMS is 1.0. The second is the level of each
+        signal, whatever its RMS.
 
         Args:
-            levelled: Name of the signal that has the level ``--spl``, for the help text.
+            signal: Noun for the signal whose level is ``--spl``, for the help text.
         """
         group = self.add_mutually_exclusive_group()
         text = "level in dB SPL of a file whose RMS is 1.0"
         self.option("--full-scale-spl", number, text, 94.0, group=group, metavar="DB")
-        text = f"level in dB SPL of {levelled}"
-        self.option("--spl", positive, text, group=group, metavar="DB")
+        text = f"level in dB SPL of {signal}"
+        self.option("--spl", positive_number, text, group=group, metavar="DB")
 
     def linked(self, condition: str) -> None:
-        """Declare ``--linked``."""
+        """Declare ``--linked``, which gives both ears the same gains.
+
+        Args:
+            condition: Beginning of the restriction in the help text, such as "stereo files; ".
+        """
         text = f"link the gains of both ears ({condition}hearing aids and wdrc only)"
         self.flag("--linked", text)
 
     def enhancers(self, waveforms: str) -> None:
-        """Declare ``--enhancer``.
+        """Declare ``--enhancer``, noise reductions of the user.
 
         Args:
-            waveforms: Description of its input and output.
+            waveforms: Shape and unit of their input and output, for the help text.
         """
         text = (
             "noise reduction of your own before each aid, package.module:name or "
@@ -196,11 +184,11 @@ class Parser(argparse.ArgumentParser):
         self.option("--enhancer", plugin_name, text, [], **settings)
 
     def sliders(self) -> None:
-        """Declare the sliders of a hearing aid."""
+        """Declare ``--noise-reduction`` and ``--amplification``, the sliders of a hearing aid."""
         text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 0.5)"
-        self.option("--noise-reduction", slider, text)
+        self.option("--noise-reduction", fraction, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
-        self.option("--amplification", slider, text)
+        self.option("--amplification", fraction, text)
 
 
 def _format_default(default: Any, separator: str) -> str:
@@ -213,10 +201,12 @@ def _format_default(default: Any, separator: str) -> str:
 def checked_type(
     read: Callable[[str], Any], accepts: Callable[[Any], bool], expected: str
 ) -> Callable[[str], Any]:
-    """Make a function that reads the value of an option and validates it.
+    """Make a function that converts the text of an option to a value and validates it.
+
+    argparse turns its ``ArgumentTypeError`` into an error of one line.
 
     Args:
-        read: Function from text to value; a ValueError rejects the text.
+        read: Function that converts the text; it raises ValueError for text of another form.
         accepts: Function that returns whether a value is valid.
         expected: Description of valid values, for the error message.
     """
@@ -231,14 +221,38 @@ def checked_type(
     return read_value
 
 
+def _read_ear(text: str) -> str | tuple[float, ...]:
+    """Return the name of a standard ear, or levels that are separated by commas or blanks."""
+    if text.upper() in STANDARD_EARS:
+        return text.upper()
+    return tuple(float(part) for part in re.split(r"[,\s]+", text.strip()))
+
+
+def _is_ear(value: str | tuple[float, ...]) -> bool:
+    """Return whether a value is a name, or eight levels in the range of an audiogram."""
+    is_name = isinstance(value, str)
+    return is_name or (len(value) == 8 and all(-10.0 <= float(level) <= 120.0 for level in value))
+
+
+def _can_be_created(path: Path) -> bool:
+    """Return whether a folder exists and is writable, or can be created."""
+    existing = path.absolute()
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+
+
 _PLUGIN = re.compile(r".+:\w+")
 
 number = checked_type(float, math.isfinite, "a number such as 65 or 2.5")
-positive = checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
-slider = checked_type(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
+positive_number = checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
+fraction = checked_type(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
 integer = checked_type(int, lambda value: True, "a whole number")
 count = checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
-natural = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
+count_or_zero = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
+ear = checked_type(
+    _read_ear, _is_ear, f"{', '.join(STANDARD_EARS)}, or eight levels from -10 to 120 dB HL"
+)
 plugin_name = checked_type(
     str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name or path/to/file.py:name"
 )
@@ -247,29 +261,28 @@ teacher_name = checked_type(
     lambda text: text in TEACHERS or bool(_PLUGIN.fullmatch(text)),
     f"{', '.join(TEACHERS)}, package.module:name or path/to/file.py:name",
 )
-
-
-def folder(text: str) -> Path:
-    """Read the name of a folder for results, and reject one that cannot be created."""
-    path = Path(text)
-    existing = path.absolute()
-    while not os.path.lexists(existing):
-        existing = existing.parent
-    if not existing.is_dir():
-        raise argparse.ArgumentTypeError(f"{existing} is not a folder")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise argparse.ArgumentTypeError(f"no permission to write to {existing}")
-    return path
-
+input_path = checked_type(Path, lambda path: path.exists(), "an existing file or folder")
+input_file = checked_type(Path, lambda path: path.exists(), "an existing file")
+input_folder = checked_type(Path, lambda path: path.is_dir(), "an existing folder")
+ears_table = checked_type(
+    Path, lambda path: path.exists() or str(path) == "standard", "an existing file, or standard"
+)
+output_folder = checked_type(Path, _can_be_created, "a folder that you may write to")
 
 _METAVARS: dict[Callable[[str], Any], str] = {
-    Path: "PATH",
-    folder: "DIR",
+    input_path: "PATH",
+    input_file: "FILE",
+    input_folder: "FOLDER",
+    ears_table: "FILE",
+    output_folder: "FOLDER",
+    Path: "FILE",
     str: "NAME",
+    ear: "EAR",
     count: "N",
-    natural: "N",
+    count_or_zero: "N",
     integer: "N",
     number: "X",
-    positive: "X",
-    slider: "X",
+    positive_number: "X",
+    fraction: "X",
 }
+"""Placeholders of values in the help."""

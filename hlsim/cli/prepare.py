@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hlsim.cli.options import Parser, slider
+from hlsim.cli.options import Parser, fraction, input_path
 
 
 def prepare(parser: Parser) -> None:
-    """Declare the options of ``prepare``."""
+    """Declare the options of the command ``prepare``."""
     parser.set_command(
         _prepare,
         "VoiceBank-DEMAND --out VoiceBank-DEMAND/manifest.csv --valid-share 0.1",
@@ -18,7 +18,7 @@ def prepare(parser: Parser) -> None:
     option = parser.option
     option(
         "corpus",
-        Path,
+        input_path,
         "folder of VoiceBank-DEMAND, LibriSpeech or LibriTTS, or another folder with the folders "
         "train, valid and test; or a CSV file with the column path, and optionally noisy, speaker "
         "and split",
@@ -32,7 +32,7 @@ def prepare(parser: Parser) -> None:
     )
     option(
         "--valid-share",
-        slider,
+        fraction,
         "share of the training speakers that are used for validation, if the corpus has no "
         "validation split",
         0.0,
@@ -41,8 +41,6 @@ def prepare(parser: Parser) -> None:
 
 
 def _prepare(options: argparse.Namespace) -> None:
-    if not options.corpus.exists():
-        raise ValueError(f"{options.corpus}: there is no such folder or CSV file")
     from hlsim.training.corpora.layouts import prepare
 
     folders = options.folders.split("/") if options.folders else None

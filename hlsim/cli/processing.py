@@ -6,23 +6,21 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ear
-from hlsim.cli.options import Parser
+from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ears
+from hlsim.cli.options import Parser, input_path
 from hlsim.files import check_extension, resolve_links
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Build = Callable[[int], Any]
-"""Function from a sample rate in Hz to a model."""
-
 
 def simulate(parser: Parser) -> None:
-    """Declare the options of ``simulate``."""
+    """Declare the options of the command ``simulate``."""
     _declare_files(
         parser,
         _simulate,
@@ -34,7 +32,7 @@ def simulate(parser: Parser) -> None:
 
 
 def compensate(parser: Parser) -> None:
-    """Declare the options of ``compensate``."""
+    """Declare the options of the command ``compensate``."""
     _declare_files(
         parser,
         _compensate,
@@ -56,7 +54,7 @@ def _declare_files(
     """Declare the options that both commands have."""
     parser.set_command(run, *examples)
     text = "audio file of 16 kHz or more (wav, flac, ogg, mp3, ...), or a folder of such files"
-    parser.option("input", Path, text, metavar="IN")
+    parser.option("input", input_path, text, metavar="IN")
     text = (
         "output file (.wav with 32-bit float; from simulate also .flac, or .ogg with up to 2 "
         "channels), or a folder for wav files if IN is a folder"
@@ -88,57 +86,67 @@ def _compensate(options: argparse.Namespace) -> None:
     _process(options, lambda rate: load_compensator(options, rate), sliders, alternatives)
 
 
-class Result(NamedTuple):
-    """Properties of the output for one file, which decide about warnings."""
+class _Output(NamedTuple):
+    """Properties of the output for one file.
+
+    Attributes:
+        path: File that was written.
+        levels: Levels of input and output in dB SPL, as text.
+        peak: Largest magnitude of the samples in the file, where 1.0 is full scale.
+        is_narrow: Whether the file could hold frequencies that the model does not return.
+    """
 
     path: Path
+    levels: str
     peak: float
-    lacks_band: bool
+    is_narrow: bool
 
 
 def _process(
-    options: argparse.Namespace, build: Build, sliders: dict[str, float], alternatives: str
+    options: argparse.Namespace,
+    build: Callable[[int], Any],
+    sliders: dict[str, float],
+    alternatives: str,
 ) -> None:
     """Process the file, or each file of the folder, and print levels and warnings.
 
     Args:
         options: Options of the command.
-        build: Function from a sample rate in Hz to a model.
-        sliders: Further arguments of the model.
-        alternatives: Options for models that keep the band above 8 kHz.
+        build: Function from a sample rate in Hz to a simulator or compensator.
+        sliders: Further arguments of the simulator or compensator, by name.
+        alternatives: Options for models that keep the band above 8 kHz, for a warning.
     """
     # Threads of OpenMP spin while they wait. On a busy machine that triples the time of the many
     # short computations here.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    _check_paths(options.input, options.output)
-    ears = read_ears(options)
     is_folder = options.input.is_dir()
+    _check_output(options.input, options.output)
+    ears = read_ears(options)
     pairs = [(options.input, options.output)]
     if is_folder:
         pairs = _pair_files(options.input, options.output)
     from hlsim.checks import LOWEST_RATE
 
-    models: dict[int, Any] = {}
+    build = cache(build)
     if is_folder:
-        # A model that cannot be loaded is reported before the first file.
-        models[LOWEST_RATE] = build(LOWEST_RATE)
+        build(LOWEST_RATE)  # A model that cannot be loaded is reported before the first file.
     if "compensator" in options:
-        warn_of_other_ear(options)
-    results = []
+        warn_of_other_ears({options.compensator: options.compensator}, ears)
+    outputs = []
     for number, (source, target) in enumerate(pairs, 1):
-        prefix = f"{number} of {len(pairs)}: " if is_folder else ""
         try:
-            result, levels = _process_file(options, source, target, ears, models, build, sliders)
+            output = _process_file(options, source, target, ears, build, sliders)
         except ValueError as error:
             if not is_folder:
                 raise
             print(f"hlsim: warning: not processed: {error}", file=sys.stderr)
         else:
-            print(f"{prefix}{target}: {levels}", flush=True)
-            results.append(result)
-    _print_warnings(results, alternatives)
-    if len(results) < len(pairs):
-        failures = len(pairs) - len(results)
+            prefix = f"{number} of {len(pairs)}: " if is_folder else ""
+            print(f"{prefix}{target}: {output.levels}", flush=True)
+            outputs.append(output)
+    _print_warnings(outputs, alternatives)
+    if len(outputs) < len(pairs):
+        failures = len(pairs) - len(outputs)
         raise ValueError(f"{failures} of {len(pairs)} files failed, see the warnings above")
 
 
@@ -147,11 +155,19 @@ def _process_file(
     source: Path,
     target: Path,
     ears: Any,
-    models: dict[int, Any],
-    build: Build,
+    build: Callable[[int], Any],
     sliders: dict[str, float],
-) -> tuple[Result, str]:
-    """Write the output for one file, and return its properties and a description of levels."""
+) -> _Output:
+    """Process one file and write the output.
+
+    Args:
+        options: Options of the command.
+        source: File to read.
+        target: File to write.
+        ears: Audiogram or listener.
+        build: Function from a sample rate in Hz to a simulator or compensator.
+        sliders: Further arguments of the simulator or compensator, by name.
+    """
     import torch
 
     from hlsim.audio import check_writable, read_audio, write_audio
@@ -162,53 +178,46 @@ def _process_file(
     waveform, rate = read_audio(source, any_rate=True)
     channels, samples = waveform.shape
     check_writable(target, channels, rate)
-    needs_stereo = "--listener" if options.listener else ""
-    if getattr(options, "linked", False):
-        needs_stereo = "--linked"
-    if needs_stereo and channels != 2:
-        raise ValueError(
-            f"{source}: {needs_stereo} requires 2 channels, left and right, got {channels}"
-        )
+    is_linked = getattr(options, "linked", False)
+    if channels != 2 and (options.listener or is_linked):
+        option = "--linked" if is_linked else "--listener"
+        raise ValueError(f"{source}: {option} requires 2 channels, left and right, got {channels}")
 
     def level(signal: Tensor) -> float:
         return float(level_spl(signal.flatten(), options.full_scale_spl))
 
     gain = 1.0 if options.spl is None else 10.0 ** ((options.spl - level(waveform)) / 20.0)
-    inner_rate = min(rate, HIGHEST_RATE)
-    if inner_rate not in models:
-        models[inner_rate] = build(inner_rate)
-    model = models[inner_rate]
+    signal = waveform * gain
+    model_rate = min(rate, HIGHEST_RATE)
+    model = build(model_rate)
     with torch.no_grad():
-        output = model(resample(waveform * gain, rate, inner_rate), ears, **sliders)
-        output = resample(output, inner_rate, rate)[..., :samples]
-    peak = output.abs().max()
+        output = model(resample(signal, rate, model_rate), ears, **sliders)
+        output = resample(output, model_rate, rate)[..., :samples]
     write_audio(target, output / gain, rate)
-    levels = {"input": level(waveform * gain), "output": level(output), "peak": level(peak[None])}
-    lacks_band = getattr(model, "highest_frequency", math.inf) < rate / 2
-    description = ", ".join(f"{name} {value:.1f} dB SPL" for name, value in levels.items())
-    return Result(target, float(peak) / gain, lacks_band), description
+    peak = output.abs().max()
+    levels = {"input": level(signal), "output": level(output), "peak": level(peak[None])}
+    return _Output(
+        target,
+        ", ".join(f"{name} {value:.1f} dB SPL" for name, value in levels.items()),
+        peak=float(peak) / gain,
+        is_narrow=getattr(model, "highest_frequency", math.inf) < rate / 2,
+    )
 
 
-def _check_paths(source: Path, target: Path) -> None:
-    """Raise ValueError if OUT could not be written, or would replace a file of IN."""
-    if not source.exists():
-        raise ValueError(f"{source}: there is no such file or folder")
-    if source.is_dir():
-        if target.exists() and not target.is_dir():
-            raise ValueError(f"{target}: expected a folder, because {source} is one")
-        inner, outer = resolve_links(source), resolve_links(target)
-        if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-            raise ValueError(
-                f"{target}: expected a folder that is neither inside {source} nor contains it"
-            )
-        return
-    if target.is_dir():
-        raise ValueError(f"{target}: expected a file, because {source} is one")
-    check_extension(target)
-    if not target.parent.is_dir():
-        raise ValueError(f"{target.parent}: there is no such folder")
-    if target.exists() and target.samefile(source):
-        raise ValueError(f"{target}: refusing to overwrite the input; choose another file")
+def _check_output(source: Path, target: Path) -> None:
+    """Raise ValueError if OUT is of another kind than IN, or would replace a file of IN."""
+    kind = "folder" if source.is_dir() else "file"
+    if target.exists() and target.is_dir() != source.is_dir():
+        raise ValueError(f"{target}: expected a {kind}, because {source} is one")
+    inner, outer = resolve_links(source), resolve_links(target)
+    is_nested = inner.is_relative_to(outer) or outer.is_relative_to(inner)
+    if is_nested or (target.exists() and target.samefile(source)):
+        raise ValueError(
+            f"{target}: refusing to overwrite the input; choose a {kind} that neither is inside "
+            f"{source} nor contains it"
+        )
+    if kind == "file":
+        check_extension(target)
 
 
 def _pair_files(source: Path, target: Path) -> list[tuple[Path, Path]]:
@@ -232,25 +241,25 @@ def _pair_files(source: Path, target: Path) -> list[tuple[Path, Path]]:
     return [(path, output) for output, path in sources.items()]
 
 
-def _print_warnings(results: Iterable[Result], alternatives: str) -> None:
+def _print_warnings(outputs: list[_Output], alternatives: str) -> None:
     """Print one warning about clipping, and one about the band above 8 kHz, for all files."""
-    loud = [result for result in results if result.peak > 1.0]
+    loud = [output for output in outputs if output.peak > 1.0]
     if loud:
-        peak = max(result.peak for result in loud)
+        peak = max(output.peak for output in loud)
         decibels = math.ceil(20.0 * math.log10(peak))
         _warn(
             loud,
             f"the peak is up to {peak:.3g} times full scale, and most players will clip it; lower "
             f"the level by {decibels} dB before playing",
         )
-    dull = [result for result in results if result.lacks_band]
-    if dull:
-        _warn(dull, f"the output has no band above 8 kHz, which {alternatives} would keep")
+    narrow = [output for output in outputs if output.is_narrow]
+    if narrow:
+        _warn(narrow, f"the output has no band above 8 kHz, which {alternatives} would keep")
 
 
-def _warn(results: list[Result], text: str) -> None:
+def _warn(outputs: list[_Output], text: str) -> None:
     """Print a warning about one or several files."""
-    files = f"{results[0].path}"
-    if len(results) > 1:
-        files += f" and {len(results) - 1} more"
+    files = f"{outputs[0].path}"
+    if len(outputs) > 1:
+        files += f" and {len(outputs) - 1} more"
     print(f"hlsim: warning: {files}: {text}", file=sys.stderr)

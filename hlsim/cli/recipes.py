@@ -5,34 +5,30 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hlsim.cli.options import Parser
+from hlsim.cli.options import Parser, input_file
 from hlsim.extras import require
 from hlsim.training.recipes import TrainingRecipe
 
 Recipe = TypeVar("Recipe", bound=TrainingRecipe)
 
-ALIASES = {"start": ["--start"]}
-"""Other names of options by setting."""
-
 
 def add_recipe(parser: Parser, recipe: type[TrainingRecipe], example: str) -> None:
-    """Declare the options of a recipe.
+    """Declare ``--recipe`` and one option per setting of a recipe.
 
     Args:
         parser: Parser of the command.
         recipe: Class of the recipe.
-        example: Path of a recipe, for the help.
+        example: Path of a YAML file with a recipe, for the help.
     """
     text = (
         f"YAML file of a recipe, such as {example}; the settings below override those of the file"
     )
-    parser.add_argument("--recipe", "--config", type=Path, metavar="FILE", help=text)
+    parser.add_argument("--recipe", "--config", type=input_file, metavar="FILE", help=text)
     settings = parser.add_argument_group(
         "settings of the recipe",
         "model and weights also accept single settings, such as --recipe.model.channels 16",
@@ -40,13 +36,20 @@ def add_recipe(parser: Parser, recipe: type[TrainingRecipe], example: str) -> No
     descriptions = describe_settings(recipe)
     for setting in fields(recipe):
         text = descriptions[setting.name] + format_default(setting)
-        names = [f"--recipe.{setting.name}", *ALIASES.get(setting.name, [])]
+        names = [f"--recipe.{setting.name}"] + ["--start"] * (setting.name == "start")
         settings.add_argument(*names, metavar="VALUE", help=text.replace("%", "%%"))
     parser.accept_prefixes("--recipe.model.", "--recipe.weights.")
 
 
 def describe_settings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return the first sentence about each setting from the docstrings of a recipe's classes."""
+    """Return the first sentence about each setting of a recipe, from the docstrings of its classes.
+
+    Args:
+        recipe: Class of the recipe.
+
+    Returns:
+        Sentences without a full stop, by the name of the setting.
+    """
     descriptions: dict[str, str] = {}
     for kind in reversed(recipe.mro()[:-1]):
         docstring = inspect.getdoc(kind) or ""
@@ -57,8 +60,14 @@ def describe_settings(recipe: type[TrainingRecipe]) -> dict[str, str]:
 
 
 def format_default(setting: Field[Any]) -> str:
-    """Format the default of a setting as YAML, for the help. An empty default gives an empty
-    text."""
+    """Describe the default of a setting for the help, such as ``" (default: 0.3)"``.
+
+    Args:
+        setting: Field of the recipe's class.
+
+    Returns:
+        Text in YAML with a leading blank; an empty text for an empty default.
+    """
     factory = setting.default_factory
     default = setting.default if factory is MISSING else factory()
     if isinstance(default, dict):
@@ -69,14 +78,17 @@ def format_default(setting: Field[Any]) -> str:
 
 
 def read_recipe(options: argparse.Namespace, recipe: type[Recipe]) -> Recipe:
-    """Make a recipe of the options of a command.
+    """Make the recipe of ``--recipe`` and of the options ``--recipe.NAME``.
+
+    Args:
+        options: Options of the command.
+        recipe: Class of the recipe.
 
     Raises:
         ValueError: The file cannot be read, or a setting is unknown or invalid.
     """
-    values = {
-        setting.name: getattr(options, f"recipe.{setting.name}") for setting in fields(recipe)
-    }
+    names = [setting.name for setting in fields(recipe)]
+    values = {name: getattr(options, f"recipe.{name}") for name in names}
     arguments = [f"--recipe.{name}={value}" for name, value in values.items() if value is not None]
     return make_recipe(recipe, options.recipe, [*arguments, *options.undeclared])
 
@@ -86,51 +98,26 @@ def make_recipe(recipe: type[Recipe], file: Path | None, arguments: Sequence[str
 
     Args:
         recipe: Class of the recipe.
-        file: YAML file, if there is one.
+        file: YAML file; None uses the defaults.
         arguments: Arguments such as ``--recipe.babble=0.3``.
 
     Raises:
         ValueError: The file cannot be read, or a setting is unknown or invalid.
     """
-    if file is None and not arguments:
+    if file is not None:
+        arguments = [f"--recipe={file}", *arguments]
+    if not arguments:
         return recipe()  # type: ignore[call-arg]
     jsonargparse: Any = require("jsonargparse", "train")
     parser = jsonargparse.ArgumentParser(exit_on_error=False)
     parser.add_class_arguments(recipe, "recipe")
-    settings = None
-    if file is not None:
-        with value_errors(str(file)):
-            settings = parser.parse_object({"recipe": read_yaml(file)})
-    with value_errors("command line"):
-        settings = parser.parse_args(arguments, namespace=settings)
-    result: Recipe = parser.instantiate(settings).recipe
-    return result
-
-
-@contextmanager
-def value_errors(source: str) -> Iterator[None]:
-    """Turn errors of jsonargparse into ValueErrors that name the source of the settings."""
     try:
-        yield
+        settings = parser.parse_args(arguments)
     except (argparse.ArgumentError, OverflowError) as error:
         text = re.sub(r"<class '(\w+)'>", r"\1", str(error))
-        raise ValueError(f"{source}: {text}") from error
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read the settings in a YAML file.
-
-    Raises:
-        ValueError: The file is not YAML, or a setting has no value.
-    """
-    yaml: Any = require("yaml", "train")
-    try:
-        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: expected a YAML file: {error}") from error
-    if not isinstance(settings, dict):
-        raise ValueError(f"{path}: expected settings, one per line, such as 'batch: 4'")
-    for name, value in settings.items():
-        if value is None:
-            raise ValueError(f"{path}: {name} has no value; add one or delete the line")
-    return settings
+        text = re.sub(r'Parser key "recipe":\s+Unable to load config', "cannot read", text)
+        raise ValueError(
+            f"recipe: {text}; write settings as 'batch: 4' in the file, or as --recipe.batch 4"
+        ) from error
+    result: Recipe = parser.instantiate(settings).recipe
+    return result

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from hlsim.cli.inputs import check_paths_exist, read_ear, require_installed
-from hlsim.cli.options import Parser, count, folder, natural, positive
+from hlsim.cli.inputs import check_extras, read_ears
+from hlsim.cli.options import (
+    Parser,
+    count,
+    count_or_zero,
+    ears_table,
+    input_file,
+    input_folder,
+    output_folder,
+    positive_number,
+)
 from hlsim.cli.recipes import add_recipe, read_recipe
-from hlsim.extras import require
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 
 def train_simulator(parser: Parser) -> None:
-    """Declare the options of ``train-simulator``."""
+    """Declare the options of the command ``train-simulator``."""
     parser.set_command(
         _train_simulator,
         "--speech speech/train --valid-speech speech/valid --out runs/simulator",
@@ -27,7 +34,7 @@ def train_simulator(parser: Parser) -> None:
 
 
 def train_compensator(parser: Parser) -> None:
-    """Declare the options of ``train-compensator``."""
+    """Declare the options of the command ``train-compensator``."""
     parser.set_command(
         _train_compensator,
         "--speech speech/train --valid-speech speech/valid --audiogram N3 --out runs/n3",
@@ -46,51 +53,39 @@ def _declare_common(parser: Parser) -> None:
     """Declare the options that both commands have."""
     option = parser.option
     speech = parser.add_mutually_exclusive_group(required=True)
-    option("--speech", Path, "folder of clean speech", group=speech)
+    option("--speech", input_folder, "folder of clean speech", group=speech)
     text = (
-        "CSV file of 'hlsim prepare', instead of --speech and --valid-speech; the noise is "
-        "that of its noisy speech"
+        "CSV file of 'hlsim prepare', instead of --speech; its validation speech and the noise of "
+        "its noisy speech are used unless other options name some"
     )
-    option("--manifest", Path, text, group=speech)
-    option(
-        "--root",
-        Path,
-        "folder to which the manifest's paths are relative; by default the folder of the manifest",
+    option("--manifest", input_file, text, group=speech)
+    text = (
+        "folder to which the manifest's paths are relative; by default the folder of the manifest"
     )
-    option("--noise", Path, "folder of noise recordings that are mixed in")
-    option(
-        "--audiograms",
-        Path,
-        "CSV file of measured ears, or standard for Bisgaard's; used in addition to random ears",
-    )
-    option("--valid-speech", Path, "folder of clean speech by other speakers, for validation")
-    option("--valid-noise", Path, "folder of noise recordings for validation")
-    option(
-        "--valid-audiograms",
-        Path,
-        "CSV file of measured ears for validation, or standard for Bisgaard's",
-    )
+    option("--root", input_folder, text)
+    option("--noise", input_folder, "folder of noise recordings that are mixed in")
+    ears = "CSV file of measured ears, or standard for Bisgaard's"
+    option("--audiograms", ears_table, f"{ears}; used in addition to random ears")
+    text = "folder of clean speech by other speakers, for validation"
+    option("--valid-speech", input_folder, text)
+    option("--valid-noise", input_folder, "folder of noise recordings for validation")
+    option("--valid-audiograms", ears_table, f"{ears}, for validation")
     text = (
         "time limit in minutes, including the time before a resumption; the learning rate "
         "does not depend on it"
     )
-    option("--max-minutes", positive, text)
+    option("--max-minutes", positive_number, text)
     option("--device", str, "device of the training", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "number of GPUs or processes; each draws its own batches", 1)
-    option(
-        "--workers",
-        natural,
-        "number of processes that draw batches, in addition to the one that trains",
-        0,
-    )
+    text = "number of processes that draw batches, in addition to the one that trains"
+    option("--workers", count_or_zero, text, 0)
     parser.flag("--quiet", "print one line per validation, without a progress bar")
-    parser.option("--out", folder, "folder for the results", required=True)
+    option("--out", output_folder, "folder for the results", required=True)
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
-    _check_options(options)
+    check_extras("train")
     recipe = read_recipe(options, SimulatorRecipe)
-    require("lightning", "train")  # A broken installation is reported here.
     from hlsim.training.simulator import train_simulator
 
     folder = train_simulator(recipe=recipe, teacher=options.teacher, **_common_arguments(options))
@@ -103,55 +98,30 @@ def _train_compensator(options: argparse.Namespace) -> None:
             "--audiogram excludes --audiograms and --valid-audiograms, because it trains for one "
             "ear; leave one or the other out"
         )
-    _check_options(options)
+    check_extras("train")
     recipe = read_recipe(options, CompensatorRecipe)
-    ear = read_ear(options.audiogram) if options.audiogram else None
-    require("lightning", "train")
+    ear: Any = read_ears(options)
     from hlsim.training.compensator import train_compensator
 
     folder = train_compensator(
-        recipe=recipe, audiogram=ear, simulator=options.simulator, **_common_arguments(options)
+        recipe=recipe,
+        audiogram=ear,
+        simulator=options.simulator,
+        **_common_arguments(options),
     )
     print(f"the best checkpoint is in {folder}")
 
 
-def _check_options(options: argparse.Namespace) -> None:
-    """Reject options that exclude each other, and missing files, before slow imports."""
-    if options.manifest is not None and options.valid_speech is not None:
-        raise ValueError(
-            "--manifest excludes --valid-speech, because it includes validation "
-            "speech; leave one out"
-        )
-    if options.manifest is None and options.root is not None:
-        raise ValueError("--root has no effect without --manifest; leave it out")
-    require_installed("train", "lightning", "tensorboard")
-    check_paths_exist(
-        folders=(
-            options.speech,
-            options.noise,
-            options.valid_speech,
-            options.valid_noise,
-            options.root,
-        ),
-        files=(options.recipe, options.manifest, options.audiograms, options.valid_audiograms),
-    )
-
-
 def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments that both training functions have."""
+    """Return the arguments that both training functions have, by name."""
     from hlsim.training.batches import TrainingData
 
-    attributes: dict[str, Any] = {
-        "noise": options.noise,
-        "audiograms": options.audiograms,
-        "valid_noise": options.valid_noise,
-        "valid_audiograms": options.valid_audiograms,
-        "workers": options.workers,
-    }
-    if options.manifest is not None:
-        data = TrainingData.from_manifest(options.manifest, options.root, **attributes)
+    names = ("noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms", "workers")
+    sources = {name: getattr(options, name) for name in names}
+    if options.manifest:
+        data = TrainingData.from_manifest(options.manifest, options.root, **sources)
     else:
-        data = TrainingData(options.speech, valid_speech=options.valid_speech, **attributes)
+        data = TrainingData(options.speech, **sources)
     return {
         "data": data,
         "out": options.out,

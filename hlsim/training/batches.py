@@ -100,7 +100,7 @@ class TrainingData:
                 f"{manifest}: no row has the split 'train', which holds the speech to train on; "
                 "correct the column 'split'"
             )
-        if not speech["valid"]:
+        if not (speech["valid"] or attributes.get("valid_speech")):
             warnings.warn(
                 f"{manifest}: no row has the split 'valid', so training speech is used for "
                 "validation; 'hlsim prepare --valid-share 0.1' moves a tenth of the speakers to "
@@ -110,7 +110,8 @@ class TrainingData:
         if not attributes.get("noise"):
             attributes["noise"] = pairs["train"]
             attributes["valid_noise"] = attributes.get("valid_noise") or pairs["valid"]
-        return cls(speech["train"], valid_speech=speech["valid"], **attributes)
+        attributes["valid_speech"] = attributes.get("valid_speech") or speech["valid"]
+        return cls(speech["train"], **attributes)
 
     def validation(self) -> TrainingData:
         """Return the validation data, as training data of another object.

@@ -12,7 +12,6 @@ from hlsim.audio import write_audio
 
 pytest.importorskip("lightning")
 
-from hlsim.cli.main import main
 from hlsim.training.batches import TrainingData, compensator_data, simulator_data
 from hlsim.training.corpora.manifest import Utterance, write_manifest
 from hlsim.training.data_module import BatchData, Step, Steps
@@ -135,6 +134,8 @@ def test_validation_is_on_other_speech_or_says_that_it_is_not(manifest: Path) ->
     with pytest.warns(UserWarning, match="training speech is used for validation"):
         data = TrainingData.from_manifest(manifest)
     assert data.validation().speech == data.speech
+    data = TrainingData.from_manifest(manifest, valid_speech=manifest.parent / "noisy")
+    assert data.validation().speech == manifest.parent / "noisy"
     manifest.write_text(rows.replace("train", "test"))
     with pytest.raises(ValueError):
         TrainingData.from_manifest(manifest)
@@ -155,23 +156,3 @@ def test_a_simulator_is_trained_on_a_manifest(
     data = TrainingData.from_manifest(manifest)
     train_simulator(data, recipe, out=tmp_path / "out", accelerator="cpu")
     assert "step 4: valid_snr_median" in capsys.readouterr().out
-
-
-def test_options_that_exclude_each_other(
-    manifest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("batch: 2\n")
-    call = ["train-simulator", "--recipe", str(recipe), "--out", str(tmp_path / "out")]
-    for options in (
-        [],
-        ["--speech", "s", "--manifest", str(manifest)],
-        ["--manifest", str(manifest), "--valid-speech", "v"],
-        ["--speech", str(tmp_path), "--root", "r"],
-        ["--manifest", str(tmp_path / "none.csv")],
-    ):
-        try:
-            status = main([*call, *options])
-        except SystemExit as end:
-            status = int(str(end.code))
-        assert status == 2 and len(capsys.readouterr().err.splitlines()) == 1
