@@ -1,4 +1,4 @@
-"""Settings of the two trainable compensators, which are stored as JSON."""
+"""Settings of the two trainable compensators, which a checkpoint stores as JSON."""
 
 from __future__ import annotations
 
@@ -10,17 +10,22 @@ from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
 
 @dataclass(frozen=True)
 class MappingConfig(NetworkConfig):
-    """Settings of a ``MappingCompensator``, in addition to those of ``NetworkConfig``.
+    """Settings of a ``MappingCompensator``, in addition to the sizes in ``NetworkConfig``.
 
     Attributes:
-        start: Gain before training: ``"nalr"``, or a share of the hearing loss from 0 to 1.
+        start: Gain before training, to which the network adds a correction: ``"nalr"`` for that of
+            the prescription, or a share from 0 to 1 of the hearing loss in dB.
         phase: Phase of the output: ``input`` for that of the input, or ``predicted`` by the
             network, as in Neuro-MSBG. Do not combine ``predicted`` with a criterion that compares
             only levels, such as ``"bands"``. Training may then find phases that differ between
             overlapping frames, which cancels steady sounds.
-        bands: Number of bands of the correction, evenly spaced on the ERB-number scale, 4 to 40.
+        bands: Number of bands, 4 to 40, in each of which the correction is computed. The centres
+            are evenly spaced on the ERB-number scale, on which the ear's bandwidth is constant.
         reach_db: Largest correction up or down in dB.
         limit_spl: Peak of the output in dB SPL that no sample exceeds.
+
+    Raises:
+        ValueError: A value is out of range.
 
     >>> MappingConfig(blocks=1, phase="predicted").phase
     'predicted'
@@ -47,28 +52,32 @@ class MappingConfig(NetworkConfig):
 
 @dataclass(frozen=True)
 class HearingAidConfig(ModelConfig):
-    """Settings of a ``HearingAid``.
+    """Settings of a ``HearingAid``, which amplifies bands and attenuates noise in them.
 
-    The gain of a band is a restoring gain, which brings the loudness of the band back to that of a
-    normal ear, plus a correction by a small network.
+    The amplification of a band is a restoring gain, which makes the band as loud as for a normal
+    ear, plus a correction by a small network. A second, recurrent network reduces noise.
 
     Attributes:
-        bands: Number of bands with a gain, an equal number of ERBs but at least 125 Hz apart, 4 to
-            40.
-        bins: Number of frequencies of a frame, 62.5 Hz apart from the first, whose levels noise
-            reduction sees in addition to those of the bands.
+        bands: Number of bands, 4 to 40. Their centres are an equal number of ERBs (bandwidths of
+            the normal ear), but at least 125 Hz, apart.
+        bins: Number of single frequencies (62.5, 125, 187.5, ... Hz) whose levels are inputs of
+            noise reduction, in addition to the levels of the bands.
         width: Width of the layer before the recurrent one of noise reduction.
         hidden: Width of the recurrent layer.
         inner: Width of the three layers of the network that computes the correction.
         reach_db: Largest correction of the restoring gain up or down in dB.
         reduction_db: Largest attenuation of a band by noise reduction in dB.
-        attack: Time constant in seconds with which the levels behind the gain rise.
-        release: Time constant in seconds with which they fall.
-        opening: Time constant in seconds with which noise reduction ends.
-        closing: Time constant in seconds with which it begins.
-        cap_db: Largest gain of a band in dB.
-        quiet_spl: Level in dB SPL below which the gain fades, to none 15 dB lower.
+        attack: Time constant in seconds with which the level that sets the amplification rises.
+        release: Time constant in seconds with which it falls.
+        opening: Time constant in seconds with which the attenuation of noise decreases.
+        closing: Time constant in seconds with which it increases.
+        cap_db: Largest amplification of a band in dB.
+        quiet_spl: Level of a frame in dB SPL below which the amplification fades. Frames that are
+            15 dB softer are not amplified.
         limit_spl: Peak of the output in dB SPL that no sample exceeds.
+
+    Raises:
+        ValueError: A value is out of range.
 
     >>> HearingAidConfig(bands=12).cap_db
     45.0

@@ -1,6 +1,11 @@
-"""The filter bank of a wearable aid, and sound levels in its bands.
+"""Filter bank of the wearable aids: it amplifies bands of a signal, and measures their levels.
 
-The filters have linear phase and sum to a delay.
+The bands cover 0 to 8000 Hz at a sample rate of 16 kHz. Their filters have linear phase, and add up
+to a delay of 64 samples. Three terms of all wearable aids:
+
+- A *hop* is 64 samples (4 ms). An aid computes the gains of its bands once per hop.
+- A *frame* is the last 256 samples (16 ms) at the end of a hop, whose spectrum sets the gains.
+- An *excess gain* is a linear gain minus 1. With 0 in all bands, no bit of the signal changes.
 """
 
 from __future__ import annotations
@@ -24,16 +29,16 @@ DELAY = 64
 """Delay of the filters in samples, 4 ms. Each filter has 2 * 64 + 1 taps."""
 
 HOP = 64
-"""Samples from one control frame to the next."""
+"""Samples from the end of one frame to the end of the next."""
 
 FRAME = 256
-"""Samples of a control frame."""
+"""Samples of a frame."""
 
 FALL = 64
-"""Samples at the end of a control frame in which its window falls."""
+"""Samples at the end of a frame in which its window falls."""
 
 HISTORY = FRAME - HOP
-"""Samples before a hop that frames and filters need."""
+"""Samples before a hop that belong to its frame."""
 
 MIN_SPACING = 125.0
 """Smallest distance of two centres in Hz, about what filters of this length can separate."""
@@ -42,7 +47,7 @@ POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
 """Power at 0 dB SPL, the lowest level of a band."""
 
 GRID_POINTS = 4096
-"""Length of the transform on which filters are designed and speech is divided into bands."""
+"""Length of the Fourier transform with which filters and the spectrum of speech are computed."""
 
 SPEECH_SPL = 65.0
 """Level in dB SPL of average speech."""
@@ -57,25 +62,29 @@ SPEECH_SPECTRUM = {
 
 
 @lru_cache(maxsize=8)
-def centres(count: int) -> tuple[float, ...]:
-    """Return centre frequencies of bands from 0 to 8000 Hz.
+def band_centres(bands: int) -> tuple[float, ...]:
+    """Return the centre frequencies of the bands in Hz, from 0 to 8000.
 
-    Neighbours are an equal number of ERBs, but at least 125 Hz, apart.
+    Neighbours are an equal number of ERBs (bandwidths of the normal ear), but at least 125 Hz,
+    apart.
 
-    >>> [round(hertz) for hertz in centres(4)]
+    Args:
+        bands: Number of bands, 4 to 40.
+
+    >>> [round(hertz) for hertz in band_centres(4)]
     [0, 526, 2264, 8000]
     """
     low, high = 0.0, 100.0
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if _spaced(count, middle)[-1] < RATE / 2.0:
+        if _spaced_frequencies(bands, middle)[-1] < RATE / 2.0:
             low = middle
         else:
             high = middle
-    return tuple(min(frequency, RATE / 2.0) for frequency in _spaced(count, high))
+    return tuple(min(frequency, RATE / 2.0) for frequency in _spaced_frequencies(bands, high))
 
 
-def _spaced(count: int, erbs: float) -> list[float]:
+def _spaced_frequencies(count: int, erbs: float) -> list[float]:
     """Return frequencies from 0 Hz upwards with a spacing in ERBs, but at least 125 Hz."""
     frequencies = [0.0]
     for _ in range(count - 1):
@@ -84,45 +93,54 @@ def _spaced(count: int, erbs: float) -> list[float]:
     return frequencies
 
 
-def shares(count: int, points: int) -> NDArray[np.float64]:
-    """Return the weight of each band at each frequency of a Fourier transform.
+def band_powers(powers: Tensor, bands: int) -> Tensor:
+    """Add up the power in each band from the power at each frequency of a frame.
 
-    Returns: (points / 2 + 1, count).
+    A frequency between two centres counts for both bands, in inverse proportion to the distance.
 
-    The weights are linear between the centres of bands, and sum to 1.
+    Args:
+        powers: Powers in Pa^2 from ``frame_power``.
+        bands: Number of bands, 4 to 40.
 
-    >>> shares(20, 512).shape
-    (257, 20)
+    Shape: (items, frames, FRAME / 2 + 1) -> (items, frames, bands) in Pa^2.
+
+    >>> band_powers(torch.ones(1, 1, FRAME // 2 + 1), bands=4).round()
+    tensor([[[ 5., 18., 60., 46.]]])
+    """
+    return powers @ constant_like(powers, _band_shares, bands, FRAME)
+
+
+def _band_shares(bands: int, points: int) -> NDArray[np.float64]:
+    """Return the weight of each band at each frequency of a Fourier transform of ``points``.
+
+    The weights are linear between the centres of bands, and sum to 1 at each frequency.
+
+    Returns: (points / 2 + 1, bands).
     """
     frequencies = np.arange(points // 2 + 1) * RATE / points
-    return np.stack([np.interp(frequencies, centres(count), row) for row in np.eye(count)], 1)
+    return np.stack([np.interp(frequencies, band_centres(bands), row) for row in np.eye(bands)], 1)
 
 
-def filters(count: int) -> NDArray[np.float64]:
-    """Return the symmetric taps of the filters, (count, 129).
+def _filter_taps(bands: int) -> NDArray[np.float64]:
+    """Return the symmetric taps of the filters, whose sum over bands is 1 in the middle, else 0.
 
-    Their sum is 1 at the middle tap, else 0.
-
-    >>> filters(20).shape
-    (20, 129)
+    Returns: (bands, 2 * DELAY + 1).
     """
-    impulses = np.fft.irfft(shares(count, GRID_POINTS).T, GRID_POINTS)
+    impulses = np.fft.irfft(_band_shares(bands, GRID_POINTS).T, GRID_POINTS)
     taps = np.roll(impulses, DELAY, -1)[:, : 2 * DELAY + 1]
     return taps * np.hanning(2 * DELAY + 3)[1:-1]
 
 
-def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
-    """Amplify each band and sum the bands, with a delay of ``DELAY`` samples.
+def apply_gains(samples: Tensor, excess_gains: Tensor, position: int = 0) -> Tensor:
+    """Amplify each band of a signal, and add up the bands, with a delay of 64 samples.
 
-    The gains change linearly from hop to hop.
-
-    It uses no transform, so that later samples do not change earlier ones even by rounding. Gains
-    of 1 change nothing either.
+    The gain of a band goes on a straight line from the beginning of a hop to its end.
 
     Args:
-        padded: Samples of whole hops, or of a part of one hop, after ``2 * DELAY`` earlier samples.
-        gains: Gains minus 1 at the beginning of each hop and at the end of the last.
-        first: Position of the first sample in its hop.
+        samples: Samples of whole hops, or of a part of one hop, after ``2 * DELAY`` earlier
+            samples that the filters need.
+        excess_gains: Linear gains minus 1 at the beginning of each hop and at the end of the last.
+        position: Position in its hop of the first sample after the earlier ones.
 
     Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
 
@@ -130,25 +148,27 @@ def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
     >>> apply_gains(torch.ones(1, 2 * DELAY + 2 * HOP), twice_as_loud).round()[0, :3]
     tensor([2., 2., 2.])
     """
-    time, count = padded.shape[-1] - 2 * DELAY, gains.shape[-1]
+    time, bands = samples.shape[-1] - 2 * DELAY, excess_gains.shape[-1]
     length = min(time, HOP)
-    taps = constant_like(padded, _hop_matrix, count).unflatten(1, (count, HOP))
-    taps = taps[: length + 2 * DELAY, :, :length]
-    ramp = constant_like(padded, _ramp)[:, first : first + length]
-    hops = padded.unfold(-1, length + 2 * DELAY, length)
-    bands = (hops @ taps.flatten(1)).unflatten(-1, (count, length))
-    ends = torch.stack((gains[:, :-1], gains[:, 1:]), 2) @ bands
-    amplified = (ends * ramp).sum(2).flatten(1)
-    return padded[:, DELAY : DELAY + time] + amplified
+    # A matrix product instead of a Fourier transform, in which later samples would change earlier
+    # ones by rounding.
+    matrix = constant_like(samples, _hop_matrix, bands).unflatten(1, (bands, HOP))
+    matrix = matrix[: length + 2 * DELAY, :, :length]
+    hops = samples.unfold(-1, length + 2 * DELAY, length)
+    bands_of_hops = (hops @ matrix.flatten(1)).unflatten(-1, (bands, length))
+    first_and_last = torch.stack((excess_gains[:, :-1], excess_gains[:, 1:]), 2)
+    ramp = constant_like(samples, _ramp)[:, position : position + length]
+    added = ((first_and_last @ bands_of_hops) * ramp).sum(2).flatten(1)
+    return samples[:, DELAY : DELAY + time] + added
 
 
 def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
-    """Interpolate the gains of one band at the samples of another rate, as ``apply_gains`` does.
+    """Interpolate the gains of one band linearly to the samples of a signal at another rate.
 
     Args:
-        gains: Gains before the first sample and at the last sample of each hop.
-        rate: Sample rate of the result in Hz.
-        time: Number of samples.
+        gains: Gains before the first sample and at the last sample of each hop at 16 kHz.
+        rate: Sample rate of the signal in Hz.
+        time: Number of samples of the signal.
 
     Shape: (items, hops + 1) -> (items, time).
 
@@ -161,19 +181,22 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
     return torch.lerp(gains[:, hop], gains[:, hop + 1], (position - hop).to(gains))
 
 
-def frame_power(padded: Tensor) -> Tensor:
-    """Compute the power at each frequency in frames of 16 ms every 4 ms.
+def frame_power(samples: Tensor) -> Tensor:
+    """Compute the power spectrum of each frame: the last 16 ms at the end of each hop of 4 ms.
 
-    The sum over frequencies is the mean square of a frame. The input begins with the HISTORY (12
-    ms) before the first hop, or as many zeros, so that a frame ends with each hop.
+    The sum over frequencies is the mean square of the windowed frame.
 
-    Shape: (items, HISTORY + frames * HOP) in pascals -> (items, frames, FRAME / 2 + 1).
+    Args:
+        samples: Samples of whole hops in pascals, after the ``HISTORY`` = 192 samples before them
+            (zeros at the beginning of a signal).
+
+    Shape: (items, HISTORY + frames * HOP) -> (items, frames, FRAME / 2 + 1) in Pa^2.
 
     >>> frame_power(torch.randn(2, HISTORY + 10 * HOP)).shape
     torch.Size([2, 10, 129])
     """
-    frames = padded.unfold(-1, FRAME, HOP) * constant_like(padded, _window)
-    return power(torch.fft.rfft(frames)) * constant_like(padded, _scale)
+    frames = samples.unfold(-1, FRAME, HOP) * constant_like(samples, _window)
+    return power(torch.fft.rfft(frames)) * constant_like(samples, _scale)
 
 
 def level_db(powers: Tensor) -> Tensor:
@@ -185,20 +208,24 @@ def level_db(powers: Tensor) -> Tensor:
     return 10.0 * torch.log10(powers + POWER_FLOOR) + PASCAL_SPL
 
 
-def speech_levels(count: int) -> tuple[float, ...]:
-    """Return the level of average speech at 65 dB SPL in each band in dB SPL.
+def speech_band_levels(bands: int) -> tuple[float, ...]:
+    """Return the level of average speech in each band in dB SPL, at 65 dB SPL in total.
 
-    >>> [round(level) for level in speech_levels(4)]
+    >>> [round(level) for level in speech_band_levels(4)]
     [60, 63, 53, 43]
     """
-    bands = speech_density(GRID_POINTS) @ shares(count, GRID_POINTS)[1:]
-    return tuple((10.0 * np.log10(bands / bands.sum()) + SPEECH_SPL).tolist())
+    powers = speech_density(GRID_POINTS) @ _band_shares(bands, GRID_POINTS)[1:]
+    return tuple((10.0 * np.log10(powers / powers.sum()) + SPEECH_SPL).tolist())
 
 
 def speech_density(points: int) -> NDArray[np.float64]:
-    """Return the relative power density of speech at a transform's frequencies above 0 Hz.
+    """Return the relative power density of average speech at the frequencies of a transform.
 
-    Returns: (points / 2,).
+    Args:
+        points: Length of the Fourier transform at 16 kHz.
+
+    Returns:
+        Power per Hz at each frequency above 0 Hz, (points / 2,).
 
     >>> speech_density(512).shape
     (256,)
@@ -210,13 +237,13 @@ def speech_density(points: int) -> NDArray[np.float64]:
     return 10.0 ** (np.interp(np.log(frequencies), np.log(thirds), density) / 10.0)
 
 
-def _hop_matrix(count: int) -> NDArray[np.float64]:
-    """Return the weights of samples in the next ``HOP`` outputs of each band.
+def _hop_matrix(bands: int) -> NDArray[np.float64]:
+    """Return the matrix from the samples of a hop, and those before it, to the bands of the hop.
 
-    Returns: (2 * DELAY + HOP, count * HOP).
+    Returns: (2 * DELAY + HOP, bands * HOP).
     """
-    matrix = np.zeros((2 * DELAY + HOP, count, HOP))
-    taps = filters(count).T
+    matrix = np.zeros((2 * DELAY + HOP, bands, HOP))
+    taps = _filter_taps(bands).T
     for sample in range(HOP):
         matrix[sample : sample + 2 * DELAY + 1, :, sample] = taps
     return matrix.reshape(len(matrix), -1)

@@ -1,13 +1,15 @@
-"""Insertion gains of an aid, measured with noise that has the spectrum of average speech."""
+"""Insertion gains of an aid, measured with noise that has the spectrum of average speech.
+
+The insertion gain is the level of an aid's output minus that of its input in dB, in a third of an
+octave around a frequency.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from compensators.filter_bank import RATE, SPEECH_SPL, speech_density
 from hlsim.audiogram import FREQUENCIES
@@ -18,55 +20,63 @@ from hlsim.dsp.fft import power
 from hlsim.torchtools import constant_like
 
 
-@torch.no_grad()
-def measure_gains(
-    process: Callable[[Tensor, Tensor], Tensor],
-    audiogram: AudiogramLike,
-    level: float,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Tensor:
-    """Measure gains in thirds of an octave around the eight ``FREQUENCIES``.
+class MeasuredAid(nn.Module):
+    """Base class of aids whose gains depend on the sound, and are therefore measured with noise.
 
-    Args:
-        process: Function from the input of an aid, (items, time) in pascals, and the thresholds of
-            ears, (items, 8), to its output, (items, time).
-        audiogram: One or more ears.
-        level: Level of the noise in dB SPL, 0 to 120.
-        dtype: Type of the noise.
-        device: Device of the noise.
+    Subclasses implement ``_amplify_noise``.
 
-    Returns: Gains in dB, (8,) for one ear, else (..., 8).
-
-    Raises:
-        ValueError: An ear or the level is not valid.
-
-    >>> gains = measure_gains(
-    ...     lambda noise, ears: 10.0 * noise, "N3", 65.0, torch.float32, torch.device("cpu")
-    ... )
-    >>> gains.round()
-    tensor([20., 20., 20., 20., 20., 20., 20., 20.])
+    >>> from compensators import WDRC
+    >>> isinstance(WDRC(), MeasuredAid)
+    True
     """
-    check_number("level", level, 0.0, 120.0)
-    thresholds = as_thresholds(audiogram, consumer="an aid").to(device, dtype)
-    ears = thresholds.reshape(-1, len(FREQUENCIES))
-    noise = constant_like(ears, speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
-    # The first second, in which gains settle, does not count.
-    output = process(noise.repeat(len(ears), 2), ears)[:, RATE:]
-    thirds = constant_like(ears, _thirds_of_octave)
-    output_power, noise_power = (
-        power(torch.fft.rfft(signal)) @ thirds for signal in (output, noise)
-    )
-    return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
+
+    @torch.no_grad()
+    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
+        """Measure the insertion gains for noise with the spectrum of average speech.
+
+        Noise reduction is off, and the limit of the output does not count.
+
+        Args:
+            audiogram: One or more ears.
+            level: Presentation level in dB SPL, 0 to 120.
+
+        Returns:
+            Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
+
+        Raises:
+            ValueError: An ear or the level is not valid.
+
+        >>> from compensators import WDRC
+        >>> WDRC().gains("N3", level=65.0).round()
+        tensor([ 1.,  8., 18., 20., 21., 22., 23., 24.])
+        """
+        check_number("level", level, 0.0, 120.0)
+        weight = next(self.parameters(), torch.empty(0))
+        thresholds = as_thresholds(audiogram, consumer="an aid").to(weight)
+        ears = thresholds.reshape(-1, len(FREQUENCIES))
+        noise = constant_like(ears, _speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
+        # The first second, in which gains settle, does not count.
+        output = self._amplify_noise(noise.repeat(len(ears), 2), ears)[:, RATE:]
+        in_third = constant_like(ears, _thirds_of_octave)
+        output_power, noise_power = (
+            power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
+        )
+        return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
+
+    def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
+        """Return the output before its limit. Shape: (items, time), (items, 8) -> (items, time).
+
+        Args:
+            noise: Noise in pascals at 16 kHz.
+            ears: Thresholds in dB HL.
+        """
+        raise NotImplementedError
 
 
-def speech_noise() -> NDArray[np.float64]:
+def _speech_noise() -> NDArray[np.float64]:
     """Return one second of noise with the spectrum of average speech at 65 dB SPL.
 
     Samples are in pascals at 16 kHz, with shape (16000,). The noise can be repeated without a jump.
-
-    >>> speech_noise().shape
-    (16000,)
     """
     spectrum = np.zeros(RATE // 2 + 1, dtype=complex)
     phases = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, RATE // 2)

@@ -9,14 +9,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators.config import HearingAidConfig
-from compensators.filter_bank import FRAME, HISTORY, frame_power, level_db, shares
-from compensators.prescription import losses, prescribed_gains, restoring_gains
-from compensators.smoothing import decay, follow_peaks
+from compensators.filter_bank import (
+    HISTORY,
+    band_centres,
+    band_powers,
+    frame_power,
+    level_db,
+)
+from compensators.nalr import nalr_gains_db
+from compensators.smoothing import follow_peaks
 from compensators.stream import Stream
 from compensators.wearable import Slider, State, Wearable
-from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.audiogram.thresholds import AudiogramLike, interpolate
 from hlsim.calibration import PASCAL_SPL
-from hlsim.torchtools import constant_like
 
 DEFAULT_NOISE_REDUCTION = 0.5
 """Share of the attenuation by default.
@@ -31,29 +36,48 @@ QUIET_FADE_DB = 15.0
 INITIAL_REDUCTION_LOGIT = -3.0
 """Initial logit of noise reduction: 5 % of the largest attenuation."""
 
+CATCH_UP_SPL = 105.0
+"""Level in dB SPL at which MSBG's recruitment ends."""
+
+NO_GAIN_SPL = 100.0
+"""Level of a band in dB SPL from which on the restoring gain is 0.
+
+The bands are wider than MSBG's, and louder than each part of them: of 95, 100, 105 and 110 dB SPL,
+100 came closest to normal hearing of speech.
+"""
+
+SOFTEST_SPL = 20.0
+"""Level of a band in dB SPL below which the restoring gain does not rise."""
+
 
 class HearingAid(Wearable):
-    """A hearing aid with a delay of 4 ms, for whole signals or chunks.
+    """A hearing aid with trained gains and trained noise reduction, and a delay of 4 ms.
 
-    Two independent networks set its gains. The first has no memory. It sees the ear and the
-    smoothed and present level of each band, and corrects the gain that would restore loudness band
-    by band (``prescription.restoring_gains``); the correction is 0 before training, and where there
-    is no loss. The second is causal and recurrent. It sees the levels of frames, not the ear, and
-    reduces noise. In dB, the gain of a band is
+    The gain of each frequency band changes every 4 ms. In dB, it is
 
-        amplification * (restoring + correction) - noise_reduction * attenuation,
+        amplification * (restoring gain + correction) - noise_reduction * attenuation,
 
-    so that at 0 and 0 the input passes unchanged. The gain has a maximum, and fades for sounds
-    below ``config.quiet_spl``; the output is softly limited at ``config.limit_spl``.
+    where ``amplification`` and ``noise_reduction`` are sliders from 0 to 1 that the wearer sets. At
+    0 and 0 the input passes unchanged. The terms are:
+
+    - The restoring gain makes the band as loud for the impaired ear as for a normal one, by the
+      formula with which MSBG simulates the growth of loudness.
+    - The correction comes from a network that gets the audiogram and the level of each band. It is
+      0 before training, and where there is no loss.
+    - The attenuation comes from a recurrent network that gets levels, but no audiogram.
+
+    Amplification is at most ``config.cap_db``, and fades for sounds below ``config.quiet_spl``. The
+    peak of the output is softly limited at ``config.limit_spl``.
 
     Args:
-        config: Sizes and choices.
-        sample_rate: Sample rate in Hz, as in ``Wearable``.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
-        linked: Link the gains of two ears, as in ``Wearable``.
+        config: Sizes of the networks, and limits of the gains; by default ``HearingAidConfig()``.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
+            in level between them stay if their audiograms are equal.
 
     Raises:
-        ValueError: A rate or level out of range, or a configuration of another type.
+        ValueError: A rate or level is out of range, or the configuration is of another type.
 
     >>> import hlsim
     >>> aid = HearingAid().eval()
@@ -113,21 +137,24 @@ class HearingAid(Wearable):
         noise_reduction: Slider = DEFAULT_NOISE_REDUCTION,
         amplification: Slider = 1.0,
     ) -> Tensor:
-        """Return the output for a whole signal, time-aligned.
+        """Return the output for a whole signal, time-aligned with the input.
 
         Args:
             waveform: Input of the aid.
-            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
-            noise_reduction: Share of the attenuation, 0 to 1, one number or one per item.
-            amplification: Share of the amplification, 0 to 1, one number or one per item.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the waveform.
+            noise_reduction: Share of the attenuation of noise that is applied, 0 to 1: one number,
+                or one value per item.
+            amplification: Share of the amplification that is applied, 0 to 1: one number, or one
+                value per item.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: No audiogram, levels outside -10 to 100 dB HL, sliders outside 0 to 1, or
-                shapes that do not fit.
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, a slider is
+                outside 0 to 1, or shapes do not fit.
         """
-        return self.process(waveform, audiogram, (noise_reduction, amplification))
+        return self._process(waveform, audiogram, (noise_reduction, amplification))
 
     def stream(
         self,
@@ -135,7 +162,15 @@ class HearingAid(Wearable):
         noise_reduction: Slider = DEFAULT_NOISE_REDUCTION,
         amplification: Slider = 1.0,
     ) -> Stream:
-        """Return a stream, which gives the same output for chunks of any size.
+        """Return a function that processes a signal in chunks of any size, as it arrives.
+
+        The output is that for the whole signal, ``latency`` samples late. The sliders are
+        attributes of the stream that may be set between chunks.
+
+        Args:
+            audiogram: Ear or ears.
+            noise_reduction: Share of the attenuation of noise that is applied, 0 to 1.
+            amplification: Share of the amplification that is applied, 0 to 1.
 
         Raises:
             ValueError: The sample rate is not 16000 Hz, or an argument is not valid.
@@ -143,42 +178,53 @@ class HearingAid(Wearable):
         return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        loss = losses(thresholds, self.bands)
-        return torch.cat((loss, prescribed_gains(thresholds, self.bands)), -1)
+        """Return the loss in each band, and then NAL-R's gain in each band, both in dB.
 
-    def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
-        return {
-            "levels": like.new_zeros(items, 3, self.bands + 1),
-            "attenuation": like.new_zeros(items, 3, self.bands),
-            "hidden": like.new_zeros(items, 2, self.config.hidden),
+        Shape: (items, 8) -> (items, 2 bands).
+        """
+        centres = band_centres(self.bands)
+        loss = interpolate(thresholds, centres)
+        prescribed = interpolate(nalr_gains_db(thresholds), centres)
+        return torch.cat((loss, prescribed), -1)
+
+    def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
+        items = len(sliders)
+        return super().initial_state(sliders) | {
+            "levels": sliders.new_zeros(items, 3, self.bands + 1),
+            "attenuation": sliders.new_zeros(items, 3, self.bands),
+            "hidden": sliders.new_zeros(items, 2, self.config.hidden),
         }
 
-    def control(
+    def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         noise_reduction, amplification = sliders.split(1, -1)
         levels = self._levels(powers)
         gain, level_state = self._amplification(levels[..., : self.bands + 1], fitted, state)
-        attenuation, reduction_state = self._reduction(levels, state)
+        attenuation, reduction_state = self._attenuation(levels, state)
         total = amplification * gain + noise_reduction * attenuation
         return total, level_state | reduction_state
 
     def attenuation(self, samples: Tensor) -> Tensor:
-        """Return the gain in dB, 0 or less, that noise reduction adds at the end of each frame.
+        """Compute the gains with which noise reduction attenuates each band, every 4 ms.
 
-        It does not depend on the ear.
+        They do not depend on the ear.
 
-        Shape: (items, hops * HOP) in pascals -> (items, hops, bands).
+        Args:
+            samples: Input of the aid in pascals at 16 kHz, a multiple of 64 samples long.
+
+        Shape: (items, time) -> (items, time / 64, bands) in dB, 0 or less.
         """
         levels = self._levels(frame_power(functional.pad(samples, (HISTORY, 0))))
-        return self._reduction(levels, self.start(len(samples), samples))[0]
+        state = self.initial_state(samples.new_zeros(len(samples), len(self.SLIDERS)))
+        return self._attenuation(levels, state)[0]
 
     def _levels(self, powers: Tensor) -> Tensor:
         """Return the levels of the bands, of the whole frame, and of single frequencies in dB SPL.
 
         Shape: (items, frames, FRAME / 2 + 1) -> (items, frames, bands + 1 + bins).
         """
-        by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
+        by_band = band_powers(powers, self.bands)
         bins = powers[..., 1 : self.config.bins + 1]
         return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
 
@@ -187,13 +233,12 @@ class HearingAid(Wearable):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the restoring gain with its correction in dB, and the state of the levels.
 
-        Shape: (items, frames, bands + 1) for the bands and the whole frame, (items, n)
+        Shape: (items, frames, bands + 1) for the bands and the whole frame, (items, 2 bands)
             -> (items, frames, bands).
         """
         config = self.config
         present = levels[..., : self.bands]
-        attack, release = decay(config.attack), decay(config.release)
-        levels, level_state = follow_peaks(levels, state["levels"], attack, release)
+        levels, memory = follow_peaks(levels, state["levels"], config.attack, config.release)
         level, total = levels.split((self.bands, 1), -1)
         loss, prescribed = fitted.chunk(2, -1)
         ear = torch.cat((loss / 50.0, prescribed / 20.0), -1)
@@ -201,11 +246,11 @@ class HearingAid(Wearable):
         reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
         features = torch.cat((ear, (levels - 40.0) / 20.0, (present - level) / 10.0), -1)
         correction = reach.unsqueeze(1) * torch.tanh(self.correct(features))
-        gain = (restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
+        gain = (_restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
         fade = ((total - config.quiet_spl) / QUIET_FADE_DB + 1.0).clamp(0.0, 1.0)
-        return fade * gain, {"levels": level_state}
+        return fade * gain, {"levels": memory}
 
-    def _reduction(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
+    def _attenuation(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the gain of noise reduction in dB, 0 or less, and its state.
 
         Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands).
@@ -223,15 +268,27 @@ class HearingAid(Wearable):
             hidden, cell = hidden.squeeze(0), cell.squeeze(0)
         logits = self.leave(torch.cat((recurrent, entered), -1))
         gain = -config.reduction_db * torch.sigmoid(logits)
-        opening, closing = decay(config.opening), decay(config.closing)
-        gain, gain_state = follow_peaks(gain, state["attenuation"], opening, closing)
-        return gain, {"attenuation": gain_state, "hidden": torch.stack((hidden, cell), 1)}
+        gain, memory = follow_peaks(gain, state["attenuation"], config.opening, config.closing)
+        return gain, {"attenuation": memory, "hidden": torch.stack((hidden, cell), 1)}
+
+
+def _restoring_gains(levels: Tensor, loss: Tensor) -> Tensor:
+    """Return the gain that makes a band as loud for an impaired ear as for a normal one.
+
+    It inverts MSBG's recruitment: at a level of 105 dB SPL - loss, the ear perceives 0 dB SPL, and
+    at 105 dB SPL it perceives the same as a normal ear.
+
+    Shape: (items, frames, bands) dB SPL, (items, bands) dB HL -> (items, frames, bands), 0 dB or
+        more.
+    """
+    share = (loss.clamp_min(0.0) / CATCH_UP_SPL).unsqueeze(1)
+    return share * (NO_GAIN_SPL - levels.clamp_min(SOFTEST_SPL)).clamp_min(0.0)
 
 
 def _lstm_step(lstm: nn.LSTM, frame: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Run a one-layer LSTM for one frame.
+    """Run a one-layer LSTM for one frame, which takes a quarter of the time of a call of the LSTM.
 
-    It takes a quarter of the module's time, and gives the same bits on a CPU.
+    The bits are the same on a CPU.
 
     Shape: (items, inputs), (items, units) twice -> hidden and cell state, (items, units) each.
     """

@@ -1,7 +1,8 @@
-"""Loading and saving of compensators."""
+"""Loading of compensators by name, and saving of trained ones in folders."""
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from compensators.config import HearingAidConfig, MappingConfig
 from compensators.hearing_aid import HearingAid
@@ -21,7 +22,7 @@ CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
     "mapping-compensator": MappingConfig,
     "hearing-aid": HearingAidConfig,
 }
-"""Configuration of each kind of compensator, by its name in ``config.json`` of a checkpoint."""
+"""Class of the settings of each kind of checkpoint, by the kind's name in ``config.json``."""
 
 UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
 """Compensators without a checkpoint."""
@@ -33,14 +34,20 @@ def build_compensator(
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
 ) -> Trained:
-    """Build the untrained compensator of a configuration.
+    """Build an untrained compensator from its settings.
+
+    Args:
+        config: Settings. Their class decides which kind of compensator is built.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     >>> build_compensator(HearingAidConfig(bands=12)).bands
     12
     """
+    options: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     if isinstance(config, HearingAidConfig):
-        return HearingAid(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+        return HearingAid(config, **options)
+    return MappingCompensator(config, **options)
 
 
 def load_compensator(
@@ -50,20 +57,22 @@ def load_compensator(
     full_scale_spl: float = PASCAL_SPL,
     linked: bool = False,
 ) -> Trained | NALR | WDRC:
-    """Load a compensator, frozen and in eval mode. Nothing is downloaded.
+    """Load a hearing aid by name, in evaluation mode and with weights that are not trained further.
+
+    Nothing is downloaded.
 
     Args:
         name: ``"nalr"``, the prescription; ``"wdrc"``, the prescription with compression; a
-            checkpoint that ships with hlsim; or the folder of a checkpoint. ``trained_for`` returns
-            the ear of a compensator that was trained for one ear.
+            checkpoint that ships with hlsim, such as ``"hearing-aid"``; or the folder of a
+            checkpoint. If an aid was trained for one ear, ``trained_for`` returns this ear.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
-        linked: Link the gains of a hearing aid or WDRC between the ears, as
-            ``compensators.wearable`` describes.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
+            in level between them stay. ``WDRC`` and ``HearingAid`` support this.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind or has changed since it was
-            saved, or ``linked`` is set for a compensator that cannot link its gains.
+            saved, or ``linked`` is set for an aid that does not support it.
 
     >>> import hlsim
     >>> aid = load_compensator("hearing-aid")
@@ -82,34 +91,32 @@ def load_compensator(
         compensator.linked = linked
     elif linked:
         raise ValueError(
-            f"{name} cannot link its gains between ears; expected wdrc or a hearing aid"
+            f"{name} cannot link its gains between ears; load wdrc or hearing-aid, or leave out "
+            "linked"
         )
     return compensator
 
 
 def _untrained(name: str | Path) -> type[NALR | WDRC] | None:
-    """Return the class of a compensator without a checkpoint.
-
-    NAL-R may be written with a hyphen.
-    """
+    """Return the class of a compensator without a checkpoint. "NAL-R" is also accepted."""
     return UNTRAINED.get(str(name).lower().replace("-", ""))
 
 
 def save_compensator(
     model: Trained, folder: str | Path, audiogram: Audiogram | None = None
 ) -> None:
-    """Write a checkpoint that ``load_compensator`` reads, in place of one that is there.
+    """Save a trained compensator as a folder, which ``load_compensator`` loads.
 
-    The checkpoint holds neither sample rate nor calibration; pass them to ``load_compensator``. An
-    existing README.md is kept.
+    A checkpoint that is already there is replaced, except for its README.md. The sample rate and
+    ``full_scale_spl`` are not saved; pass them to ``load_compensator``.
 
     Args:
         model: Compensator to save.
         folder: Folder of the checkpoint.
-        audiogram: The one ear for which the compensator was trained, or None for all ears.
+        audiogram: Ear for which the compensator was trained; None if it was trained for all ears.
 
     Raises:
-        ValueError: The model is of another kind, or the folder holds something else.
+        ValueError: The model is of another kind, or the folder contains other files.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -127,7 +134,10 @@ def save_compensator(
 
 
 def trained_for(name: str | Path) -> Audiogram | None:
-    """Return the one ear for which a compensator was trained, or None for one that suits all ears.
+    """Return the ear for which a compensator was trained, or None if it was trained for all ears.
+
+    Args:
+        name: Name or folder, as in ``load_compensator``.
 
     Raises:
         ValueError: There is no such checkpoint, or its record of the ear is no audiogram.

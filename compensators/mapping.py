@@ -1,4 +1,4 @@
-"""The paper's compensator: Neuro-MSBG with a magnitude path that maps instead of masking."""
+"""The compensator of the Neuro-MSBG paper, whose gains change over time and frequency."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators.config import MappingConfig
-from compensators.gains import measure_gains
+from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
 from compensators.nalr import nalr_gains_db
-from hlsim.audiogram.thresholds import AudiogramLike, interpolate
+from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
@@ -32,32 +32,31 @@ LOWEST_CENTRE = 100.0
 """Centre of the lowest band of the correction in Hz."""
 
 
-class MappingCompensator(EarNetwork):
-    """A network that maps a waveform and an audiogram to a time-aligned, limited output.
+class MappingCompensator(MeasuredAid, EarNetwork):
+    """A trainable aid for whole signals: a network that amplifies each point of the spectrogram.
 
-    The network works on the spectrogram. Its input channels are the log magnitude, the audiogram
-    (encoded by Equation 1 of the Neuro-MSBG paper) and the prescribed gain. An encoder is followed
-    by blocks that process the spectrogram along time and along frequency in turn. A decoder returns
-    a correction of the gain, which is smooth over time and frequency and 0 before training. The
-    output has the magnitude of the input, plus the gain of the prescription ``config.start``, plus
-    this correction, all in dB. Training needs the prescription as its start: an inaudible band has
-    almost no gradient, and without a prescription the trained network is worse than NAL-R. The
-    phase of the input is kept. With ``config.phase`` "predicted" it is an input channel, and a
-    second decoder shifts it.
+    In dB, the gain at a time and a frequency is that of a prescription (``config.start``) plus a
+    correction by the network, which is smooth over time and frequency, and 0 before training. The
+    network gets the log magnitude of the input, the audiogram and the prescribed gain. It has the
+    encoder, dual-path blocks and decoder of Neuro-MSBG. Training needs the prescription: an
+    inaudible band has almost no gradient, and without a prescription the trained network is worse
+    than NAL-R.
 
-    Levels are in pascals, and nothing is normalised. The output is softly limited at
-    ``config.limit_spl``.
+    The output is time-aligned with the input, and has its phase, which a second decoder shifts if
+    ``config.phase`` is "predicted". It depends on the level, because nothing is normalised, and is
+    softly limited at ``config.limit_spl``.
 
     Args:
-        config: Sizes and choices.
-        sample_rate: Sample rate in Hz, as in ``EarNetwork``.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
+        config: Sizes and choices, by default ``MappingConfig()``.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Outputs contain the
+            frequencies below 8 kHz only.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Attributes:
         highest_frequency: Highest frequency of outputs in Hz.
 
     Raises:
-        ValueError: A rate or level out of range, or a configuration of another type.
+        ValueError: A rate or level is out of range, or the configuration is of another type.
 
     >>> import hlsim
     >>> model = MappingCompensator(MappingConfig(channels=8, blocks=1))
@@ -79,18 +78,17 @@ class MappingCompensator(EarNetwork):
         super().__init__(sample_rate, full_scale_spl)
         self.config = config = MappingConfig.from_optional(config)
         self.stft = config.stft
-        layers = config.channels, config.dense_depth, config.stride
-        channels, depth, stride = layers
+        sizes = config.channels, config.dense_depth, config.stride
         is_predicted = config.phase == "predicted"
         inputs = 4 if is_predicted else 3
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
-        self.encoder = DenseEncoder(inputs, *layers, normalise=False)
+        self.encoder = DenseEncoder(inputs, *sizes, normalise=False)
         self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
-        self.magnitude_decoder = Decoder(channels, 1, depth, stride, normalise=False)
-        self.phase_decoder = PhaseDecoder(*layers, normalise=False) if is_predicted else None
+        self.magnitude_decoder = Decoder(*sizes, outputs=1, normalise=False)
+        self.phase_decoder = PhaseDecoder(*sizes, normalise=False) if is_predicted else None
 
-    def start_gains_db(self, thresholds: Tensor) -> Tensor:
-        """Return the gain before training at the transform's frequencies.
+    def _start_gains_db(self, thresholds: Tensor) -> Tensor:
+        """Return the gain before training at each frequency of the spectrogram.
 
         Shape: (items, 8) dB HL -> (items, frequencies) dB.
         """
@@ -100,25 +98,6 @@ class MappingCompensator(EarNetwork):
         else:
             gains = float(start) * thresholds.clamp_min(0.0)
         return interpolate(gains, self.config.hz)
-
-    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
-        """Measure the insertion gains for noise with the spectrum of average speech.
-
-        Args:
-            audiogram: One or more ears.
-            level: Presentation level in dB SPL, 0 to 120.
-
-        Returns:
-            Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
-
-        Raises:
-            ValueError: An ear or the level is not valid.
-
-        >>> MappingCompensator().gains("N3").shape
-        torch.Size([8])
-        """
-        weight = self.magnitude_decoder.leave.weight
-        return measure_gains(self._process, audiogram, level, weight.dtype, weight.device)
 
     def extra_repr(self) -> str:
         return (
@@ -137,13 +116,16 @@ class MappingCompensator(EarNetwork):
     def _dtype(self) -> torch.dtype:
         return self.magnitude_decoder.leave.weight.dtype
 
+    def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
+        return self._process(noise, ears)
+
     def _finish(self, result: Tensor) -> Tensor:
         # The limit is the last step, because resampling can overshoot.
         return soft_limit(result, 10.0 ** ((self.config.limit_spl - PASCAL_SPL) / 20.0))
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         spectrum = self.stft.analyse(signals)
-        start = self.start_gains_db(ears) / NEPER_DB
+        start = self._start_gains_db(ears) / NEPER_DB
         features = self._features(spectrum, ears, start)
         features = features.contiguous(memory_format=torch.channels_last)
         features = self.encoder(features).permute(0, 2, 3, 1)

@@ -1,4 +1,4 @@
-"""NAL-R, a linear prescription of gains for an audiogram."""
+"""NAL-R, a prescription of gains for an audiogram that do not depend on the level."""
 
 from __future__ import annotations
 
@@ -33,23 +33,25 @@ THRESHOLD_OPTIONS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "consumer": "NAL-
 
 
 class NALR(nn.Module):
-    """The revised prescription of the National Acoustic Laboratories as a linear-phase filter.
+    """The simplest aid: a filter with the gains that NAL-R prescribes for an audiogram.
 
-    The gains are those of Byrne and Dillon 1986, Ear and Hearing 7(4), and for severe losses Byrne,
-    Parkinson and Newall 1990, Ear and Hearing 11(1). The filter is that of pyclarity 0.9.0 without
-    its delay of ``order / 2`` samples. The output is linear in the input and has no limit.
+    NAL-R is the revised prescription of the National Acoustic Laboratories: Byrne and Dillon 1986,
+    Ear and Hearing 7(4), and for severe losses Byrne, Parkinson and Newall 1990, Ear and Hearing
+    11(1). The filter has linear phase, and is that of pyclarity 0.9.0 without its delay of
+    ``order / 2`` samples. It amplifies loud sounds as much as soft ones, and the output has no
+    limit.
 
     Args:
-        audiogram: Ear or ears; may be passed to each call instead. A tensor that requires a
-            gradient has to be. The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz
+        audiogram: Ear or ears for all calls. Pass them to each call instead if they are a tensor
+            that requires a gradient. The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz
             count, interpolated over log frequency where they were not measured.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of RMS 1.0. A linear filter does not need it; all
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0. It has no effect here; all
             compensators accept it.
-        order: Order of the filter, even, 2 to 1022.
+        order: Order of the filter, which has ``order + 1`` taps: an even number, 2 to 1022.
 
     Raises:
-        ValueError: A value out of range.
+        ValueError: A value is out of range.
 
     >>> import hlsim
     >>> from hlsim.calibration import level_spl
@@ -85,16 +87,18 @@ class NALR(nn.Module):
         self._two_ears = has_listeners(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the amplified waveform, time-aligned.
+        """Return the amplified waveform, time-aligned with the input.
 
         Args:
             waveform: Input of the aid.
-            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the waveform; by default those of the constructor.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: No audiogram, levels outside -10 to 120 dB HL, or shapes that do not fit.
+            ValueError: There is no audiogram, a threshold is outside -10 to 120 dB HL, or shapes do
+                not fit.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         thresholds = resolve_thresholds(
@@ -104,24 +108,24 @@ class NALR(nn.Module):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
             points = scipy.fft.next_fast_len(time + self.order, real=True)
-            taps = self.taps(thresholds).to(signal.dtype)
+            taps = self._taps(thresholds).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
             delay = self.order // 2
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
             return output.to(waveform.dtype)
 
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
-        """Compute the insertion gains of the prescription, which are the same at every level.
+        """Compute the insertion gains: the output level minus the input level at each frequency.
 
         Args:
             audiogram: One or more ears, by default those that were passed to the constructor.
-            level: Presentation level in dB SPL, which all aids accept.
+            level: Presentation level in dB SPL, which changes nothing here. All aids accept it.
 
         Returns:
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: No audiogram, or levels outside -10 to 120 dB HL.
+            ValueError: There is no audiogram, or a threshold is outside -10 to 120 dB HL.
 
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
@@ -133,8 +137,8 @@ class NALR(nn.Module):
             raise ValueError("no audiogram; pass one to gains, or to NALR when building it")
         return nalr_gains_db(thresholds)
 
-    def taps(self, thresholds: Tensor) -> Tensor:
-        """Return the taps of the filter, symmetric around the middle one.
+    def _taps(self, thresholds: Tensor) -> Tensor:
+        """Return the taps of the filter for ears, symmetric around the middle one.
 
         Shape: (..., 8) dB HL -> (..., order + 1).
         """
@@ -153,13 +157,16 @@ class NALR(nn.Module):
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
-    """Return the insertion gain that NAL-R prescribes at the audiometric frequencies.
+    """Return the gains that NAL-R prescribes at the eight frequencies of an audiogram.
 
     The formula is for 250, 500, 1000, 2000, 4000 and 6000 Hz. As in pyclarity, the gain is a
     straight line from 2 to 4 kHz and constant above 6 kHz, so that the thresholds at 3 and 8 kHz do
     not count. An ear without any loss has no gain.
 
-    Shape: (..., 8) dB HL -> (..., 8), 0 dB or more.
+    Args:
+        thresholds: Thresholds in dB HL at ``hlsim.audiogram.FREQUENCIES``.
+
+    Shape: (..., 8) -> (..., 8) in dB, 0 or more.
 
     >>> nalr_gains_db(torch.tensor([20.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 50.0])).round()
     tensor([ 0.,  2., 13., 14., 15., 16., 18., 18.])

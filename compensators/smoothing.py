@@ -1,4 +1,8 @@
-"""Smoothing of levels and gains over control frames, with a state for the next call."""
+"""Smoothing of the levels and gains of bands from frame to frame, 4 ms each.
+
+A smoother gets the values of some frames, and returns its memory after the last one. The next call
+gets this memory, so that a signal may be processed in chunks of any number of frames.
+"""
 
 from __future__ import annotations
 
@@ -16,29 +20,65 @@ BLOCK_FRAMES = 128
 """Frames that are computed together by a matrix, whose powers must not overflow."""
 
 
-def decay(seconds: float) -> float:
-    """Convert a time constant to the weight of the previous frame in an exponential average.
+def follow_peaks(
+    values: Tensor, memory: Tensor, attack: float, release: float
+) -> tuple[Tensor, Tensor]:
+    """Smooth values with one time constant where they rise and another where they fall.
 
-    The weight is 0 for 0 s.
+    This is the smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng.
+    Soc. 60(6), Equation 17, without a loop over frames. With x for the values, y for the result, r
+    and a for the weights of the past in a fall and in a rise:
 
-    >>> round(decay(0.1), 3)
-    0.961
+        p[n] = max(x[n], r p[n - 1] + (1 - r) x[n]),  y[n] = a y[n - 1] + (1 - a) p[n]
+
+    Args:
+        values: Levels or gains in dB, for each frame.
+        memory: Second result of the call for the preceding frames, zeros before the first frame.
+        attack: Time constant of a rise in seconds. With 0, the result follows at once.
+        release: Time constant of a fall in seconds.
+
+    Returns:
+        The smoothed values, and the memory after the last frame.
+
+    Shape: (items, frames, n), (items, 3, n) -> (items, frames, n), (items, 3, n).
+
+    >>> values = torch.tensor([0.0, 60.0, 0.0, 0.0]).reshape(1, 4, 1)
+    >>> smoothed, memory = follow_peaks(values, torch.zeros(1, 3, 1), attack=0.0, release=0.04)
+    >>> smoothed.flatten().round()
+    tensor([ 0., 60., 54., 49.])
     """
+    fall, rise = _weight_of_past(release), _weight_of_past(attack)
+    # p is the largest of the averages that begin at any of the frames: p = e + d, where e is the
+    # average with r, and d[n] = max(x[n] - e[n], r d[n - 1]).
+    average, excess, result = memory.unbind(1)
+    averages = _average(values, average, fall)
+    blocks = []
+    for block in (values - averages).split(BLOCK_FRAMES, 1):
+        powers = constant_like(values, _powers, block.shape[1], fall)
+        highest = block / powers
+        if block.shape[1] > 1:  # a stream saves the call
+            highest = _running_maximum(highest)
+        blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
+        excess = blocks[-1][:, -1]
+    peaks = averages + _join(blocks)
+    results = _average(peaks, result, rise)
+    return results, torch.stack((averages[:, -1], excess, results[:, -1]), 1)
+
+
+def _weight_of_past(seconds: float) -> float:
+    """Convert a time constant to the weight of the past in an exponential average, 0 for 0 s."""
     return math.exp(-HOP / (RATE * seconds)) if seconds > 0.0 else 0.0
 
 
-def average(values: Tensor, state: Tensor, past: float) -> Tensor:
+def _average(values: Tensor, before: Tensor, past: float) -> Tensor:
     """Compute the exponential average y[n] = past y[n - 1] + (1 - past) x[n].
 
     Args:
-        values: X.
-        state: Y of the frame before the first one.
+        values: x in each frame.
+        before: y before the first frame.
         past: Weight of the past.
 
     Shape: (items, frames, n), (items, n) -> (items, frames, n).
-
-    >>> average(torch.ones(1, 3, 1), torch.zeros(1, 1), 0.5).flatten()
-    tensor([0.5000, 0.7500, 0.8750])
     """
     if past == 0.0:
         return values
@@ -46,49 +86,15 @@ def average(values: Tensor, state: Tensor, past: float) -> Tensor:
     for block in values.split(BLOCK_FRAMES, 1):
         frames = block.shape[1]
         new = constant_like(values, _weights, frames, past) @ block
-        old = constant_like(values, _powers, frames, past) * state.unsqueeze(1)
+        old = constant_like(values, _powers, frames, past) * before.unsqueeze(1)
         averages.append(new + old)
-        state = averages[-1][:, -1]
-    return averages[0] if len(averages) == 1 else torch.cat(averages, 1)
+        before = averages[-1][:, -1]
+    return _join(averages)
 
 
-def follow_peaks(
-    values: Tensor, state: Tensor, attack: float, release: float
-) -> tuple[Tensor, Tensor]:
-    """Smooth levels with one time constant where they rise and another where they fall.
-
-    This is the smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng.
-    Soc. 60(6), Equation 17: p[n] = max(x[n], release p[n - 1] + (1 - release) x[n]), y[n] = attack
-    y[n - 1] + (1 - attack) p[n]. It needs no loop over frames, because p is the largest of the
-    averages that begin at any of the frames: p = e + d, where e is the average with ``release``,
-    and d[n] = max(x[n] - e[n], release d[n - 1]).
-
-    Args:
-        values: X.
-        state: E, d and y of the frame before the first one, (items, 3, n).
-        attack: Weight of the past in a rising level, from ``decay``.
-        release: Weight of the past in a falling level.
-
-    Shape: (items, frames, n) -> (items, frames, n), and the state after the last frame.
-
-    >>> values = torch.tensor([0.0, 60.0, 0.0, 0.0]).reshape(1, 4, 1)
-    >>> levels, state = follow_peaks(values, torch.zeros(1, 3, 1), attack=0.0, release=0.9)
-    >>> levels.flatten()
-    tensor([ 0.0000, 60.0000, 54.0000, 48.6000])
-    """
-    slow_state, excess, smooth_state = state.unbind(1)
-    slow = average(values, slow_state, release)
-    blocks = []
-    for block in (values - slow).split(BLOCK_FRAMES, 1):
-        powers = constant_like(values, _powers, block.shape[1], release)
-        highest = block / powers
-        if block.shape[1] > 1:  # a stream saves the call
-            highest = _running_maximum(highest)
-        blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
-        excess = blocks[-1][:, -1]
-    peaks = slow + (blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1))
-    levels = average(peaks, smooth_state, attack)
-    return levels, torch.stack((slow[:, -1], excess, levels[:, -1]), 1)
+def _join(blocks: list[Tensor]) -> Tensor:
+    """Concatenate blocks of frames. A single block is not copied."""
+    return blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1)
 
 
 def _running_maximum(values: Tensor) -> Tensor:

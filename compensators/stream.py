@@ -1,6 +1,8 @@
-"""Streams, in which a wearable aid processes chunks of any size."""
+"""Streams, in which a wearable aid processes a signal in chunks of any size."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,18 +15,26 @@ from hlsim.checks import check_waveform
 
 
 class Stream:
-    """Process chunks of any size, without gradients. The output has the size of the chunk.
+    """An aid for a signal that arrives in chunks: a function from a chunk to the next output.
 
-    The output is delayed by ``aid.latency`` samples. The sliders of the aid, such as
-    ``noise_reduction`` and ``amplification``, are attributes that may be set at any time: they move
-    from end to end in 0.1 s, so that nothing clicks. For more than eight items, a chunk has nine
-    samples or more, because a smaller one looks like an array with time first.
+    Chunks may have any number of samples. The output has as many, and is delayed by ``aid.latency``
+    samples. It is that of the aid for the whole signal, without gradients.
+
+    Sliders of the aid, such as ``noise_reduction``, are attributes that may be set at any time.
+    They take 0.1 s from 0 to 1, so that nothing clicks. For more than eight items, a chunk needs at
+    least nine samples, because a smaller one looks like an array with time first.
 
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
 
+    Args:
+        aid: Aid at 16 kHz.
+        audiogram: Ear or ears, as in a call of the aid.
+        sliders: Values from 0 to 1 by name, one number or one value per item.
+
     Raises:
-        ValueError: As the call of the aid, or the leading dimensions change, or samples are NaN or
-            infinite, which would stay in the state. A rejected chunk changes nothing.
+        ValueError: The aid has another sample rate, or rejects the ear, a slider or a chunk; the
+            leading dimensions change; or samples are NaN or infinite, which would affect all later
+            output. After a rejected chunk, the stream goes on as if there had been none.
         AttributeError: An attribute is set that is not a slider of the aid.
 
     >>> import hlsim
@@ -37,27 +47,29 @@ class Stream:
     def __init__(self, aid: Wearable, audiogram: AudiogramLike, **sliders: Slider) -> None:
         if aid.sample_rate != RATE:
             raise ValueError(
-                f"expected a sample rate of {RATE} Hz for a stream, got {aid.sample_rate}; "
-                "resampling would look 8.5 ms farther ahead"
+                f"expected an aid with sample_rate={RATE} for a stream, got {aid.sample_rate}; "
+                "resample the signal to that rate"
             )
         as_thresholds(audiogram, consumer=type(aid).__name__)
         self._aid = aid
-        # A copy, because the caller may write into a tensor, and the ear is read with each slider.
+        # A copy, because the caller may write into a tensor, and the first chunk may come later.
         self._audiogram = audiogram.clone() if isinstance(audiogram, Tensor) else audiogram
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
-        self._previous_sliders: list[Slider] = []
         self._shape = self._batch = torch.Size()
         self._partial_hop = self._fitted = self._sliders = torch.empty(0)
         for name, slider in sliders.items():
-            items = slider.shape if isinstance(slider, Tensor) else torch.Size()
-            check_slider(name, slider, items, torch.empty(0))
             setattr(self, name, slider)
 
-    def __setattr__(self, name: str, value: Slider) -> None:
-        if not name.startswith("_") and name not in self._aid.SLIDERS:
-            sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
-            aid = type(self._aid).__name__
-            raise AttributeError(f"the stream of a {aid} has no slider {name}; it has {sliders}")
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_"):
+            if name not in self._aid.SLIDERS:
+                sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
+                aid = type(self._aid).__name__
+                raise AttributeError(
+                    f"the stream of a {aid} has no slider {name}; it has {sliders}"
+                )
+            items = value.shape if isinstance(value, Tensor) else torch.Size()
+            check_slider(name, value, items, torch.empty(0))
         super().__setattr__(name, value)
 
     def __call__(self, chunk: Tensor) -> Tensor:
@@ -84,10 +96,14 @@ class Stream:
             return output.reshape(*self._batch, -1).to(chunk.dtype)
 
     def flush(self) -> Tensor:
-        """Return the last ``latency`` samples, and begin again: the next chunk follows silence.
+        """Return the output that is still missing because of the delay, and begin again.
+
+        The next chunk is the beginning of another signal.
+
+        Shape: -> (..., latency), with the leading dimensions of the chunks.
 
         Raises:
-            ValueError: No chunk was processed.
+            ValueError: There was no chunk.
         """
         if not self._state:
             raise ValueError("expected a chunk before flush, got none")
@@ -96,47 +112,38 @@ class Stream:
         return rest
 
     def _prepare(self, chunk: Tensor) -> None:
-        """Compute the parameters for the ear from the first chunk, and update the sliders."""
+        """Fit the aid to the ears with the first chunk, and read the sliders."""
         is_first = not self._state
-        if not is_first and chunk.shape[:-1] not in (self._shape, self._batch):
+        if is_first:
+            self._shape = chunk.shape[:-1]
+            self._batch, self._fitted = self._aid.prepare(chunk, self._audiogram)
+        elif chunk.shape[:-1] not in (self._shape, self._batch):
             raise ValueError(
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
                 f"got {tuple(chunk.shape)}"
             )
-        sliders = [getattr(self, name) for name in self._aid.SLIDERS]
-        if is_first or not all(map(_is_same, sliders, self._previous_sliders)):
-            self._batch, self._fitted, self._sliders = self._aid.prepare(
-                chunk, self._audiogram, sliders
-            )
-            # These are copies, because the caller may write into a tensor.
-            self._previous_sliders = [
-                slider.clone() if isinstance(slider, Tensor) else slider for slider in sliders
-            ]
+        values = [getattr(self, name) for name in self._aid.SLIDERS]
+        self._sliders = self._aid.stack_sliders(values, self._batch, self._fitted)
         if is_first:
-            self._shape = chunk.shape[:-1]
-            self._state = self._aid.initial(self._sliders)
+            self._state = self._aid.initial_state(self._sliders)
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
 
     def _process_hops(self, samples: Tensor) -> Tensor:
-        output, self._state = self._aid.step(samples, self._fitted, self._sliders, self._state)
+        output, self._state = self._aid.process_hops(
+            samples, self._fitted, self._sliders, self._state
+        )
         return output
 
     def _process_partial_hop(self, samples: Tensor) -> Tensor:
         """Process samples that do not go beyond the end of the current hop."""
-        first = self._partial_hop.shape[-1]
-        state = self._state
+        position = self._partial_hop.shape[-1]
         self._partial_hop = torch.cat((self._partial_hop, samples), -1)
         needed = 2 * DELAY + samples.shape[-1]
-        padded = torch.cat((state["past"], self._partial_hop), -1)[:, -needed:]
-        output = self._aid.finish(apply_gains(padded, state["gains"], first))
+        padded = torch.cat((self._state["past"], self._partial_hop), -1)[:, -needed:]
+        output = self._aid.limit(apply_gains(padded, self._state["gains"], position))
         if self._partial_hop.shape[-1] == HOP:
-            after = self._aid.advance(self._partial_hop, self._fitted, self._sliders, state)
-            self._state = after | {"gains": after["gains"][:, -2:]}
+            _, self._state = self._aid.excess_gains(
+                self._partial_hop, self._fitted, self._sliders, self._state
+            )
             self._partial_hop = self._partial_hop[:, :0]
         return output
-
-
-def _is_same(new: Slider, old: Slider) -> bool:
-    if isinstance(new, Tensor):
-        return isinstance(old, Tensor) and torch.equal(new, old)
-    return new is old

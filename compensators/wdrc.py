@@ -5,44 +5,41 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from compensators.filter_bank import FRAME, level_db, shares
-from compensators.prescription import (
-    above_speech,
-    compression_ratios,
-    compressive_gains,
-    losses,
-    prescribed_gains,
-)
-from compensators.smoothing import decay, follow_peaks
+from compensators.filter_bank import band_centres, band_powers, level_db, speech_band_levels
+from compensators.nalr import nalr_gains_db
+from compensators.smoothing import follow_peaks
 from compensators.stream import Stream
 from compensators.wearable import State, Wearable
-from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.audiogram.thresholds import AudiogramLike, interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
 from hlsim.torchtools import constant_like
 
 
 class WDRC(Wearable):
-    """Amplify average speech by NAL-R's gains, louder bands less and softer bands more.
+    """A hearing aid that amplifies loud sounds less than soft ones, without trained parameters.
 
-    The level of a band, in frames of 16 ms, rises with ``attack`` and falls with ``release``. Above
-    the knee, the input level rises by ``ratio`` dB for each dB of the output level; the ratio is 1
-    up to 10 dB HL, rises by 1 per 40 dB, and is 3 at most.
+    Each band of average speech at 65 dB SPL gets the gain that NAL-R prescribes. The gain falls
+    where the band is louder, and rises where it is softer: the output changes by 1 dB if the input
+    changes by ``ratio`` dB. The ratio is 1 up to a loss of 10 dB HL, rises by 1 per 40 dB of loss,
+    and is 3 at most. The delay is 4 ms.
 
     Args:
-        sample_rate: Sample rate in Hz, as in ``Wearable``.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
-        bands: Number of bands, an equal number of ERBs but at least 125 Hz apart, 4 to 40.
-        attack: Time constant in seconds, 0 to 1.
-        release: Time constant in seconds, 0.01 to 2.
-        knee: Knee of the compression in dB below the level of average speech at 65 dB SPL in the
-            band.
-        limit_spl: Peak of the output in dB SPL that no sample exceeds, and beyond which no band is
-            amplified.
-        linked: Link the gains of two ears, as in ``Wearable``.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        bands: Number of bands, 4 to 40. Their centres are an equal number of ERBs (bandwidths of
+            the normal ear), but at least 125 Hz, apart.
+        attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
+        release: Time constant in seconds with which it falls, 0.01 to 2.
+        knee: Distance in dB, 0 to 60, below average speech at which softer sounds stop to get more
+            gain.
+        limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds. A band is not
+            amplified beyond this level.
+        linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
+            in level between them stay if their audiograms are equal.
 
     Raises:
-        ValueError: A value out of range.
+        ValueError: A value is out of range.
 
     >>> import hlsim
     >>> WDRC()(hlsim.example_speech(), "N3").shape
@@ -74,41 +71,55 @@ class WDRC(Wearable):
         self.limit_spl = limit_spl
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the output for a whole signal, time-aligned.
+        """Return the output for a whole signal, time-aligned with the input.
 
         Args:
             waveform: Input of the aid.
-            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the waveform.
 
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: No audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes
+                do not fit.
         """
-        return self.process(waveform, audiogram, ())
+        return self._process(waveform, audiogram, ())
 
     def stream(self, audiogram: AudiogramLike) -> Stream:
-        """Return a stream, which gives the same output for chunks of any size.
+        """Return a function that processes a signal in chunks of any size, as it arrives.
+
+        The output is that for the whole signal, ``latency`` samples late.
+
+        Args:
+            audiogram: Ear or ears.
 
         Raises:
-            ValueError: The sample rate is not 16000 Hz.
+            ValueError: The sample rate is not 16000 Hz, or the audiogram is not valid.
         """
         return Stream(self, audiogram)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        loss = losses(thresholds, self.bands)
-        return torch.cat((prescribed_gains(thresholds, self.bands), compression_ratios(loss)), -1)
+        """Return the prescribed gain in dB and the ratio of each band. Shape as in ``Wearable``."""
+        centres = band_centres(self.bands)
+        prescribed = interpolate(nalr_gains_db(thresholds), centres)
+        loss = interpolate(thresholds, centres)
+        ratios = 1.0 + ((loss - 10.0) / 40.0).clamp(0.0, 2.0)
+        return torch.cat((prescribed, ratios), -1)
 
-    def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
-        return {"levels": like.new_zeros(items, 3, self.bands)}
+    def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
+        levels = sliders.new_zeros(len(sliders), 3, self.bands)
+        return super().initial_state(sliders) | {"levels": levels}
 
-    def control(
+    def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        levels = level_db(powers @ constant_like(powers, shares, self.bands, FRAME))
-        attack, release = decay(self.attack), decay(self.release)
-        levels, level_state = follow_peaks(levels, state["levels"], attack, release)
+        levels, memory = follow_peaks(
+            level_db(band_powers(powers, self.bands)), state["levels"], self.attack, self.release
+        )
+        above_speech = levels - constant_like(levels, speech_band_levels, self.bands)
         prescribed, ratios = fitted.chunk(2, -1)
-        gains = compressive_gains(above_speech(levels), prescribed, ratios, -self.knee)
-        highest = (self.limit_spl - levels).clamp_min(0.0)
-        return torch.minimum(gains, highest), {"levels": level_state}
+        slope = (1.0 / ratios - 1.0).unsqueeze(1)
+        gains = prescribed.unsqueeze(1) + slope * above_speech.clamp_min(-self.knee)
+        highest_gains = (self.limit_spl - levels).clamp_min(0.0)
+        return torch.minimum(gains.clamp_min(0.0), highest_gains), {"levels": memory}

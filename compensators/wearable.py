@@ -1,4 +1,16 @@
-"""Base class of wearable aids, which amplify bands with a delay of 4 ms."""
+"""Base class of the wearable aids: hearing aids with a gain per band and a delay of 4 ms.
+
+Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms of its input (a
+*frame*). Terms of all methods:
+
+- An *item* is one signal for one ear. Methods with ``samples`` take all items of a call as rows,
+  (items, time), in pascals at 16 kHz.
+- ``fitted`` (items, n) holds the parameters that ``fit`` computes once from the audiogram.
+- A *slider* is a setting from 0 to 1 that may change meanwhile, such as ``noise_reduction``.
+- The *state* is all that an aid remembers from one hop to the next: tensors (items, ...) by name,
+  such as earlier samples and smoothed levels. Methods take the state and return the next one. The
+  aid itself stores none, so that whole signals, streams and exported programs run the same code.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +28,7 @@ from compensators.filter_bank import (
     frame_power,
     gain_at_rate,
 )
-from compensators.gains import measure_gains
+from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import (
@@ -25,16 +37,17 @@ from hlsim.audiogram.thresholds import (
     resolve_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform, describe
+from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform
 from hlsim.dsp.resample import resample
 
 Slider = float | Tensor
+"""Value of a slider, 0 to 1: one number, or one value per item."""
 
 State = Mapping[str, Tensor]
-"""Tensors that are carried from hop to hop, by name, (items, ...) each."""
+"""Tensors that an aid remembers from one hop to the next, by name, (items, ...) each."""
 
 SLIDER_STEP = 0.04
-"""Largest change of a slider per hop: 0.1 s from end to end."""
+"""Largest change of a slider per hop, so that the way from 0 to 1 takes 0.1 s."""
 
 BLOCK_SAMPLES = 320_000
 """Samples of all items that are processed together, which limits memory and changes no output."""
@@ -43,28 +56,33 @@ RESAMPLER_LOOKAHEAD = 136
 """Samples at 16 kHz by which resampling to 16 kHz and back looks ahead."""
 
 
-class Wearable(nn.Module):
-    """An aid with gains in bands.
+class Wearable(MeasuredAid):
+    """Base class of hearing aids that amplify bands with a delay of 4 ms.
 
-    Subclasses have ``SLIDERS`` with ``DEFAULT_SLIDERS``, ``fit``, ``start`` and ``control``.
+    The signal is divided into bands, which are multiplied by their gains and added up again. This
+    delays it by 64 samples at 16 kHz. The gain of a band is computed from the spectrum of the last
+    16 ms, every 4 ms, and goes on a straight line between these values.
 
-    A direct path splits the signal into bands that sum to the signal with a delay of 4 ms,
-    multiplies each band by its gain, and adds them. The gains come from frames of 16 ms every 4 ms
-    that end where the direct path is. The output, aligned with the input, therefore has a
-    look-ahead of ``DELAY`` samples. The gains go linearly from frame to frame. Whole signals and
-    streams run the same ``step``.
+    Subclasses define ``bands``, ``limit_spl``, ``fit`` and ``compute_gains``; if they have sliders,
+    ``SLIDERS`` with ``DEFAULT_SLIDERS``; and if their gains depend on the past, ``initial_state``.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
-            kHz; components above get the gain of the highest band. Other rates than 16000 are
-            supported for whole signals only, and resampling adds 8.5 ms of look-ahead.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
-        linked: For two ears, (..., 2, time), set the gains of both ears by their mean power, so
-            that differences in level between ears with the same fitting stay. The limit of the
-            output is that of each ear.
+            kHz; components above get the gain of the highest band. Streams need 16000 Hz. For whole
+            signals at other rates, resampling adds 8.5 ms of look-ahead.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
+            in level between them stay if their audiograms are equal. The limit of the output is
+            that of each ear.
+
+    Attributes:
+        SLIDERS: Names of the sliders.
+        DEFAULT_SLIDERS: Their default values.
+        bands: Number of bands.
+        limit_spl: Peak of the output in dB SPL.
 
     Raises:
-        ValueError: A rate or level out of range; in a call with ``linked``, another shape.
+        ValueError: A rate or level is out of range.
 
     >>> from compensators import WDRC
     >>> aid = WDRC()
@@ -85,90 +103,120 @@ class Wearable(nn.Module):
 
     @property
     def latency(self) -> int:
-        """Look-ahead of the aligned output in samples, which is the delay of a stream."""
+        """Delay of a stream in samples, and look-ahead of the output for a whole signal."""
         if self.sample_rate == RATE:
             return DELAY
         return -(-(DELAY + RESAMPLER_LOOKAHEAD) * self.sample_rate // RATE)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Compute the parameters of ``control`` for ears. Shape: (items, 8) dB HL -> (items, n)."""
-        raise NotImplementedError
+        """Compute the parameters of the aid for each ear, such as the prescribed gains.
 
-    def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
-        """Return the state of ``control`` after silence, of the type and device of a tensor."""
-        raise NotImplementedError
-
-    def control(
-        self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute each band's gain in dB at the end of each frame, and the state after the last.
-
-        Args:
-            powers: Result of ``frame_power``.
-            fitted: Result of ``fit``.
-            sliders: Values of the sliders in each frame.
-            state: State before the first frame.
-
-        Shape: (items, frames, FRAME / 2 + 1), (items, n), (items, frames, sliders)
-            -> (items, frames, bands).
+        Shape: (items, 8) in dB HL -> (items, n).
         """
         raise NotImplementedError
 
-    def initial(self, sliders: Tensor) -> dict[str, Tensor]:
-        """Return the state after silence. Shape: (items, sliders) -> (items, ...) each."""
-        items = len(sliders)
-        past = sliders.new_zeros(items, HISTORY)
-        gains = sliders.new_zeros(items, 2, self.bands)
-        return {"past": past, "gains": gains, "gliding": sliders, **self.start(items, sliders)}
+    def compute_gains(
+        self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the gain of each band at the end of each frame.
 
-    def advance(
+        Args:
+            powers: Power spectrum of each frame from ``frame_power``.
+            fitted: Parameters from ``fit``.
+            sliders: Values of the sliders in each frame.
+            state: State before the first frame.
+
+        Returns:
+            The gains in dB, and the entries of the state that the subclass needs, after the last
+            frame.
+
+        Shape: (items, frames, FRAME / 2 + 1), (items, n), (items, frames, sliders) -> (items,
+            frames, bands).
+        """
+        raise NotImplementedError
+
+    def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
+        """Return the state before the first hop, which is that after silence.
+
+        Args:
+            sliders: Values of the sliders at the beginning. Shape: (items, sliders).
+
+        Returns: Tensors by name, (items, ...) each, of the type and device of ``sliders``.
+        """
+        past = sliders.new_zeros(len(sliders), HISTORY)
+        gains = sliders.new_zeros(len(sliders), 2, self.bands)
+        return {"past": past, "gains": gains, "gliding": sliders}
+
+    def excess_gains(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> dict[str, Tensor]:
-        """Process a whole number of hops, and return the new state.
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the gains of whole hops of the input.
 
-        Its entry ``gains`` contains the gains of all these hops, not only of the last one.
+        The filters delay the signal by one hop, so the output of these hops needs gains from one
+        hop earlier on.
 
-        Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders), where n is the number
-            of parameters that are fitted to an ear.
+        Args:
+            samples: Input in pascals.
+            fitted: Parameters from ``fit``.
+            sliders: Values to which the sliders move.
+            state: State before the first hop.
+
+        Returns:
+            Linear gains minus 1 at the end of each hop, after those at the ends of the two hops
+            before, and the state after the last hop.
+
+        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, 2 + hops, bands).
         """
         padded = torch.cat((state["past"], samples), -1)
         powers = frame_power(padded)
         if self.linked:
             powers = powers.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0)
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
-        gains_db, control_state = self.control(powers, fitted, gliding, state)
+        gains_db, changed_state = self.compute_gains(powers, fitted, gliding, state)
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
-        common = {"past": padded[:, -HISTORY:], "gains": gains, "gliding": gliding[:, -1]}
-        return common | control_state
+        state = {"past": padded[:, -HISTORY:], "gains": gains[:, -2:], "gliding": gliding[:, -1]}
+        return gains, state | changed_state
 
-    def step(
+    def process_hops(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the output for whole hops, ``DELAY`` samples late, and the state after them.
+        """Process whole hops of the input.
 
-        Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders) -> (items, hops * HOP).
+        Args:
+            samples: Input in pascals.
+            fitted: Parameters from ``fit``.
+            sliders: Values to which the sliders move.
+            state: State before the first hop.
+
+        Returns:
+            The output in pascals, 64 samples late, and the state after the last hop.
+
+        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, hops * HOP).
         """
-        output, _, after = self._amplify(samples, fitted, sliders, state)
-        return self.finish(output), after
+        output, _, state = self._amplify(samples, fitted, sliders, state)
+        return self.limit(output), state
 
     def _amplify(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Return the output of ``step`` before the limit, the highest gains minus 1, and the state.
+        """Return the output of ``process_hops`` before the limit, excess gains, and the state.
 
-        Shape: as ``step`` -> (items, hops * HOP), (items, hops).
+        The gains are those of the highest band at the end of each hop, (items, hops).
         """
-        after = self.advance(samples, fitted, sliders, state)
-        gains = after["gains"]
+        gains, next_state = self.excess_gains(samples, fitted, sliders, state)
         padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
-        output = apply_gains(padded, gains[:, :-1])
-        return output, gains[:, 2:, -1], after | {"gains": gains[:, -2:]}
+        return apply_gains(padded, gains[:, :-1]), gains[:, 2:, -1], next_state
 
-    def finish(self, samples: Tensor) -> Tensor:
-        """Apply the limit of the output to samples in pascals. Any shape."""
+    def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
+        sliders = noise.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
+        sliders = sliders.expand(len(noise), -1)
+        return self._amplify(noise, self.fit(ears), sliders, self.initial_state(sliders))[0]
+
+    def limit(self, samples: Tensor) -> Tensor:
+        """Limit the peak of the output. Any shape, in pascals."""
         return soft_limit(samples, 10.0 ** ((self.limit_spl - PASCAL_SPL) / 20.0))
 
-    def process(
+    def _process(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
     ) -> Tensor:
         """Return the time-aligned output for whole signals.
@@ -182,12 +230,13 @@ class Wearable(nn.Module):
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         with torch.autocast(waveform.device.type, enabled=False):
-            batch, fitted, settings = self.prepare(waveform, audiogram, sliders)
+            batch, fitted = self.prepare(waveform, audiogram)
+            settings = self.stack_sliders(sliders, batch, fitted)
             time = waveform.shape[-1]
             gain = gain_to_pascals(self.full_scale_spl)
             signals = waveform.to(fitted.dtype).expand(*batch, -1).reshape(-1, time) * gain
             low = resample(signals, self.sample_rate, RATE)
-            state = self.initial(settings)
+            state = self.initial_state(settings)
             outputs = []
             highest_gains = [low.new_zeros(len(low), 1)]
             low_time = low.shape[-1]
@@ -203,57 +252,53 @@ class Wearable(nn.Module):
                 above_8_khz = signals - resample(low, RATE, self.sample_rate)[:, :time]
                 gains = gain_at_rate(torch.cat(highest_gains, -1), self.sample_rate, time)
                 result = result[:, :time] + (1.0 + gains) * above_8_khz
-            result = self.finish(result)
+            result = self.limit(result)
             return (result / gain).reshape(*batch, time).to(waveform.dtype)
 
     def prepare(
-        self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
-    ) -> tuple[torch.Size, Tensor, Tensor]:
-        """Return the common leading dimensions, the result of ``fit``, and the sliders.
-
-        Shape: (..., time), (..., 8), (...) each -> (...), (items, n), (items, sliders).
-        """
-        thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
-        own_dtype = next((weight.dtype for weight in self.parameters()), waveform.dtype)
-        dtype = torch.promote_types(own_dtype, torch.float32)
-        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
-        if self.linked:
-            check_two_channels(waveform)
-        settings = [
-            check_slider(name, slider, batch, thresholds)
-            for name, slider in zip(self.SLIDERS, sliders, strict=True)
-        ]
-        ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        stacked = torch.stack(settings, -1) if settings else ears.new_zeros(*batch, 0)
-        return batch, self.fit(ears), stacked.to(dtype).reshape(len(ears), -1)
-
-    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
-        """Measure the insertion gains for noise with the spectrum of average speech.
-
-        Noise reduction is off, and the limit of the output does not count.
+        self, waveform: Tensor, audiogram: AudiogramLike | None
+    ) -> tuple[torch.Size, Tensor]:
+        """Validate the arguments of a call, and fit the aid to the ear of each item.
 
         Args:
-            audiogram: One or more ears.
-            level: Presentation level in dB SPL, 0 to 120.
+            waveform: Input of the aid, (..., time).
+            audiogram: One ear, or ears whose shape (..., 8) broadcasts over the leading dimensions.
 
         Returns:
-            Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
+            The common leading dimensions of waveform and ears, whose product is the number of
+            items, and the parameters from ``fit``, (items, n).
 
         Raises:
-            ValueError: An ear or the level is not valid.
-
-        >>> from compensators import WDRC
-        >>> WDRC().gains("N3", level=65.0).round()
-        tensor([ 1.,  8., 18., 20., 21., 22., 23., 24.])
+            ValueError: An ear is not valid, or shapes do not fit.
         """
+        thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
+        if self.linked:
+            check_two_channels(waveform)
+        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
+        own_dtype = next((weight.dtype for weight in self.parameters()), waveform.dtype)
+        ears = thresholds.to(torch.promote_types(own_dtype, torch.float32))
+        return batch, self.fit(ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES)))
 
-        def amplify(noise: Tensor, ears: Tensor) -> Tensor:
-            sliders = noise.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
-            sliders = sliders.expand(len(noise), -1)
-            return self._amplify(noise, self.fit(ears), sliders, self.initial(sliders))[0]
+    def stack_sliders(self, sliders: Sequence[Slider], batch: torch.Size, like: Tensor) -> Tensor:
+        """Convert the sliders of a call to one row per item.
 
-        weight = next(self.parameters(), torch.empty(0))
-        return measure_gains(amplify, audiogram, level, weight.dtype, weight.device)
+        Args:
+            sliders: Value of each slider in the order of ``SLIDERS``.
+            batch: Leading dimensions of the call.
+            like: Tensor whose type and device the result has.
+
+        Returns: Values from 0 to 1, (items, sliders).
+
+        Raises:
+            ValueError: A value is outside 0 to 1, or a shape does not broadcast to ``batch``.
+        """
+        values = [
+            check_slider(name, slider, batch, like)
+            for name, slider in zip(self.SLIDERS, sliders, strict=True)
+        ]
+        if not values:
+            return like.new_zeros(batch.numel(), 0)
+        return torch.stack(values, -1).reshape(-1, len(values))
 
     def extra_repr(self) -> str:
         return (
@@ -263,19 +308,19 @@ class Wearable(nn.Module):
 
 
 def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> Tensor:
-    """Return a slider as a tensor with one value per item, of the type of another tensor.
+    """Return the value of a slider for each item.
 
-    The values of a tensor on a GPU are not read, because the host would wait for the GPU. Those
-    that are out of range become NaN.
+    Values on a GPU are not read, because the host would wait for the GPU. Those that are out of
+    range become NaN instead of raising an error.
 
     Args:
         name: Name of the slider, for messages.
-        slider: Number or tensor from 0 to 1.
-        batch: Shape of the result, to which a tensor has to broadcast.
-        like: Tensor with the type and the device of the result.
+        slider: Number from 0 to 1, or a tensor that broadcasts to ``batch``.
+        batch: Shape of the result, the leading dimensions of a call.
+        like: Tensor whose type and device the result has.
 
     Raises:
-        ValueError: Values outside 0 to 1, or a shape that does not broadcast over the items.
+        ValueError: A value is outside 0 to 1, or the shape does not broadcast.
 
     >>> check_slider("amplification", 0.5, torch.Size([2]), torch.empty(0))
     tensor([0.5000, 0.5000])
@@ -283,14 +328,13 @@ def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> 
     if not isinstance(slider, Tensor):
         check_number(name, slider, 0.0, 1.0)
         return like.new_full(batch, float(slider))
-    if slider.is_complex():
-        raise ValueError(f"expected {name} from 0 to 1, got {describe(slider)}")
-    values = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
-    in_range = (slider >= 0.0) & (slider <= 1.0)
-    if slider.device.type != "cpu":
-        values = torch.where(in_range, values, torch.nan)
-    elif not bool(in_range.all()):
+    is_on_cpu = slider.device.type == "cpu"
+    in_range = None if slider.is_complex() else (slider >= 0.0) & (slider <= 1.0)
+    if in_range is None or (is_on_cpu and not bool(in_range.all())):
         raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
+    values = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
+    if not is_on_cpu:
+        values = torch.where(in_range, values, torch.nan)
     try:
         return values.expand(batch)
     except RuntimeError:
@@ -300,12 +344,12 @@ def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> 
         ) from None
 
 
-def _glide(now: Tensor, target: Tensor, frames: int) -> Tensor:
-    """Move sliders gradually to new values, because a jump would click.
+def _glide(start: Tensor, target: Tensor, frames: int) -> Tensor:
+    """Return the sliders in each frame on their way to new values, because a jump would click.
 
-    Shape: (items, n) twice -> (items, frames, n).
+    Shape: (items, sliders) twice -> (items, frames, sliders).
     """
-    steps = torch.arange(1, frames + 1, dtype=now.dtype, device=now.device)
+    steps = torch.arange(1, frames + 1, dtype=start.dtype, device=start.device)
     limit = SLIDER_STEP * steps.unsqueeze(-1)
-    distance = (target - now).unsqueeze(1)
-    return now.unsqueeze(1) + torch.minimum(torch.maximum(distance, -limit), limit)
+    distance = (target - start).unsqueeze(1)
+    return start.unsqueeze(1) + torch.minimum(torch.maximum(distance, -limit), limit)

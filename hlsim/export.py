@@ -98,7 +98,7 @@ class _FitCall(nn.Module):
 
 
 class _HopCall(nn.Module):
-    """``Wearable.step`` as a module with named inputs and outputs."""
+    """``Wearable.process_hops`` as a module with named inputs and outputs."""
 
     def __init__(self, aid: Wearable) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class _HopCall(nn.Module):
         empty = inputs["samples"][:, :0]
         sliders = inputs.get("sliders", empty)
         state = {"gliding": empty} | inputs  # An aid without sliders has no such state.
-        output, next_state = self.aid.step(samples, inputs["fitted"], sliders, state)
+        output, next_state = self.aid.process_hops(samples, inputs["fitted"], sliders, state)
         names = [name for name in inputs if name not in STATELESS_INPUTS]
         return {"output": output / gain} | {f"next_{name}": next_state[name] for name in names}
 
@@ -213,12 +213,13 @@ def first_inputs(
     values = [sliders.get(name, default) for name, default in defaults]
     with torch.no_grad():
         samples = weight.new_zeros(items, hops * HOP)
-        _, fitted, settings = aid.prepare(samples, audiogram, values)
+        batch, fitted = aid.prepare(samples, audiogram)
+        settings = aid.stack_sliders(values, batch, fitted)
         inputs = {
             "samples": samples,
             "fitted": fitted,
             "sliders": settings,
-            **aid.initial(settings),
+            **aid.initial_state(settings),
         }
     # Copies, because torch.export would merge two inputs that are the same tensor.
     return {name: tensor.clone() for name, tensor in inputs.items() if tensor.numel()}

@@ -16,7 +16,6 @@ MODULES = [
     "compensators.loading",
     "compensators.mapping",
     "compensators.nalr",
-    "compensators.prescription",
     "compensators.smoothing",
     "compensators.stream",
     "compensators.wdrc",

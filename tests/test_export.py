@@ -69,7 +69,7 @@ def test_a_program_of_hops_gives_the_outputs_of_the_stream(name: str) -> None:
     aid: Any = build_wearable(name, full_scale_spl=110.0)
     ears = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
     inputs, stream, outputs, expected = first_inputs(aid, ears, items=2), aid.stream(ears), [], []
-    assert not aid.SLIDERS or set(inputs) >= set(aid.initial(torch.ones(2, 2)))
+    assert not aid.SLIDERS or set(inputs) >= set(aid.initial_state(torch.ones(2, 2)))
     program = hop_program(aid, items=2).module()
     for number, samples in enumerate((0.005 * torch.randn(2, 6400)).split(64, -1)):
         if number == 40 and aid.SLIDERS:

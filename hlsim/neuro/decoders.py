@@ -1,4 +1,10 @@
-"""Decoders that turn feature maps into factors on the magnitude and shifts of the phase."""
+"""Decoders: they turn the feature maps of a network into factors on a spectrogram.
+
+A spectrogram has the shape (items, time, frequency). Feature maps are coarser: (items, channels,
+time / stride[0], frequency / stride[1]), rounded up. A decoder computes a patch of stride[0] by
+stride[1] points of the spectrogram from each of their points. ``size`` is the number of frames and
+frequencies to which the patches are cut.
+"""
 
 from typing import Any
 
@@ -12,27 +18,27 @@ EPS_SQUARE = 1e-8
 
 
 class Decoder(nn.Module):
-    """Decoder from feature maps to the grid of a spectrum, whose output is 0 before training.
+    """Decoder from feature maps to values at each point of a spectrogram.
 
-    Each point of the feature maps becomes a patch of ``stride`` points.
+    Before training, all values are 0.
 
-    Shape: (items, channels, time / stride, frequency / stride) -> (items, outputs, time,
+    Shape: (items, channels, time / stride[0], frequency / stride[1]) -> (items, outputs, time,
         frequency).
 
     Args:
         channels: Number of channels of the feature maps.
-        outputs: Number of values per point of the spectrum.
-        depth: Number of convolutions of the dense block.
-        stride: Time and frequency steps of the encoder, which the decoder undoes.
-        normalise: Normalise the features in the dense block.
+        depth: Number of convolutions before the last layer.
+        stride: Frames and frequencies of the spectrogram per point of the feature maps.
+        outputs: Number of values per point of the spectrogram.
+        normalise: Normalise the output of each convolution per item and channel.
 
-    >>> decoder = Decoder(8, 1, depth=0, stride=(4, 3), normalise=False)
+    >>> decoder = Decoder(8, depth=0, stride=(4, 3), outputs=1, normalise=False)
     >>> decoder(torch.randn(2, 8, 5, 22), (20, 65)).shape
     torch.Size([2, 1, 20, 65])
     """
 
     def __init__(
-        self, channels: int, outputs: int, depth: int, stride: tuple[int, int], normalise: bool
+        self, channels: int, depth: int, stride: tuple[int, int], outputs: int, normalise: bool
     ) -> None:
         super().__init__()
         self.stride = stride
@@ -42,7 +48,7 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.leave.bias)
 
     def forward(self, features: Tensor, size: tuple[int, int]) -> Tensor:
-        """Decode feature maps to a grid of the given time and frequency size."""
+        """Decode feature maps to a spectrogram with a number of frames and frequencies."""
         patches = self.leave(self.dense(features).permute(0, 2, 3, 1))
         # (items, time, frequency, outputs * steps) -> (items, outputs, time, step, frequency, step)
         grid = patches.unflatten(-1, (-1, *self.stride)).permute(0, 3, 1, 4, 2, 5)
@@ -50,14 +56,18 @@ class Decoder(nn.Module):
 
 
 class MaskDecoder(Decoder):
-    """Decoder of the logarithm of a factor on the magnitude.
+    """Decoder of a mask, the factor by which a network multiplies the magnitude of a spectrogram.
 
     Args:
-        recruiting: Decode two maps a and b, and return a x + b, where x is the exponent of
-            recruitment at each frequency. The effect of an error of the envelope is proportional to
-            it. Otherwise decode one map.
+        channels: Number of channels of the feature maps.
+        depth: Number of convolutions before the last layer.
+        stride: Frames and frequencies of the spectrogram per point of the feature maps.
+        normalise: Normalise the output of each convolution per item and channel.
+        recruiting: Add a term in proportion to the recruitment of the ear, as errors of the prior's
+            envelope are: the log mask is a x + b, where a and b are decoded and x is the exponent
+            of recruitment at each frequency. Otherwise it is b.
 
-    >>> decoder = MaskDecoder(8, 0, (4, 3), normalise=False, recruiting=True)
+    >>> decoder = MaskDecoder(8, depth=0, stride=(4, 3), normalise=False, recruiting=True)
     >>> decoder.log_mask(torch.randn(2, 8, 5, 22), (20, 65), torch.ones(2, 65)).shape
     torch.Size([2, 20, 65])
     """
@@ -65,18 +75,20 @@ class MaskDecoder(Decoder):
     def __init__(
         self, channels: int, depth: int, stride: tuple[int, int], normalise: bool, recruiting: bool
     ) -> None:
-        super().__init__(channels, 2 if recruiting else 1, depth, stride, normalise)
+        super().__init__(channels, depth, stride, 2 if recruiting else 1, normalise)
         self.recruiting = recruiting
 
     def log_mask(self, features: Tensor, size: tuple[int, int], exponents: Tensor) -> Tensor:
-        """Decode the logarithm of the factor.
+        """Decode the natural logarithm of the mask.
 
-        Shape: (items, channels, time / stride, frequency / stride), (items, frequency) -> (items,
-            time, frequency).
+        Shape: (items, channels, time / stride[0], frequency / stride[1]), (items, frequency) ->
+            (items, time, frequency).
 
         Args:
-            size: Number of frames and frequencies of the spectrum.
-            exponents: Exponent of recruitment at each frequency.
+            features: Feature maps.
+            size: Number of frames and frequencies of the spectrogram.
+            exponents: Exponent of recruitment at each frequency, 0 for an ear without a loss. An
+                ear with exponent x perceives a rise of 1 dB as one of 1 + x dB.
         """
         maps = self(features, size).to(exponents.dtype)
         if not self.recruiting:
@@ -85,27 +97,34 @@ class MaskDecoder(Decoder):
 
 
 class PhaseDecoder(Decoder):
-    """Decoder of a phase shift, the angle of 1 + x + j y for two maps x and y.
+    """Decoder of the shift of the phase at each point of a spectrogram.
 
-    The paper's decoder predicts phase shifts, too.
+    The shift is the angle of 1 + x + j y for two decoded values x and y.
 
-    >>> decoder = PhaseDecoder(8, 0, (4, 3), normalise=False)
+    Args:
+        channels: Number of channels of the feature maps.
+        depth: Number of convolutions before the last layer.
+        stride: Frames and frequencies of the spectrogram per point of the feature maps.
+        normalise: Normalise the output of each convolution per item and channel.
+
+    >>> decoder = PhaseDecoder(8, depth=0, stride=(4, 3), normalise=False)
     >>> decoder.factor(torch.randn(2, 8, 5, 22), (20, 65), torch.zeros(2, 20, 65)).shape
     torch.Size([2, 20, 65])
     """
 
     def __init__(self, channels: int, depth: int, stride: tuple[int, int], normalise: bool) -> None:
-        super().__init__(channels, 2, depth, stride, normalise)
+        super().__init__(channels, depth, stride, 2, normalise)
 
     def factor(self, features: Tensor, size: tuple[int, int], log_gain: Tensor) -> Tensor:
-        """Decode a complex factor exp(log gain + j shift).
+        """Decode the shift, and return the complex factor exp(log gain + j shift).
 
-        Shape: (items, channels, time / stride, frequency / stride), (items, time, frequency) ->
-            complex (items, time, frequency).
+        Shape: (items, channels, time / stride[0], frequency / stride[1]), (items, time, frequency)
+            -> complex (items, time, frequency).
 
         Args:
-            size: Number of frames and frequencies of the spectrum.
-            log_gain: Logarithm of the factor's magnitude.
+            features: Feature maps.
+            size: Number of frames and frequencies of the spectrogram.
+            log_gain: Natural logarithm of the factor's magnitude.
         """
         # Autocast may return maps of lower precision than that of the weights.
         maps = self(features, size).to(self.leave.weight.dtype)

@@ -6,12 +6,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from compensators.filter_bank import FRAME, HISTORY, HOP, frame_power, shares
+from compensators.filter_bank import HISTORY, HOP, band_powers, frame_power
 from compensators.hearing_aid import HearingAid
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.metrics.score_loss import score_loss
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.torchtools import constant_like
 
 POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
 """Power in Pa^2 (0 dB SPL) that is added to speech and noise, so that silence is not attenuated."""
@@ -49,8 +48,7 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
     with torch.no_grad():
         parts = torch.stack((clean, signal - clean))
         frames = frame_power(functional.pad(parts, (HISTORY, 0)).flatten(0, 1))
-        band_shares = constant_like(parts, shares, aid.bands, FRAME)
-        speech, noise = (frames @ band_shares).chunk(2)
+        speech, noise = band_powers(frames, aid.bands).chunk(2)
         wiener = ((speech + POWER_FLOOR) / (speech + noise + POWER_FLOOR)).sqrt()
         lowest_gain = 10.0 ** (-aid.config.reduction_db / 20.0)
         target = (wiener**WIENER_EXPONENT).clamp_min(lowest_gain)[:, GAIN_DELAY:]

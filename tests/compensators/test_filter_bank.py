@@ -6,18 +6,18 @@ import torch
 
 from compensators.filter_bank import (
     DELAY,
-    FRAME,
     HISTORY,
     HOP,
+    _band_shares,
+    _filter_taps,
     apply_gains,
-    centres,
-    filters,
+    band_centres,
+    band_powers,
     frame_power,
     level_db,
-    shares,
-    speech_levels,
+    speech_band_levels,
 )
-from compensators.smoothing import average, decay, follow_peaks
+from compensators.smoothing import _average, _weight_of_past, follow_peaks
 from hlsim.calibration import set_level
 from tests.compensators.aids import tone
 
@@ -26,27 +26,27 @@ from tests.compensators.aids import tone
 def test_filters_sum_to_a_delay(count: int) -> None:
     impulse = np.zeros(2 * DELAY + 1)
     impulse[DELAY] = 1.0
-    assert np.abs(filters(count).sum(0) - impulse).max() < 1e-12
-    assert np.allclose(filters(count), filters(count)[:, ::-1])  # linear phase
-    assert np.allclose(shares(count, 512).sum(1), 1.0)
-    assert centres(count)[0] == 0.0
-    assert centres(count)[-1] == pytest.approx(8000.0, abs=1.0)
-    assert (np.diff(centres(count))[:-1] > 124.9).all()
+    assert np.abs(_filter_taps(count).sum(0) - impulse).max() < 1e-12
+    assert np.allclose(_filter_taps(count), _filter_taps(count)[:, ::-1])  # linear phase
+    assert np.allclose(_band_shares(count, 512).sum(1), 1.0)
+    assert band_centres(count)[0] == 0.0
+    assert band_centres(count)[-1] == pytest.approx(8000.0, abs=1.0)
+    assert (np.diff(band_centres(count))[:-1] > 124.9).all()
 
 
 def test_levels_are_in_db_spl() -> None:
     for hertz in (250.0, 1000.0, 3001.0):
         powers = frame_power(tone(hertz, 65.0)[None, : HISTORY + 200 * HOP])
         assert (level_db(powers.sum(-1)) - 65.0).abs().max() < 0.3
-        bands = level_db(powers @ torch.tensor(shares(20, FRAME), dtype=torch.float32)).mean((0, 1))
-        assert abs(centres(20)[int(bands.argmax())] - hertz) < 260.0
+        bands = level_db(band_powers(powers, 20)).mean((0, 1))
+        assert abs(band_centres(20)[int(bands.argmax())] - hertz) < 260.0
     noise = set_level(torch.randn(1, HISTORY + 400 * HOP), 50.0)
     assert float(level_db(frame_power(noise).sum(-1).mean())) == pytest.approx(50.0, abs=0.3)
     assert float(level_db(torch.zeros(1))) == pytest.approx(0.0, abs=1e-4)
 
 
 def test_average_speech_has_its_level_and_falls_with_frequency() -> None:
-    levels = torch.tensor(speech_levels(20))
+    levels = torch.tensor(speech_band_levels(20))
     total = 10.0 * torch.log10((10.0 ** (levels / 10.0)).sum())
     assert float(total) == pytest.approx(65.0, abs=1e-4)
     assert int(levels.argmax()) in (1, 2, 3, 4)
@@ -57,7 +57,7 @@ def test_gains_equal_a_sum_in_float64() -> None:
     signal, gains = torch.randn(2, 2 * DELAY + 3 * HOP), torch.randn(2, 4, 20)
     time = (np.arange(3 * HOP) + 1) / HOP
     expected = signal[:, DELAY : DELAY + 3 * HOP].double().numpy()
-    for band, taps in enumerate(filters(20)):
+    for band, taps in enumerate(_filter_taps(20)):
         for item in range(2):
             path = np.interp(time, np.arange(4), gains[item, :, band].double().numpy())
             expected[item] += np.convolve(signal[item].double().numpy(), taps, "valid") * path
@@ -74,7 +74,7 @@ def test_gains_of_1_change_nothing() -> None:
 @pytest.mark.parametrize("past", [0.0, 0.3, 0.96])
 def test_the_average_equals_its_recursion(past: float) -> None:
     values, expected = torch.randn(2, 300, 3), torch.randn(2, 3)
-    averages = average(values, expected, past)
+    averages = _average(values, expected, past)
     for frame in range(300):
         expected = past * expected + (1.0 - past) * values[:, frame]
         assert (averages[:, frame] - expected).abs().max() < 1e-5
@@ -87,15 +87,15 @@ def test_the_peak_follower_equals_the_recursion_of_giannoulis(
     values = 60.0 * torch.rand(2, 700, 3)
     values[:, 200:400] = 0.0
     values.requires_grad_()
-    up, down = decay(attack), decay(release)
-    levels, state = follow_peaks(values, torch.zeros(2, 3, 3), up, down)
+    up, down = _weight_of_past(attack), _weight_of_past(release)
+    levels, state = follow_peaks(values, torch.zeros(2, 3, 3), attack, release)
     peak = smooth = torch.zeros(2, 3)
     for frame in range(700):
         peak = torch.maximum(values[:, frame], down * peak + (1.0 - down) * values[:, frame])
         smooth = up * smooth + (1.0 - up) * peak
         assert (levels[:, frame] - smooth).abs().max() < 1e-3
-    first, between = follow_peaks(values[:, :333], torch.zeros(2, 3, 3), up, down)
-    second, last = follow_peaks(values[:, 333:], between, up, down)
+    first, between = follow_peaks(values[:, :333], torch.zeros(2, 3, 3), attack, release)
+    second, last = follow_peaks(values[:, 333:], between, attack, release)
     assert (torch.cat((first, second), 1) - levels).abs().max() < 1e-3
     assert (last - state).abs().max() < 1e-3
     (gradient,) = torch.autograd.grad(levels.sum(), values)
