@@ -18,7 +18,12 @@ from hlsim.checks import loud_outputs
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
-from hlsim.losses.band_levels import audibility, band_level_loss, band_levels, least_audible
+from hlsim.losses.band_levels import (
+    audibility_threshold,
+    audibility_weights,
+    band_level_loss,
+    band_levels,
+)
 from hlsim.metrics import fidelity
 from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import haspi
@@ -273,7 +278,7 @@ def band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> flo
     """
     levels = band_levels(perceived, sample_rate)
     reference_levels = band_levels(reference, sample_rate)
-    audible = audibility(reference_levels, least_audible(reference_levels)) > 0.0
+    audible = audibility_weights(reference_levels, audibility_threshold(reference_levels)) > 0.0
     if not bool(audible.any()):
         raise ValueError("a normal ear finds nothing of the clean speech audible")
     return float((levels - reference_levels).abs()[audible].double().quantile(0.5))

@@ -1,4 +1,9 @@
-"""Levels in bands about one ERB wide, and a loss that compares them with those of a normal ear."""
+"""The criterion ``"bands"``, which compares levels in bands about as wide as auditory filters.
+
+There are 24 bands from 80 Hz to 7.5 kHz. They are equally wide, 1.25 ERB (equivalent rectangular
+bandwidths), on the scale of Glasberg and Moore (1990), rectangular and without gaps, so that their
+powers add up to that of the signal.
+"""
 
 from functools import lru_cache
 
@@ -40,13 +45,18 @@ LOWEST_TOTAL_WEIGHT = 1e-3
 
 
 def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
-    """Return the level of each band in each frame of 32 ms, every 16 ms.
+    """Compute the level in 24 bands from 80 Hz to 7.5 kHz in each frame of 32 ms, every 16 ms.
 
-    The bands are equally wide on the ERB-number scale of Glasberg and Moore (1990), 1.25 ERB each,
-    from 80 Hz to 7.5 kHz. They are rectangular and without gaps, so that their powers add up to
-    that of the signal.
+    The bands are about as wide as auditory filters, 1.25 ERB each.
 
-    Shape: (..., time) in pascals -> (..., frames, 24) in dB SPL; silence gives -86.
+    Shape: (..., time) -> (..., frames, 24).
+
+    Args:
+        waveform: Signals in pascals.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Levels in dB SPL; -86 for silence.
 
     >>> from hlsim.calibration import set_level
     >>> levels = band_levels(set_level(torch.randn(16000), 65.0), sample_rate=16000)
@@ -61,23 +71,26 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
 
 
 def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tensor:
-    """Mean absolute difference in dB of band levels, weighted by the audibility of the bands.
+    """Compute by how many dB the band levels of perceived speech differ from those of a normal ear.
 
-    A gain of g dB costs ``abs(g)``. The perceived level has no floor. With one, such as a threshold
-    of hearing, a band that the impaired ear misses altogether would have no gradient, and no
-    compensator would learn to restore it.
+    This is a mean of absolute differences, weighted by the audibility of the bands. A gain of g dB
+    costs ``abs(g)``. The perceived level has no floor. With one, such as a threshold of hearing, a
+    band that the impaired ear misses altogether would have no gradient, and no compensator would
+    learn to restore it.
 
     The weight of a band is its audibility for a normal ear, or that of the perceived signal if it
     is higher: noise that fills a pause is an error, too. Such an error counts down to 40 dB below
-    audibility.
+    audibility. The weights carry no gradient.
+
+    Shape: (..., time) twice -> (...).
 
     Args:
-        perceived: Output of the impaired ear.
-        normal: Output of a normal ear for the clean speech.
+        perceived: Speech that the impaired ear perceives, in pascals.
+        normal: Clean speech as a normal ear perceives it, in pascals.
         sample_rate: Sample rate in Hz.
 
-    Shape: (..., time) twice, in pascals -> (...) in dB; 0 if neither is audible. The weights carry
-        no gradient.
+    Returns:
+        Difference in dB for each item; 0 if neither signal is audible.
 
     >>> speech = torch.randn(1, 16000)
     >>> band_level_loss(0.1 * speech, speech, sample_rate=16000).round(decimals=2)  # 20 dB too low
@@ -85,44 +98,63 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
     """
     levels = band_levels(perceived, sample_rate)
     reference_levels = band_levels(normal, sample_rate)
-    threshold = least_audible(reference_levels)
-    weights = torch.maximum(audibility(reference_levels, threshold), audibility(levels, threshold))
+    threshold = audibility_threshold(reference_levels)
+    weights = torch.maximum(
+        audibility_weights(reference_levels, threshold), audibility_weights(levels, threshold)
+    )
     errors = (levels - torch.maximum(reference_levels, threshold - DEPTH)).abs()
     total = weights.sum((-2, -1)).clamp_min(LOWEST_TOTAL_WEIGHT)
     return (weights * errors).sum((-2, -1)) / total
 
 
-def least_audible(levels: Tensor) -> Tensor:
-    """Return the level at which audibility begins.
+def audibility_threshold(levels: Tensor) -> Tensor:
+    """Compute the level in each band from which a normal ear hears something.
 
-    It is the threshold in quiet, or 40 dB below the strongest band of the item if that is higher.
+    It is the threshold in quiet, or 40 dB below the strongest band of the item if that is higher,
+    because loud bands mask soft ones. It carries no gradient.
 
-    Shape: (..., frames, 24) in dB SPL -> (..., 1, 24).
+    Shape: (..., frames, 24) -> (..., 1, 24).
 
-    >>> least_audible(torch.full((1, 10, 24), 60.0))[0, 0, :3]
+    Args:
+        levels: Levels from ``band_levels`` in dB SPL.
+
+    Returns:
+        Levels in dB SPL.
+
+    >>> audibility_threshold(torch.full((1, 10, 24), 60.0))[0, 0, :3]
     tensor([23.0014, 20.0000, 20.0000])
     """
     quiet = constant(threshold_in_quiet, dtype=levels.dtype, device=levels.device)
     return torch.maximum(quiet, levels.amax((-2, -1), keepdim=True) - DEPTH).detach()
 
 
-def audibility(levels: Tensor, threshold: Tensor) -> Tensor:
-    """Return weights, 0 up to the threshold of audibility and 1 from 20 dB above, without gradient.
+def audibility_weights(levels: Tensor, threshold: Tensor) -> Tensor:
+    """Compute the weight of each band: 0 up to the threshold of audibility, 1 from 20 dB above it.
 
-    Shape: (..., frames, 24), (..., 1, 24) in dB SPL -> (..., frames, 24).
+    The weights carry no gradient.
 
-    >>> audibility(torch.tensor([10.0, 30.0, 50.0]), threshold=torch.tensor(20.0))
+    Shape: (..., frames, 24), (..., 1, 24) -> (..., frames, 24).
+
+    Args:
+        levels: Levels from ``band_levels`` in dB SPL.
+        threshold: Levels from ``audibility_threshold`` in dB SPL.
+
+    >>> audibility_weights(torch.tensor([10.0, 30.0, 50.0]), threshold=torch.tensor(20.0))
     tensor([0.0000, 0.5000, 1.0000])
     """
     return ((levels.detach() - threshold) / RISE).clamp(0.0, 1.0)
 
 
 def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor]:
-    """Return the transform and the share of each frequency in each band, (frequencies, 24).
+    """Return what computes band powers: a short-time Fourier transform, and weights of its bins.
 
     Args:
-        like: Tensor with the type and the device of the shares.
+        like: Tensor with the type and the device of the weights.
         sample_rate: Sample rate in Hz.
+
+    Returns:
+        The transform, and the share of each of its frequencies in each band, (frequencies, 24). The
+        powers of a spectrum times these shares are the powers in bands.
 
     >>> stft, shares = band_analysis(torch.zeros(1), sample_rate=16000)
     >>> stft.hop, shares.shape
@@ -130,14 +162,15 @@ def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor]:
     """
     hop = round(FRAME_SECONDS / 2.0 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
-    shares = constant(band_shares, stft.fft, sample_rate, dtype=like.dtype, device=like.device)
+    shares = constant(_band_shares, stft.fft, sample_rate, dtype=like.dtype, device=like.device)
     return stft, shares
 
 
 def spectrum_scale(stft: STFT) -> float:
-    """Return the factor from the power of a frequency to its part of the signal's mean square.
+    """Return the factor that turns squared magnitudes of a spectrum into powers of the signal.
 
-    It counts both halves of the spectrum. The squares of a Hann window of n samples sum to 3 n / 8.
+    The powers of all frequencies then add up to the mean square of the signal. The factor counts
+    positive and negative frequencies. The squares of a Hann window of n samples sum to 3 n / 8.
 
     >>> spectrum_scale(STFT(512, 512, 256)) * 512**2 * 3 / 16
     1.0
@@ -146,7 +179,7 @@ def spectrum_scale(stft: STFT) -> float:
 
 
 def band_edges() -> NDArray[np.float64]:
-    """Return the edges of the bands in Hz, (25,).
+    """Return the edges of the 24 bands in Hz, (25,).
 
     >>> print(band_edges()[[0, 24]].round())
     [  80. 7500.]
@@ -156,7 +189,7 @@ def band_edges() -> NDArray[np.float64]:
 
 
 def band_centres() -> NDArray[np.float64]:
-    """Return the geometric centres of the bands in Hz, (24,).
+    """Return the geometric centres of the 24 bands in Hz, (24,).
 
     >>> print(band_centres()[12].round())
     1423.0
@@ -166,12 +199,8 @@ def band_centres() -> NDArray[np.float64]:
     return centres
 
 
-def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
-    """Return the share of each frequency of a transform in each band, (fft // 2 + 1, 24).
-
-    >>> band_shares(512, sample_rate=16000).shape
-    (257, 24)
-    """
+def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
+    """Return the share of each frequency of a transform in each band, (fft // 2 + 1, 24)."""
     spacing = sample_rate / fft
     frequencies = np.arange(fft // 2 + 1)[:, None] * spacing
     edges = band_edges()
@@ -182,7 +211,9 @@ def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def threshold_in_quiet() -> NDArray[np.float64]:
-    """Return a normal ear's threshold in each band in dB SPL, (24,) (Terhardt 1979, Equation 1).
+    """Return the softest level that a normal ear hears in each band in dB SPL, (24,).
+
+    Source: Terhardt (1979), Equation 1.
 
     >>> print(threshold_in_quiet()[12].round(1))  # at 1423 Hz
     2.0

@@ -2,18 +2,19 @@
 
 It compares the coherence and the level in each band with those for a normal ear.
 
-Both signals are cut into 24 ERB-wide bands (``hlsim.losses.band_levels``) and overlapping segments
-of 96 ms. With ``H`` and ``R`` the spectra of the impaired and the normal ear's outputs, in frames
-of 32 ms, each band and segment has
+Coherence says how much of a signal is a fixed filter of the other: it is 1 for any gain and phase,
+and falls with noise. Both signals are divided into 24 bands (``hlsim.losses.band_levels``) and
+overlapping segments of 96 ms. Let ``H`` be the spectra in frames of 32 ms of what the impaired ear
+perceives, and ``R`` those of what a normal ear perceives. Each band and segment has
 
 - ``incoherence``, ``1 - (sum |mean H R*|)^2 / (sum mean |H|^2 * sum mean |R|^2)``, with means over
   the frames of the segment and sums over the frequencies of the band. It is 0 if the perceived
   signal is the reference times any gain and any fixed phase. It rises with noise, late
   reverberation and distortion, however soft: noise in a band that is perceived too softly does not
   lower it.
-- ``misalignment``, the part of the square root of the coherence that is lost to the phase. It has a
-  small weight, as nobody hears the sign or a delay of one millisecond; it leads a model with an
-  arbitrary phase to none.
+- ``misalignment``, the part of the square root of the coherence that is lost to a phase shift. It
+  has a small weight, as nobody hears the sign or a delay of one millisecond; it leads a model with
+  an arbitrary phase shift to one without.
 - ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope
   falls with the difference, so that a severe ear, which perceives 100 dB too little and 2.5 dB more
   per dB of gain, counts like a mild one.
@@ -99,15 +100,19 @@ LOWEST_TOTAL_WEIGHT = 1e-9
 
 
 def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> dict[str, Tensor]:
-    """Return the incoherence, misalignment, compressed level error and excess level of each item.
+    """Compute four errors of perceived speech: in coherence, phase and level, and excess level.
+
+    Weights of bands and segments carry no gradient. Audible sound where the reference is silent has
+    a gradient all the same.
 
     Args:
-        perceived: Output of the impaired ear.
-        normal: Output of a normal ear for the clean speech.
+        perceived: Speech that the impaired ear perceives, (items, time) in pascals.
+        normal: Clean speech as a normal ear perceives it, (items, time) in pascals.
         sample_rate: Sample rate in Hz.
 
-    Shape: (items, time) twice, in pascals -> (items,) each. The weights carry no gradient; audible
-        sound where the reference is silent has a gradient all the same.
+    Returns:
+        ``incoherence``, ``misalignment``, ``levels`` and ``louder`` of each item, (items,) each, as
+        described at the top of ``hlsim.losses.coherent_bands``.
 
     >>> speech = torch.randn(1, 16000)
     >>> parts = coherent_band_parts(0.1 * speech, speech, sample_rate=16000)  # 20 dB too low
@@ -128,10 +133,10 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
     strongest = reference_level.detach().amax((-2, -1), keepdim=True)
     threshold = torch.maximum(quiet, 10.0 ** (-DEPTH / 10.0) * strongest)
     weights = _audibility(reference_level, threshold)
-    own_weights = _audibility(level, threshold)
+    perceived_weights = _audibility(level, threshold)
     total = weights.sum((-2, -1)).clamp_min(LOWEST_TOTAL_WEIGHT)
     # Noise in a silent reference has no audible reference whose weight it could be divided by.
-    louder_total = torch.maximum(total, own_weights.sum((-2, -1)) / 10.0)
+    louder_total = torch.maximum(total, perceived_weights.sum((-2, -1)) / 10.0)
 
     error = (_decibels(level) - _decibels(reference_level)).abs()
     audible_level = torch.maximum(reference_level, threshold)
@@ -145,14 +150,17 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
         "levels": weights * (KNEE * torch.log1p(error / KNEE)),
     }
     sums = {name: part.sum((-2, -1)) / total for name, part in parts.items()}
-    sums["louder"] = (own_weights * excess).sum((-2, -1)) / louder_total
+    sums["louder"] = (perceived_weights * excess).sum((-2, -1)) / louder_total
     return sums
 
 
 def peak_excess(compensated: Tensor) -> Tensor:
-    """Return the mean excess of the samples over 120 dB SPL, relative to that pressure.
+    """Compute by how much samples exceed 120 dB SPL on average, as a multiple of that pressure.
 
-    Shape: (items, time) in pascals -> (items,).
+    Shape: (items, time) -> (items,).
+
+    Args:
+        compensated: Output of an aid in pascals.
 
     >>> peak_excess(torch.full((1, 100), 2.0 * HIGHEST_PEAK))
     tensor([1.])
@@ -161,15 +169,20 @@ def peak_excess(compensated: Tensor) -> Tensor:
 
 
 def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
-    """Return the same waveform with a limiter on its gradient.
+    """Return a waveform unchanged, and limit its gradient in the backward pass.
 
-    In ears that perceive next to nothing, a recruiting band or a network gives a few samples a
-    gradient a thousand times as large as the others', which then have no part in the step. Blocks
-    of 5 ms are scaled down as a whole: limiting single samples leaves a mean, from which a
+    In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
+    times as large as the others', which then have no part in the training step. Where a block of 5
+    ms has a gradient above six times the item's usual one (its 90th percentile), the gradient of
+    the whole block is scaled down. Limiting single samples would leave a mean, from which a
     convolutional network grows a constant pressure that is inaudible. In pauses, blocks 30 dB or
     more below the loudest one of the item, the limit is six times as low. NaN stays.
 
     Shape: (..., time) -> (..., time).
+
+    Args:
+        compensated: Output of an aid.
+        sample_rate: Sample rate in Hz.
 
     >>> samples = torch.randn(1, 1600, requires_grad=True)
     >>> gradient = torch.ones(1, 1600)
@@ -183,6 +196,8 @@ def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
 
 
 class _GradientLimiter(torch.autograd.Function):
+    """Identity whose gradient is limited, as ``limit_gradient_spikes`` describes."""
+
     @staticmethod
     def forward(waveform: Tensor, block: int) -> Tensor:
         return waveform.view_as(waveform)

@@ -1,4 +1,8 @@
-"""Criteria of ``HearingLossLoss`` by name, and the weights of their parts."""
+"""Criteria of ``HearingLossLoss`` by name, and the weights of their parts.
+
+A criterion compares perceived speech with its reference. It has one or several *parts*, whose
+weighted sum is the loss.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
@@ -22,17 +26,23 @@ CRITERIA: dict[str, Mapping[str, float]] = {
 """Parts of each criterion with their default weights."""
 
 Criterion = CriterionName | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
-"""A name, weights by name, or a function of the perceived speech and its reference.
+"""Name of a criterion, weights of several by name, or a function of perceived speech and reference.
 
 Shape of the function: (items, time) twice, in pascals -> (items,).
 """
 
 
 def check_criterion(criterion: Any) -> dict[str, Any]:
-    """Return the weights of the criteria by name, without those of 0, or a function by itself.
+    """Return the criteria of a loss by name with their weights.
+
+    Args:
+        criterion: Name of a criterion, weights of several by name, or a function.
+
+    Returns:
+        Weights above 0 by name; or the function itself under the name ``criterion``.
 
     Raises:
-        ValueError: An unknown name, or a weight that is negative or not finite.
+        ValueError: A name is unknown, or a weight is negative or not finite.
 
     >>> check_criterion({"bands": 1.0, "paper": 0.0})
     {'bands': 1.0}
@@ -47,14 +57,17 @@ def check_criterion(criterion: Any) -> dict[str, Any]:
 def combine_weights(
     weights: Mapping[str, float] | None, criteria: Mapping[str, Any]
 ) -> dict[str, float]:
-    """Return the weight of each part of the loss, multiplied by that of its criterion.
+    """Compute the weight of each part of a loss: its own weight times that of its criterion.
 
     Args:
         weights: Weights of the parts by name; the defaults of the criteria if None.
-        criteria: Result of ``check_criterion``.
+        criteria: Criteria with their weights, from ``check_criterion``.
+
+    Returns:
+        Weights by name of the part.
 
     Raises:
-        ValueError: An unknown part, or a weight that is negative or not finite.
+        ValueError: A part is unknown, or a weight is negative or not finite.
 
     >>> combine_weights(None, {"bands": 0.5, "haspi": 2.0})
     {'band_levels': 0.5, 'haspi': 2.0}
@@ -70,10 +83,14 @@ def combine_weights(
 
 
 def check_values(values: Any, items: int) -> Tensor:
-    """Return the result of a criterion of the user's own.
+    """Validate and return what a user's function returned as a criterion.
+
+    Args:
+        values: Return value of the function.
+        items: Number of items.
 
     Raises:
-        ValueError: It is not a tensor with one value per item.
+        ValueError: It is not a tensor with one value per item, (items,).
 
     >>> check_values(torch.tensor([0.5, 1.0]), items=2)
     tensor([0.5000, 1.0000])
@@ -88,9 +105,11 @@ def check_values(values: Any, items: int) -> Tensor:
 
 
 def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Return the sum of the parts of a loss times their weights.
+    """Compute the sum of the parts of a loss times their weights.
 
-    Parts without a weight do not count.
+    Args:
+        parts: Parts by name, all with the same shape.
+        weights: Weights by name. Parts without a weight do not count.
 
     >>> weighted_sum({"time": torch.tensor(2.0), "phase": torch.tensor(1.0)}, {"time": 0.5})
     tensor(1.)

@@ -1,11 +1,11 @@
-"""A frozen simulator, and the reference with which its output is compared."""
+"""A simulator that is not trained, and the reference with which its output is compared."""
 
 import math
 import os
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -26,50 +26,30 @@ from hlsim.torchtools import without_modes
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
-Hearing = Callable[[Tensor], Tensor]
-"""A normal ear: (..., time) -> (..., time)."""
-
-
-class Inputs(NamedTuple):
-    """Validated arguments of a call of the loss.
-
-    Attributes:
-        compensated: Output of the compensator, silent after each end and at missing ears.
-        clean: Clean speech, silent there, too.
-        ears: Thresholds in dB HL, 0 dB HL for missing ears.
-        ends: Number of samples of each item, or None if all are as long as the batch.
-        known: Mask of the ears that are not missing, or None if all are known.
-        options: Arguments of the simulator beyond the audiogram, by name.
-
-    >>> speech = torch.randn(2, 1600)
-    >>> Inputs(speech, speech, torch.zeros(8), ends=None, known=None, options={}).ears.shape
-    torch.Size([8])
-    """
-
-    compensated: Tensor
-    clean: Tensor
-    ears: Tensor
-    ends: Tensor | None
-    known: Tensor | None
-    options: Mapping[str, Any]
+NormalEar = Callable[[Tensor], Tensor]
+"""Function or module that returns what a normal ear perceives, (..., time) -> (..., time)."""
 
 
 class FrozenSimulator:
-    """A simulator in eval mode without trainable parameters, and the normal ear that belongs to it.
+    """Simulator of an impaired ear that is not trained, with the normal ear that belongs to it.
 
-    It is not a module, so that its owner does not register its parameters. The owner moves it with
-    ``apply``.
+    The simulator stays in eval mode and has no trainable parameter. This class is not a module, so
+    that the loss that owns it does not register these parameters. The loss moves it with ``apply``.
 
     Args:
-        simulator: Simulator, as ``HearingLossLoss`` describes it and its attributes.
+        simulator: ``"msbg"``, the name or folder of a checkpoint, or a module, as in
+            ``HearingLossLoss``.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
-        normal: Normal ear, as in ``HearingLossLoss``.
-        reference: Reference of the criteria that have a choice, as in ``HearingLossLoss``.
-        checkpoint: Compute the activations of the simulator again in the backward pass.
+        normal: Normal ear that belongs to the simulator. By default, the simulator at 0 dB HL.
+        reference: Reference of the criteria that have a choice: ``"clean"`` speech, or
+            ``"normal-hearing"``, what the normal ear perceives of it. By default, the criterion
+            ``"paper"`` takes clean speech.
+        checkpoint: Whether activations of the simulator are computed again in the backward pass
+            instead of stored.
 
     Raises:
-        ValueError: An argument is not as ``HearingLossLoss`` describes it.
+        ValueError: An argument is not as described.
 
     >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, reference=None)
     >>> frozen.simulator.training
@@ -81,7 +61,7 @@ class FrozenSimulator:
         simulator: str | Path | nn.Module,
         sample_rate: int,
         full_scale_spl: float,
-        normal: Hearing | None,
+        normal: NormalEar | None,
         reference: ReferenceName | None,
         checkpoint: bool = False,
     ) -> None:
@@ -107,38 +87,44 @@ class FrozenSimulator:
             simulator.checkpoint = True
             self._checkpoints_whole = False
 
-    def simulate(self, waveform: Tensor, thresholds: Tensor, inputs: Inputs) -> Tensor:
-        """Return the output of the simulator.
+    def simulate(
+        self,
+        waveform: Tensor,
+        thresholds: Tensor,
+        lengths: Tensor | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> Tensor:
+        """Compute what the impaired ears perceive.
 
         Args:
             waveform: Speech.
             thresholds: Ears in dB HL.
-            inputs: Lengths, and further arguments of the simulator.
+            lengths: Number of samples of each item of a padded batch, on the CPU. By default, all
+                items are as long as the batch.
+            options: Further keyword arguments of the simulator.
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
         """
-        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
-        if not self._needs_exact_lengths or inputs.ends is None or inputs.options or batch is None:
-            return self._run(waveform, thresholds, inputs.options)
-        time = waveform.shape[-1]
-        ends = inputs.ends.expand(batch).flatten()
-        if all(end == time for end in ends.tolist()):
-            return self._run(waveform, thresholds)
+        if not self._needs_exact_lengths or lengths is None or options:
+            return self._run(waveform, thresholds, options or {})
         # Items of each length are simulated separately, without the silence after their ends.
+        time = waveform.shape[-1]
+        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
+        ends = lengths.expand(batch).flatten()
         items = waveform.expand(*batch, -1).reshape(-1, time)
         ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
         outputs: dict[int, Tensor] = {}
         for end in ends.unique().tolist():
             members = (ends == end).nonzero().flatten()
             chosen = members.to(items.device)
-            padded = functional.pad(self._run(items[chosen, :end], ears[chosen]), (0, time - end))
+            perceived = self._run(items[chosen, :end], ears[chosen], {})
+            padded = functional.pad(perceived, (0, time - end))
             outputs |= zip(members.tolist(), padded, strict=True)
         return torch.stack([outputs[item] for item in range(len(items))]).reshape(*batch, time)
 
-    def _run(
-        self, waveform: Tensor, thresholds: Tensor, options: Mapping[str, Any] | None = None
-    ) -> Tensor:
+    def _run(self, waveform: Tensor, thresholds: Tensor, options: Mapping[str, Any]) -> Tensor:
         """Run the simulator, and validate its output."""
+        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
         weight = next(self.simulator.parameters(), None)
         if weight is not None and weight.device != waveform.device:
             raise ValueError(
@@ -147,27 +133,38 @@ class FrozenSimulator:
             )
         arguments = {
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
-            for name, value in (options or {}).items()
+            for name, value in options.items()
         }
         simulator = partial(self.simulator, **arguments)
         if self._checkpoints_whole:
             simulator = partial(checkpoint, simulator, use_reentrant=False)
-        output = simulator(waveform, thresholds)
-        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
-        return _check_output(output, "simulator", waveform, batch)
+        return _check_output(simulator(waveform, thresholds), "simulator", waveform, batch)
 
-    def reference(self, criterion: str, inputs: Inputs, batch: torch.Size) -> Tensor:
-        """Return the reference with which a criterion compares the output of the simulator.
+    def reference(
+        self,
+        criterion: str,
+        clean: Tensor,
+        thresholds: Tensor,
+        batch: torch.Size,
+        lengths: Tensor | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> Tensor:
+        """Compute the reference with which a criterion compares what the impaired ears perceive.
 
         Args:
-            criterion: ``coherent-bands``, ``bands``, ``paper``, or the name of another criterion.
-            inputs: Arguments of the call.
+            criterion: Name of the criterion.
+            clean: Clean speech, (..., time).
+            thresholds: Impaired ears in dB HL, (..., 8). Their severity selects the phase shift of
+                the reference (``hlsim.msbg.response``).
             batch: Leading dimensions of the result.
+            lengths: Lengths of the items, as in ``simulate``.
+            options: Further arguments of the simulator, as in ``simulate``.
 
-        Shape: (*batch, time).
+        Returns:
+            Clean speech, or what a normal ear perceives of it, (*batch, time).
         """
-        clean, ears = inputs.clean, inputs.ears
         time = clean.shape[-1]
+        ears = thresholds
         if self._has_bank_phase:
             ears = ears.expand(*batch, -1) if ears.ndim > 1 else ears
             ears = ears.reshape(-1, len(FREQUENCIES))
@@ -182,7 +179,7 @@ class FrozenSimulator:
                 return simulate_normal_ear(items, ears, self.sample_rate).reshape(*batch, time)
             else:
                 no_loss = on_device(_no_loss(clean.dtype), clean.device)
-                reference = self.simulate(clean, no_loss, inputs)
+                reference = self.simulate(clean, no_loss, lengths, options)
             reference = reference.expand(*batch, time)
             if criterion == "bands" or not self._has_bank_phase:
                 return reference
@@ -192,11 +189,19 @@ class FrozenSimulator:
             return items.reshape(*batch, time)
 
     def frequencies(self, fft: int) -> int | None:
-        """Return the number of a transform's frequencies to compare, or None for all of them."""
+        """Return how many frequencies of a Fourier transform the criteria compare.
+
+        Args:
+            fft: Length of the transform.
+
+        Returns:
+            Number of frequencies from 0 Hz up to 7500 Hz; ``None``, for all of them, if the output
+            of the simulator reaches half the sample rate.
+        """
         return int(HIGHEST * fft / self.sample_rate) + 1 if self._limits_band else None
 
     def apply(self, function: Callable[[Tensor], Tensor]) -> None:
-        """Move the modules, as ``nn.Module._apply`` does."""
+        """Apply a function to all tensors of the modules in place, as ``nn.Module.to`` does."""
         apply_to_module(self.simulator, function)
         apply_to_module(self.normal, function)
 
@@ -206,7 +211,7 @@ class FrozenSimulator:
         return self.choice or ("clean" if criterion == "paper" else "normal-hearing")
 
     def _limit_band(self, clean: Tensor) -> Tensor:
-        """Remove the band that the simulator does not return."""
+        """Remove the frequencies above those that the simulator returns."""
         if not self._limits_band:
             return clean
         rate = round(2.0 * self._highest_frequency)
@@ -215,9 +220,11 @@ class FrozenSimulator:
 
 
 def apply_to_module(value: object, function: Callable[[Tensor], Tensor]) -> None:
-    """Apply a function to the tensors of a module, but keep float32 or float64.
+    """Apply a function to all tensors of a module in place, except conversions to half precision.
 
-    Values that are not modules are ignored.
+    Args:
+        value: Module, or another value, which is ignored.
+        function: Function that moves or converts a tensor.
 
     >>> layer = nn.Linear(2, 1)
     >>> apply_to_module(layer, lambda tensor: tensor.bfloat16())
@@ -237,11 +244,11 @@ def apply_to_module(value: object, function: Callable[[Tensor], Tensor]) -> None
 def build_simulator(
     simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float
 ) -> nn.Module:
-    """Build the simulator of a name or a folder, or validate a module and return it.
+    """Return the simulator that a name, a folder or a module describes.
 
     Args:
         simulator: ``"msbg"`` for the exact model, the name or the folder of a checkpoint, or a
-            module.
+            module, which is validated and returned.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
 
@@ -280,21 +287,21 @@ def _no_loss(dtype: torch.dtype) -> Tensor:
     return without_modes(lambda: torch.zeros(len(FREQUENCIES), dtype=dtype))
 
 
-def _broadcast_batch(items: torch.Size, ears: torch.Size) -> torch.Size | None:
-    """Return the shape to which the leading dimensions of signals and ears broadcast, or None.
+def _broadcast_batch(items: torch.Size, ears: torch.Size) -> torch.Size:
+    """Return the shape to which the leading dimensions of signals and ears broadcast.
 
     Raises:
-        ValueError: The ears would broadcast so that each item is simulated for each ear, as
+        ValueError: They do not broadcast, or so that each item would be simulated for each ear, as
             (batch,) ears with (batch, 1) items would.
     """
     try:
         batch = broadcast_shape(items, ears)
-    except RuntimeError:  # the simulator rejects them
-        return None
-    if math.prod(batch) > max(math.prod(items), math.prod(ears)):
+    except RuntimeError:
+        batch = None
+    if batch is None or math.prod(batch) > max(math.prod(items), math.prod(ears)):
         raise ValueError(
             f"expected one audiogram, or one per item in the shape {(*items, len(FREQUENCIES))}, "
-            f"got {(*ears, len(FREQUENCIES))}, which would pair each item with each ear"
+            f"got {(*ears, len(FREQUENCIES))}"
         )
     return batch
 
@@ -308,7 +315,7 @@ def _check_output(
         output: Value to validate.
         source: Name of the module that returned it, for messages.
         waveform: Input of the module.
-        batch: Further leading dimensions that the output may have.
+        batch: Leading dimensions that the output may have instead of those of its input.
     """
     check_waveform(output, f"the output of the {source}", highest=math.inf)
     time = waveform.shape[-1:]

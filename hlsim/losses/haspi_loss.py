@@ -15,7 +15,10 @@ Excess level costs twice its default, as HASPI rewards gain.
 
 
 class HASPILoss(HearingLossLoss):
-    """1 minus HASPI, optionally 1 minus HASQI, and the error of the perceived level.
+    """Training loss that rises as HASPI, a score of intelligibility, falls.
+
+    It is 1 minus HASPI, optionally plus 1 minus HASQI (a score of quality), plus the error of the
+    perceived level.
 
     HASPI alone rewards any gain. Therefore the loss also compares the level that is perceived
     through ``simulator`` with the level that a normal ear perceives of the clean speech, and
@@ -24,10 +27,10 @@ class HASPILoss(HearingLossLoss):
     ``noise="expected"``, which makes them deterministic. An item whose clean speech is inaudible
     has a HASPI term of 0.
 
-    It is called as ``HearingLossLoss`` is, ``loss(compensated, clean, audiogram=None,
-    lengths=None)``, with the same shapes, conventions and errors. Items last 0.7 s or more, and no
-    gradient of HASPI reaches ``clean``. A step costs about 10 times that of the default loss, with
-    HASQI 23 times.
+    It is called as ``loss(compensated, clean, audiogram=None, lengths=None)``, with waveforms of
+    shape (..., time) in pascals, and returns a scalar; ``HearingLossLoss`` describes the details.
+    Items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. A step costs about 10
+    times that of the default loss, with HASQI 23 times.
 
     Args:
         audiogram: Ear or ears, as in ``HearingLossLoss``.
@@ -37,7 +40,8 @@ class HASPILoss(HearingLossLoss):
             ``ears`` and ``checkpoint`` of ``HearingLossLoss``.
 
     Raises:
-        ValueError: As ``HearingLossLoss``, or a weight is negative or not finite.
+        ValueError: A weight is negative or not finite, or an option of ``HearingLossLoss`` is not
+            valid.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()[:16000]

@@ -1,11 +1,11 @@
-"""A training loss that simulates an impaired ear."""
+"""The training loss of hearing aids: what an impaired ear perceives, compared with a normal ear."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -40,8 +40,7 @@ from hlsim.losses.criteria import (
 )
 from hlsim.losses.frozen_simulator import (
     FrozenSimulator,
-    Hearing,
-    Inputs,
+    NormalEar,
     ReferenceName,
     apply_to_module,
 )
@@ -50,18 +49,38 @@ from hlsim.metrics.score_loss import SCORES, score_loss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import not_compiled
 
-Reduction = Literal["mean", "none"]
+_Reduction = Literal["mean", "none"]
 
-EarsName = Literal["mean", "better"]
+_EarsName = Literal["mean", "better"]
 
-CRITERIA_OF_OUTPUT = {*SCORES, "interaural"}
+_CRITERIA_OF_OUTPUT = {*SCORES, "interaural"}
 """Criteria of the output of the compensator. The others compare what is perceived of it."""
 
-TEMPERATURE = 0.1
+_TEMPERATURE = 0.1
 """Temperature of ``ears="better"``.
 
 An ear with a loss that is 0.1 lower than that of the other ear counts 2.7 times as much.
 """
+
+
+class _Call(NamedTuple):
+    """Validated arguments of a call of the loss.
+
+    Attributes:
+        compensated: Output of the compensator, silent after each end and at missing ears.
+        clean: Clean speech, silent there, too.
+        ears: Thresholds in dB HL, 0 dB HL for missing ears.
+        lengths: Number of samples of each item, or None if all are as long as the batch.
+        known: Mask of the ears that are not missing, or None if none is missing.
+        options: Further keyword arguments of the simulator.
+    """
+
+    compensated: Tensor
+    clean: Tensor
+    ears: Tensor
+    lengths: Tensor | None
+    known: Tensor | None
+    options: Mapping[str, Any]
 
 
 class HearingLossLoss(nn.Module):
@@ -69,9 +88,9 @@ class HearingLossLoss(nn.Module):
 
     The impaired ear perceives compensated speech, the output of an aid, and the normal ear clean
     speech. A simulator computes both. It is frozen: it stays in eval mode and has no trainable
-    parameter, but gradients pass through it to the compensated speech. It is not registered, so
-    that the parameters and the state dict of a module that holds this loss do not include it. It
-    moves with ``.to()`` all the same. Use ``DistributedDataParallel`` instead of
+    parameter, but gradients pass through it to the compensated speech. It is not registered as a
+    submodule, so that the parameters and the state dict of a module that holds this loss do not
+    include it. It moves with ``.to()`` all the same. Use ``DistributedDataParallel`` instead of
     ``nn.DataParallel``, because all threads of a process share one simulator.
 
     The level is not normalised: 65 dB SPL is an RMS of 0.035 at the default ``full_scale_spl``. NaN
@@ -98,7 +117,8 @@ class HearingLossLoss(nn.Module):
       returns one value per item, (items,)
 
     Args:
-        audiogram: Ear or ears; may be passed to each call instead. A tensor that requires a
+        audiogram: Ear or ears; may be passed to each call instead. The standard audiogram ``"N7"``
+            is not accepted, because it has thresholds above 100 dB HL. A tensor that requires a
             gradient gets one, and is not registered either. Every simulator, ``"msbg"`` included,
             receives the levels at eight frequencies, ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
@@ -134,7 +154,7 @@ class HearingLossLoss(nn.Module):
             storing them, which takes less memory. Value and gradient are the same.
 
     Raises:
-        ValueError: An unknown name, a value of another type or out of range, or a simulator that
+        ValueError: A name is unknown, a value has another type or is out of range, or the simulator
             was built for another rate or level, or delays its output.
 
     >>> import hlsim
@@ -156,9 +176,9 @@ class HearingLossLoss(nn.Module):
         reference: ReferenceName | None = None,
         criterion: Criterion = "coherent-bands",
         weights: Mapping[str, float] | None = None,
-        reduction: Reduction = "mean",
-        normal: Hearing | None = None,
-        ears: EarsName = "mean",
+        reduction: _Reduction = "mean",
+        normal: NormalEar | None = None,
+        ears: _EarsName = "mean",
         checkpoint: bool = False,
     ) -> None:
         super().__init__()
@@ -166,8 +186,8 @@ class HearingLossLoss(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         if reference is not None:
             check_choice("reference", reference, ReferenceName)
-        check_choice("reduction", reduction, Reduction)
-        check_choice("ears", ears, EarsName)
+        check_choice("reduction", reduction, _Reduction)
+        check_choice("ears", ears, _EarsName)
         self.reduction = reduction
         self.ears = ears
         self.criteria = check_criterion(criterion)
@@ -181,27 +201,27 @@ class HearingLossLoss(nn.Module):
 
     @property
     def criterion(self) -> Criterion:
-        """The criterion that was passed to the constructor."""
+        """Criterion that was passed to the constructor."""
         return self._unregistered[1]
 
     @property
     def simulator(self) -> nn.Module:
-        """The frozen simulator."""
+        """Simulator that computes what the impaired ear perceives, which is not trained."""
         return self._frozen.simulator
 
     @property
-    def normal(self) -> Hearing | None:
-        """The normal ear that was passed to the constructor."""
+    def normal(self) -> NormalEar | None:
+        """Normal ear that was passed to the constructor; None for that of the simulator."""
         return self._frozen.normal
 
     @property
     def reference(self) -> ReferenceName | None:
-        """The name of the signal to compare with, from the constructor; None for the default."""
+        """Name of the reference that was passed to the constructor; None for the default."""
         return self._frozen.choice
 
     @property
     def thresholds(self) -> Tensor | None:
-        """The ear or ears of the constructor, (..., 8) dB HL, NaN for a missing ear."""
+        """Thresholds of the constructor's ear or ears in dB HL, (..., 8); NaN for a missing ear."""
         return self._unregistered[0]
 
     @not_compiled
@@ -214,14 +234,15 @@ class HearingLossLoss(nn.Module):
         *,
         listener: Mapping[str, Any] | None = None,
     ) -> Tensor:
-        """Return the loss.
+        """Compute the loss.
 
         Args:
             compensated: Output of the compensator.
             clean: Clean speech.
-            audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions. With
-                (batch, 1, time), (batch, 8) is accepted, too. A ``Listener`` goes with
-                (..., 2, time), left first; a missing ear does not count.
+            audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions; by
+                default the ears of the constructor. With (batch, 1, time), (batch, 8) is accepted,
+                too. A ``Listener`` goes with (..., 2, time), left first; a missing ear does not
+                count.
             lengths: Number of samples of each item of a padded batch, (...), or its share of the
                 longest, above 0 and up to 1, as SpeechBrain defines it. Samples after the end of an
                 item are ignored, so that its value is the one that it has alone (within 1e-4 for
@@ -243,25 +264,42 @@ class HearingLossLoss(nn.Module):
         return weighted_sum(parts, self.weights)
 
     @not_compiled
-    def parts(self, *arguments: Any, **options: Any) -> dict[str, Tensor]:
-        """Return the parts of the loss by name, before their weights.
+    def parts(
+        self,
+        compensated: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike | None = None,
+        lengths: Lengths | None = None,
+        *,
+        listener: Mapping[str, Any] | None = None,
+    ) -> dict[str, Tensor]:
+        """Compute the terms of the loss by name, before they are multiplied by their weights.
 
-        The parts of ``"coherent-bands"`` are incoherence, misalignment, levels, louder and peaks,
-        that of ``"bands"`` is band_levels (in dB), and those of ``"paper"`` are magnitude, phase,
-        complex and time. The other criteria have one part of their own name, and a function has the
-        part ``"criterion"``. ``forward`` returns ``sum(weight * parts[name] for name, weight in
-        loss.weights.items())``.
-
+        ``forward`` returns ``sum(weight * parts[name] for name, weight in loss.weights.items())``.
         Arguments, shapes and errors are those of ``forward``.
+
+        Returns:
+            For ``"coherent-bands"`` the parts incoherence, misalignment, levels, louder and peaks
+            (``hlsim.losses.coherent_bands`` describes them); for ``"bands"`` band_levels, in dB;
+            for ``"paper"`` magnitude, phase, complex and time. Other criteria have one part of
+            their own name, and a function has the part ``"criterion"``.
         """
-        inputs = self._prepare(*arguments, **options)
-        with torch.autocast(inputs.clean.device.type, enabled=False):
-            parts = self._compare(inputs)
-        return self._reduce(parts, inputs.known)
+        call = self._prepare(compensated, clean, audiogram, lengths, listener)
+        with torch.autocast(call.clean.device.type, enabled=False):
+            parts = self._compare(call)
+        return self._reduce(parts, call.known)
 
     @not_compiled
-    def heard(self, *arguments: Any, **options: Any) -> tuple[Tensor, Tensor]:
-        """Return the perceived speech and its reference, for a criterion of your own.
+    def heard(
+        self,
+        compensated: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike | None = None,
+        lengths: Lengths | None = None,
+        *,
+        listener: Mapping[str, Any] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Compute the perceived speech and its reference, for a criterion of your own.
 
         Both signals are in pascals and time-aligned. They are silent after the end of each item,
         and at the missing ear of a listener. Gradients pass through the frozen simulator.
@@ -270,14 +308,20 @@ class HearingLossLoss(nn.Module):
 
         Shape: (..., time) twice -> (..., time) twice; the leading dimensions broadcast with those
             of the ears.
+
+        Returns:
+            The compensated speech as the impaired ear perceives it, and its reference: the clean
+            speech as a normal ear perceives it or, with ``reference="clean"``, as it is.
         """
-        inputs = self._prepare(*arguments, **options)
-        with torch.autocast(inputs.clean.device.type, enabled=False):
-            perceived = self._frozen.simulate(inputs.compensated, inputs.ears, inputs)
-            reference = self._frozen.reference("criterion", inputs, perceived.shape[:-1])
-            if inputs.ends is not None:
-                perceived = silence_after(perceived, inputs.ends)
-                reference = silence_after(reference, inputs.ends)
+        call = self._prepare(compensated, clean, audiogram, lengths, listener)
+        output, clean, ears, lengths, _, options = call
+        with torch.autocast(clean.device.type, enabled=False):
+            perceived = self._frozen.simulate(output, ears, lengths, options)
+            batch = perceived.shape[:-1]
+            reference = self._frozen.reference("criterion", clean, ears, batch, lengths, options)
+            if lengths is not None:
+                perceived = silence_after(perceived, lengths)
+                reference = silence_after(reference, lengths)
             gain = gain_to_pascals(self.full_scale_spl)
             return perceived * gain, reference * gain
 
@@ -292,11 +336,10 @@ class HearingLossLoss(nn.Module):
         self,
         compensated: Tensor,
         clean: Tensor,
-        audiogram: AudiogramLike | None = None,
-        lengths: Lengths | None = None,
-        *,
-        listener: Mapping[str, Any] | None = None,
-    ) -> Inputs:
+        audiogram: AudiogramLike | None,
+        lengths: Lengths | None,
+        listener: Mapping[str, Any] | None,
+    ) -> _Call:
         """Validate the arguments of a call, and silence what does not count."""
         check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
@@ -311,6 +354,8 @@ class HearingLossLoss(nn.Module):
         if listeners or self.ears == "better" or "interaural" in self.criteria:
             check_two_channels(clean)
         ends = None if lengths is None else check_lengths(lengths, clean.shape)
+        if ends is not None and bool((ends == clean.shape[-1]).all()):
+            ends = None
         ears = self.thresholds
         if audiogram is not None:
             ears = as_thresholds(audiogram, allow_missing=True)
@@ -322,25 +367,29 @@ class HearingLossLoss(nn.Module):
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:
             compensated, clean = silence_after(compensated, ends), silence_after(clean, ends)
-        options = listener or {}
         # Only a listener, whose ears are on the CPU, may lack an ear.
         known = ears.isfinite().all(-1) if listeners else None
         ears = on_device(ears, compensated.device)
-        if known is None or bool(known.all()):
-            return Inputs(compensated, clean, ears, ends, None, options)
-        # A missing ear is simulated as a normal one that is given silence.
-        known = known.to(compensated.device, non_blocking=True)
-        compensated = torch.where(known.unsqueeze(-1), compensated, 0.0)
-        clean = torch.where(known.unsqueeze(-1), clean, 0.0)
-        return Inputs(compensated, clean, ears.nan_to_num(), ends, known, options)
+        if known is not None and bool(known.all()):
+            known = None
+        if known is not None:
+            # A missing ear is simulated as a normal one that receives silence.
+            known = known.to(compensated.device, non_blocking=True)
+            compensated = torch.where(known.unsqueeze(-1), compensated, 0.0)
+            clean = torch.where(known.unsqueeze(-1), clean, 0.0)
+            ears = ears.nan_to_num()
+        return _Call(compensated, clean, ears, ends, known, listener or {})
 
-    def _compare(self, inputs: Inputs) -> dict[str, Tensor]:
-        """Return the parts of the loss of each item. Shape: the leading dimensions each."""
-        compensated, clean, ears, ends, known, _ = inputs
-        limited = compensated
+    def _compare(self, call: _Call) -> dict[str, Tensor]:
+        """Compute the parts of the loss for each item, each in the shape of the leading dimensions.
+
+        Args:
+            call: Arguments from ``_prepare``.
+        """
+        output, clean, ears, lengths, known, options = call
         if {"coherent-bands", *SCORES} & self.criteria.keys():
-            limited = coherent_bands.limit_gradient_spikes(compensated, self.sample_rate)
-        perceived = self._frozen.simulate(limited, ears, inputs)
+            output = coherent_bands.limit_gradient_spikes(output, self.sample_rate)
+        perceived = self._frozen.simulate(output, ears, lengths, options)
         batch, time = perceived.shape[:-1], perceived.shape[-1]
         gain = gain_to_pascals(self.full_scale_spl)
 
@@ -348,45 +397,47 @@ class HearingLossLoss(nn.Module):
             """Return a waveform in pascals, (items, time)."""
             return waveform.expand_as(perceived).reshape(-1, time) * gain
 
-        signals = {"perceived": as_items(perceived), "output": as_items(compensated)}
+        signals = {"perceived": as_items(perceived), "output": as_items(call.compensated)}
         for name in self.criteria:
-            if name not in CRITERIA_OF_OUTPUT:
-                signals[name] = as_items(self._frozen.reference(name, inputs, batch))
-        item_ends = [time] * math.prod(batch)
-        if ends is not None:
-            item_ends = ends.expand(batch).flatten().tolist()
-        if all(end == time for end in item_ends):
+            if name not in _CRITERIA_OF_OUTPUT:
+                reference = self._frozen.reference(name, clean, ears, batch, lengths, options)
+                signals[name] = as_items(reference)
+        if lengths is None:
+            ends = [time] * math.prod(batch)
             parts = self._compare_perceived(signals)
         else:
+            ends = lengths.expand(batch).flatten().tolist()
             items = []
-            for item, end in enumerate(item_ends):
+            for item, end in enumerate(ends):
                 alone = {name: signal[item, None, :end] for name, signal in signals.items()}
                 items.append(self._compare_perceived(alone))
             parts = {name: torch.cat([item[name] for item in items]) for name in items[0]}
         for name in self.criteria:
             if name in SCORES:
                 item_ears = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-                pair = as_items(limited), as_items(clean)
-                parts[name] = score_loss(name, *pair, item_ears, item_ends, self.sample_rate)
+                pair = as_items(output), as_items(clean)
+                parts[name] = score_loss(name, *pair, item_ears, ends, self.sample_rate)
         if "interaural" in self.criteria:
-            pair = limited.expand_as(perceived) * gain, clean.expand_as(perceived) * gain
+            pair = output.expand_as(perceived) * gain, clean.expand_as(perceived) * gain
             changes = interaural_loss(*pair, self.sample_rate)
             both_ears = 1.0 if known is None else known.all(-1).to(changes)
             parts["interaural"] = (both_ears * changes).unsqueeze(-1).expand(batch)
         return {name: part.reshape(batch) for name, part in parts.items()}
 
     def _compare_perceived(self, signals: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the parts of the criteria that compare what is perceived.
+        """Compute the parts of the criteria that compare what is perceived.
 
         Args:
-            signals: ``perceived``, ``output``, and the reference of each criterion by its name.
+            signals: ``perceived``, ``output``, and the reference of each criterion by its name,
+                (items, time) each, in pascals.
 
-        Shape: (items, time) each, in pascals -> (items,) each.
+        Returns:
+            Parts by name, (items,) each.
         """
         perceived = signals["perceived"]
         parts: dict[str, Tensor] = {}
         for name, criterion in self.criteria.items():
-            if name in CRITERIA_OF_OUTPUT:
+            if name in _CRITERIA_OF_OUTPUT:
                 continue
             pair = perceived, signals[name]
             if name == "coherent-bands":
@@ -402,14 +453,19 @@ class HearingLossLoss(nn.Module):
         return parts
 
     def _reduce(self, parts: dict[str, Tensor], known: Tensor | None) -> dict[str, Tensor]:
-        """Reduce parts over the ears and the items."""
+        """Reduce the parts of each ear and item as ``ears`` and ``reduction`` demand.
+
+        Args:
+            parts: Parts by name, each in the shape of the leading dimensions.
+            known: Mask of the ears that are not missing, or None if none is missing.
+        """
         if known is not None:
             known = known.expand(next(iter(parts.values())).shape)
         if self.ears == "better":
             losses = weighted_sum(parts, self.weights).detach()
             if known is not None:
                 losses = losses.masked_fill(~known, math.inf)
-            shares = torch.softmax(-losses / TEMPERATURE, -1)
+            shares = torch.softmax(-losses / _TEMPERATURE, -1)
             parts = {name: (shares * part).sum(-1) for name, part in parts.items()}
         elif known is not None and self.reduction == "mean":
             return {name: part[known].mean() for name, part in parts.items()}

@@ -1,6 +1,7 @@
-"""The training criteria of the Neuro-MSBG paper: Equations 2 to 9.
+"""The criterion ``"paper"``: the training losses of the Neuro-MSBG paper, Equations 2 to 9.
 
-Simulators learn by them. As the criterion of a compensator in ``HearingLossLoss`` they have faults:
+They compare an estimate with its target. Simulators are trained by them. As the criterion of a
+compensator in ``HearingLossLoss`` they have faults:
 
 - They are not balanced. The gradient on eight band gains that start at 0 dB is 6.9e-3 for N1,
   2.0e-3 for N3 and 3.5e-6 for N5, and 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for
@@ -41,7 +42,7 @@ SILENT_MAGNITUDE = 1e-7
 
 
 def magnitude_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean square of the difference of magnitudes (Equation 2).
+    """Compute the mean squared difference of the magnitudes of spectra (Equation 2).
 
     Shape: complex (items, frames, bins) twice -> (items,).
 
@@ -53,11 +54,13 @@ def magnitude_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Sum of the anti-wrapped errors of phase, group delay and frequency (Equations 3 to 6).
+    """Compute the mean error of the phase of spectra in radians (Equations 3 to 6).
 
-    The value is the paper's. Its gradient is 1 / magnitude, so that the inaudible bins would
-    dominate it; it is faded out where the estimate or the target is fainter than a tone of 20 dB
-    SPL.
+    This is the sum of three means: of the distance between the phases, and of the distances between
+    their differences from frequency to frequency (group delay) and from frame to frame
+    (instantaneous frequency). The gradient of a phase is 1 / magnitude, so that inaudible
+    frequencies would dominate it; it is faded out where the estimate or the target is fainter than
+    a tone of 20 dB SPL.
 
     Shape: complex (items, frames, bins) twice -> (items,).
 
@@ -75,9 +78,9 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def complex_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Twice the mean square of real and imaginary differences (Equation 7).
+    """Compute twice the mean squared difference of real and imaginary parts (Equation 7).
 
-    Shape: (items, frames, bins) twice -> (items,).
+    Shape: complex (items, frames, bins) twice -> (items,).
 
     >>> spectrum = torch.full((1, 3, 201), 2.0 + 0.0j)
     >>> complex_loss(spectrum, -spectrum)
@@ -88,7 +91,7 @@ def complex_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def time_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of waveforms (Equation 8).
+    """Compute the mean absolute difference of waveforms (Equation 8).
 
     Shape: (items, time) twice -> (items,).
 
@@ -99,9 +102,11 @@ def time_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def anti_wrap(angle: Tensor) -> Tensor:
-    """Distance of an angle from the nearest multiple of 2 pi (Ai and Ling 2023).
+    """Compute the distance of angles from the nearest multiple of 2 pi, a whole turn, in radians.
 
-    Any shape, in radians.
+    Shape: (...) -> (...).
+
+    Source: Ai and Ling (2023).
 
     >>> anti_wrap(torch.tensor([0.5, 2.0 * math.pi - 0.5])).round(decimals=3)
     tensor([0.5000, 0.5000])
@@ -111,7 +116,9 @@ def anti_wrap(angle: Tensor) -> Tensor:
 
 
 def paper_stft(sample_rate: int) -> STFT:
-    """Return the paper's transform, windows of 25 ms every 6.25 ms, at another sample rate.
+    """Return the paper's short-time Fourier transform for a sample rate in Hz.
+
+    Its windows are 25 ms long, one every 6.25 ms.
 
     >>> paper_stft(48000).window
     1200
@@ -123,17 +130,18 @@ def paper_stft(sample_rate: int) -> STFT:
 def paper_parts(
     estimate: Tensor, target: Tensor, stft: STFT = PAPER_STFT, frequencies: int | None = None
 ) -> dict[str, Tensor]:
-    """Return the paper's four losses of each item by name.
+    """Compute the paper's four losses: of magnitudes, phases, complex spectra and waveforms.
 
     Args:
-        estimate: Waveform to judge.
-        target: Waveform that it should equal.
-        stft: Transform. Spectra are scaled to the magnitudes of the paper's transform, so that the
-            sample rate changes no level, and the magnitude and complex losses to its number of
-            frequencies, so that an empty band changes nothing.
+        estimate: Waveforms to judge, (items, time).
+        target: Waveforms that they should equal, (items, time).
+        stft: Short-time Fourier transform. Spectra are scaled to the magnitudes of the paper's
+            transform, so that the sample rate changes no level, and the magnitude and complex
+            losses to its number of frequencies, so that an empty band changes nothing.
         frequencies: Number of frequencies to compare, from 0 Hz up; all if None.
 
-    Shape: (items, time) twice -> (items,) each.
+    Returns:
+        ``magnitude``, ``phase``, ``complex`` and ``time`` of each item, (items,) each.
 
     >>> speech = torch.randn(1, 16000)
     >>> parts = paper_parts(speech, speech)
@@ -188,7 +196,7 @@ class _FadedPhaseDifference(torch.autograd.Function):
 
 
 def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both parts.
+    """Return the real and the imaginary part of spectra.
 
     Near silence, where the angle is rounding, the real part is small and positive.
     """

@@ -1,4 +1,7 @@
-"""Differences in dB between the output of a simulator and that of its teacher."""
+"""Training losses of simulators: differences in dB between an estimate and its target.
+
+The estimate is the output of a network, the target that of the simulator from which it learns.
+"""
 
 import torch
 from torch import Tensor
@@ -12,7 +15,7 @@ SPECTRAL_FLOOR = 1e-12
 
 
 def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:
-    """Power of the error over that of the target in dB: the negative signal-to-noise ratio.
+    """Compute the power of the error over that of the target in dB, the negative SNR.
 
     It is -60 dB at least, so that silent items and perfect ones do not outweigh the others.
 
@@ -29,7 +32,9 @@ def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def log_spectral_distance_db(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of log spectra in dB, down to 60 dB below each item's strongest bin.
+    """Compute the mean absolute difference between spectra in dB.
+
+    Powers count from 60 dB below the strongest one of each item.
 
     Shape: (items, time) twice -> (items,).
 

@@ -14,11 +14,11 @@ from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import (
     BANDS,
     DEPTH,
-    audibility,
+    audibility_threshold,
+    audibility_weights,
     band_edges,
     band_level_loss,
     band_levels,
-    least_audible,
     threshold_in_quiet,
 )
 from tests.losses.signals import RATE, excerpt, filter_by_gain, frequencies
@@ -97,11 +97,11 @@ def test_audibility_rises_from_the_threshold_or_40_db_below_the_loudest_band() -
     levels = torch.full((2, 5, BANDS), -20.0)
     levels[0, 2:, 10] = torch.tensor([60.0, 30.0, 19.0])
     levels[1, 2, 10] = 15.0
-    threshold = least_audible(levels)
+    threshold = audibility_threshold(levels)
     # In the lowest band, the threshold in quiet is higher.
     assert threshold[0, 0, 1:].tolist() == [60.0 - DEPTH] * (BANDS - 1)
     np.testing.assert_allclose(threshold[1, 0].numpy(), threshold_in_quiet(), rtol=1e-6)
-    weights = audibility(levels, threshold)
+    weights = audibility_weights(levels, threshold)
     assert weights[0, 2:, 10].tolist() == pytest.approx([1.0, 0.5, 0.0])
     assert 0.0 < weights[1, 2, 10] < 1.0 and weights[1].count_nonzero() == 1
 
@@ -131,7 +131,7 @@ def test_inaudible_band_keeps_its_gradient(voice: Tensor, attenuation: float) ->
     perceived = filter_by_gain(normal, gain * ((hz > 2000.0) & (hz < 4000.0)))
     (gradient,) = torch.autograd.grad(band_level_loss(perceived, normal, RATE).mean(), gain)
     levels = band_levels(normal, RATE)
-    weights = audibility(levels, least_audible(levels))
+    weights = audibility_weights(levels, audibility_threshold(levels))
     inside = torch.from_numpy((band_edges()[:-1] > 2000.0) & (band_edges()[1:] < 4000.0))
     share = (weights * inside).sum((-2, -1)) / weights.sum((-2, -1))
     assert float(gradient) < -0.8 * float(share.mean())
