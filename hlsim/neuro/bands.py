@@ -1,4 +1,8 @@
-"""A small network that corrects MSBG's known gains at a fraction of the full network's cost."""
+"""A small network that corrects the prior's gains, at a fraction of the full network's cost.
+
+The prior (``hlsim.neuro.prior``) estimates MSBG's gains in each channel of its filter bank by its
+own formulae. The network works on channels, and on *steps* of a few frames of the spectrogram.
+"""
 
 import math
 
@@ -15,20 +19,22 @@ MAX_SLOPE = 6.0
 
 
 class BandCorrection(nn.Module):
-    """Network that simulates MSBG on a spectrum by correcting the gains of its prior.
+    """Network that simulates MSBG on a spectrogram, by correcting the gains of the prior.
 
-    The spectrum is smeared and multiplied by the corrected gains of MSBG's channels. The network
-    reads the fluctuation of each channel's level about its envelope, and the difference of the
-    envelopes of neighbouring channels, neither of which depends on the level. It predicts a
-    correction of each channel's envelope, a factor on its gain and, optionally, a phase.
+    The spectrogram is smeared and multiplied by the corrected gains of MSBG's channels. The inputs
+    of the network are the fluctuation of each channel's level about its envelope (the smoothed
+    level), and the difference between the envelopes of neighbouring channels. Neither changes with
+    the level of the signal. The network predicts a correction of each channel's envelope, a factor
+    on its gain and, optionally, a phase.
 
-    Severities have different filters, so each has its own first and last layer. The last layer is 0
-    before training, and the output is that of the prior.
+    The degrees of hearing loss, or severities, have different filter banks in MSBG. Each has
+    its own first and last layer. Before training the last layer is 0, and the output is that of the
+    prior.
 
     Args:
-        config: ``channels`` is the width of the network, ``blocks`` the number of its blocks,
-            ``stride[0]`` the number of frames per step, and ``kernel[0]`` the length of the
-            convolutions in steps.
+        config: Settings of which these are used: ``channels``, the width of the network;
+            ``blocks``, the number of its blocks; ``stride[0]``, the number of frames per step;
+            ``kernel[0]``, the length of the convolutions in steps; ``expansion`` and ``phase``.
 
     >>> import torch
     >>> from hlsim.audiogram import severity_index
@@ -55,16 +61,16 @@ class BandCorrection(nn.Module):
         self.leave = nn.Parameter(torch.zeros(severities, outputs, width))
 
     def forward(self, spectrum: Tensor, ears: Tensor, severity: Tensor, prior: Prior) -> Tensor:
-        """Simulate MSBG on the spectra of filtered signals.
+        """Return the spectrogram that ears perceive.
 
         Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
             frequencies).
 
         Args:
-            spectrum: Spectra of the output of ``prior.filter``.
-            ears: Audiograms in dB HL.
-            severity: Index of each ear's severity.
-            prior: Known gains of MSBG.
+            spectrum: Spectrogram of the output of ``prior.filter``.
+            ears: Thresholds in dB HL.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
+            prior: Estimate of MSBG's gains.
         """
         smeared, smeared_power = prior.smear(spectrum, severity)
         levels = prior.channel_levels(smeared_power, severity)
@@ -93,7 +99,7 @@ class BandCorrection(nn.Module):
         return smeared * torch.view_as_complex(factors)
 
     def _features(self, log_levels: Tensor, log_envelope: Tensor) -> Tensor:
-        """Compute the input of the network.
+        """Compute the input of the network: fluctuations, and differences of envelopes.
 
         The last frame is repeated where the last step is incomplete.
 

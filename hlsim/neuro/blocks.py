@@ -1,7 +1,7 @@
-"""Dual-path blocks along time and along frequency: convolutional, Mamba, LSTM or Transformer.
+"""Dual-path blocks: layers along time, followed by layers along frequency, of four kinds.
 
-Feature maps have the shape (items, time, frequency, channels), for which layers across channels are
-matrix products.
+The layers are convolutions, Mamba, LSTM or Transformer. Feature maps have the shape (items, time,
+frequency, channels), because layers across channels are then matrix products.
 """
 
 from typing import Any, Self, cast
@@ -15,10 +15,11 @@ from hlsim.neuro.mamba import Mamba
 
 
 class ConvPath(nn.Module):
-    """The paper's convolutional block along one axis.
+    """The convolutional layers of a block, along time or along frequency.
 
-    It is a residual sequence of a convolution per channel, a linear expansion, a ReLU and a
-    transposed convolution of length 1.
+    They are a convolution of each channel, a linear expansion to more channels, a ReLU and a
+    transposed convolution of length 1 back to the number of channels. Their output is added to the
+    input. Source: the Neuro-MSBG paper, Section III.
 
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
@@ -47,17 +48,17 @@ class ConvPath(nn.Module):
 
 
 class SequencePath(nn.Module):
-    """A layer for sequences along one axis.
+    """A Mamba, LSTM or Transformer layer of a block, along time or along frequency.
 
-    It is a residual sequence of layer normalisation, the layer, and a transposed convolution of
-    length 1.
+    Layer normalisation, the layer and a transposed convolution of length 1 follow each other, and
+    their output is added to the input.
 
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
         channels: Number of channels.
         axis: 0 for time, 1 for frequency. Each row along this axis is a sequence.
-        core: Layer for sequences, (sequences, length, channels) -> (sequences, length, width).
+        core: The layer, (sequences, length, channels) -> (sequences, length, width).
         width: Number of channels of the layer's output.
 
     >>> path = SequencePath(8, axis=0, core=BidirectionalLSTM(8, hidden=4), width=8)
@@ -82,13 +83,13 @@ class SequencePath(nn.Module):
 
 
 class BidirectionalMamba(nn.Module):
-    """Two Mambas, one of them backwards in time.
+    """Two Mamba layers, one of which runs backwards, and whose outputs are concatenated.
 
     Shape: (sequences, length, channels) -> (sequences, length, 2 * channels).
 
     Args:
         channels: Number of channels of the input.
-        states: Number of states per inner channel.
+        states: Number of states, values that remember the past, per inner channel.
         expansion: Number of inner channels relative to ``channels``.
 
     >>> BidirectionalMamba(8, states=4, expansion=2)(torch.randn(3, 20, 8)).shape
@@ -105,7 +106,9 @@ class BidirectionalMamba(nn.Module):
 
 
 class BidirectionalLSTM(nn.Module):
-    """An LSTM in both directions. Shape: (sequences, length, channels) -> (..., 2 * hidden).
+    """An LSTM that runs forwards and backwards, and whose outputs are concatenated.
+
+    Shape: (sequences, length, channels) -> (sequences, length, 2 * hidden).
 
     Args:
         channels: Number of channels of the input.
@@ -120,10 +123,10 @@ class BidirectionalLSTM(nn.Module):
         self.lstm = nn.LSTM(channels, hidden, batch_first=True, bidirectional=True)
 
     def train(self, mode: bool = True) -> Self:
-        """Set the mode, and leave the LSTM in training mode.
+        """Set the mode of this module, but leave the LSTM in training mode.
 
-        Otherwise cuDNN computes no gradient. The mode has no other effect, because there is no
-        dropout.
+        In evaluation mode cuDNN computes no gradient. The mode has no other effect, because there
+        is no dropout.
         """
         super().train(mode)
         self.lstm.train()
@@ -138,10 +141,10 @@ class BidirectionalLSTM(nn.Module):
 
 
 class EncoderLayer(nn.TransformerEncoderLayer):
-    """Transformer encoder layer without dropout, always in training mode.
+    """Transformer layer (self-attention and a feed-forward layer) whose memory grows with length.
 
     In evaluation mode, torch would keep the attention of all pairs of times in memory, 64 GiB for
-    one minute of signal.
+    one minute of signal. The layer therefore stays in training mode, and has no dropout.
 
     Shape: (sequences, length, channels) -> (sequences, length, channels).
 
@@ -159,7 +162,7 @@ class EncoderLayer(nn.TransformerEncoderLayer):
         super().__init__(channels, heads, hidden, dropout=0.0, **options)
 
     def train(self, mode: bool = True) -> Self:
-        """Leave the layer in training mode."""
+        """Leave the layer in training mode, whatever the mode."""
         return super().train(True)
 
     def forward(self, src: Tensor, *args: Any, **options: Any) -> Tensor:
@@ -171,13 +174,13 @@ class EncoderLayer(nn.TransformerEncoderLayer):
 
 
 class DualPathBlock(nn.Sequential):
-    """A path along time, followed by a path along frequency.
+    """Layers along time, followed by layers along frequency.
 
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
-        config: Kind and sizes of the paths.
-        time_alone: Leave out the path along frequency, as in the monolithic baselines.
+        config: Kind and sizes of the layers.
+        time_alone: Leave out the layers along frequency, as in the paper's monolithic baselines.
 
     >>> from hlsim.neuro.config import NeuroConfig
     >>> DualPathBlock(NeuroConfig(channels=8))(torch.randn(1, 20, 5, 8)).shape
@@ -192,7 +195,7 @@ class DualPathBlock(nn.Sequential):
 
 
 def _build_path(config: NetworkConfig, axis: int) -> nn.Module:
-    """Build the path that ``config.block`` names, along time (0) or frequency (1)."""
+    """Build the layers that ``config.block`` names, along time (axis 0) or frequency (axis 1)."""
     channels = config.channels
     inner = config.expansion * channels
     core: nn.Module

@@ -1,4 +1,4 @@
-"""Settings of the networks, which can be saved as JSON."""
+"""Settings of the networks: dataclasses that a checkpoint stores as JSON."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _MAX_SIZES = {
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Base of the settings of a model, a dataclass that can be saved as JSON.
+    """Base class of the settings of a model, which can be converted to JSON and back.
 
     >>> NeuroConfig.from_dict({"channels": 32}).to_dict()["channels"]
     32
@@ -43,10 +43,13 @@ class ModelConfig:
 
     @classmethod
     def from_optional(cls, config: Self | None) -> Self:
-        """Return a configuration, or the default one in place of None.
+        """Return the settings that a caller passed, or the default ones if it passed None.
+
+        Args:
+            config: Settings of this class, or None.
 
         Raises:
-            ValueError: The configuration is of another class.
+            ValueError: The settings are of another class.
         """
         if config is None:
             return cls()
@@ -63,7 +66,7 @@ class ModelConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Build a configuration from a dictionary of ``to_dict``.
+        """Build settings from a dictionary, for example one that ``to_dict`` returned.
 
         Args:
             data: Values of settings by name. Missing settings have their default values.
@@ -81,7 +84,10 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig(ModelConfig):
-    """Sizes that simulators and compensators share.
+    """Sizes of the networks on spectrograms: Neuro-MSBG and ``MappingCompensator``.
+
+    Such a network encodes the spectrogram of its input on a coarser grid, processes it in
+    *dual-path blocks* (layers along time, then layers along frequency), and decodes it again.
 
     Attributes:
         fft: Length of the Fourier transform in samples at 16 kHz.
@@ -89,8 +95,8 @@ class NetworkConfig(ModelConfig):
         hop: Samples at 16 kHz from one frame to the next, at most a quarter of ``window``.
         channels: Number of feature maps of the network.
         dense_depth: Number of dilated convolutions of the encoder and of each decoder.
-        stride: Time and frequency steps of the encoder, which the decoders undo.
-        block: Kind of the layers along each axis.
+        stride: Frames and frequencies of the spectrogram per point of the feature maps.
+        block: Kind of the layers in the blocks: ``cnn``, ``mamba``, ``lstm`` or ``transformer``.
         blocks: Number of dual-path blocks.
         kernel: Lengths of a ``cnn`` block's convolutions along time and frequency, odd numbers.
         expansion: Width inside a block relative to ``channels``. It applies to the pointwise layers
@@ -153,12 +159,12 @@ class NetworkConfig(ModelConfig):
 
     @property
     def stft(self) -> STFT:
-        """Short-time Fourier transform of the network."""
+        """Short-time Fourier transform with which the network computes spectrograms."""
         return STFT(self.fft, self.window, self.hop)
 
     @property
     def hz(self) -> tuple[float, ...]:
-        """Frequencies of the transform in Hz."""
+        """Frequencies of the spectrogram in Hz."""
         return tuple(NEURO_RATE * k / self.fft for k in range(self.fft // 2 + 1))
 
     @property
@@ -168,15 +174,18 @@ class NetworkConfig(ModelConfig):
 
     @property
     def density(self) -> float:
-        """Number of values of the widest feature map per sample."""
+        """Number of values of the largest tensor in the network per sample of its input.
+
+        It decides how many samples the network processes at a time.
+        """
         rows = -(-self.stft.frequencies // self.stride[1])
         return self.channels * self.expansion * rows / self.step
 
     @property
     def receptive_field(self) -> int | None:
-        """Number of samples on either side on which a sample of the output depends.
+        """Number of samples before and after a sample of the output on which it depends.
 
-        None if the output depends on the whole signal.
+        None if the output depends on the whole signal, as with layers other than convolutions.
         """
         if self.block != "cnn":
             return None
@@ -195,17 +204,18 @@ class NeuroConfig(NetworkConfig):
         structure: ``dual-path``, ``monolithic`` or ``bands``. The monolithic baselines of the paper
             have no encoder and no frequency axis: each frame is a vector of ``channels`` values,
             and the blocks run along time only. ``bands`` is a network along time that corrects the
-            gains of the prior (``hlsim.neuro.bands``) at a third of the cost.
+            gains in MSBG's frequency channels (``hlsim.neuro.bands``) at a third of the cost.
         audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation
-            1), or ``concatenated`` for eight levels next to magnitude and phase along frequency
+            1), or ``concatenated`` for eight thresholds next to magnitude and phase along frequency
             (its Table IV).
         phase: ``predicted``, or ``input`` for a network that changes the magnitude only (Table
             III).
-        prior: Start from MSBG's known gains (``hlsim.neuro.prior``), which the network corrects.
-            Without them it learns everything, as in the paper.
-        level_aware: Use the log magnitude and no normalisation. Otherwise the level does not affect
-            the network, as in MP-SENet: each utterance is scaled to unit RMS and back, and instance
-            normalisation follows the convolutions.
+        prior: Compute MSBG's gains by its formulae (``hlsim.neuro.prior``), and correct them by the
+            network. Otherwise the network learns everything, as in the paper.
+        level_aware: Use the log magnitude and no normalisation, so that the output depends on the
+            level as it does in an ear. Otherwise the level has no effect, as in MP-SENet: each
+            signal is scaled to an RMS of 1 and back, and instance normalisation follows the
+            convolutions.
 
     Raises:
         ValueError: A value is out of range, or values do not fit together.

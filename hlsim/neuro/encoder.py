@@ -1,4 +1,4 @@
-"""Encoders of input channels, among them the audiogram, to feature maps."""
+"""Encoders: they turn a spectrogram and an audiogram into the feature maps of a network."""
 
 import torch
 from torch import Tensor, nn
@@ -6,9 +6,10 @@ from torch.nn import functional
 
 
 def log_magnitude(squared: Tensor) -> Tensor:
-    """Compute half the logarithm of magnitudes from their squares. Silence gives -6.3.
+    """Compute half the natural logarithm of magnitudes, an input channel of the networks.
 
-    Shape: (...) -> (...).
+    Args:
+        squared: Squared magnitudes, any shape. For 0, the result is -6.3.
 
     >>> log_magnitude(torch.tensor([1.0, 0.0])).round(decimals=1)
     tensor([ 0.0000, -6.3000])
@@ -17,14 +18,13 @@ def log_magnitude(squared: Tensor) -> Tensor:
 
 
 def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
-    """Compute the sine of the phase of spectra, which fades to 0 in silence.
+    """Compute the sine of the phase of spectra, an input channel of the networks.
 
-    Its gradient is finite in silence. Unlike the phase, it has no jump at pi.
-
-    Shape: complex (...), (...) -> (...).
+    Unlike the phase, it has no jump at pi. In silence it fades to 0 with a finite gradient.
 
     Args:
-        squared: Squared magnitude of the spectra.
+        spectrum: Complex spectra, any shape.
+        squared: Their squared magnitudes, of the same shape.
 
     >>> spectrum = torch.tensor([2.0j, 0.0j])
     >>> sine_of_phase(spectrum, torch.tensor([4.0, 0.0])).round(decimals=3)
@@ -34,14 +34,14 @@ def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
 
 
 class AudiogramEncoder(nn.Module):
-    """Encoder of an audiogram to one value per frequency.
+    """Encoder of an audiogram to one value per frequency, an input channel of the networks.
 
-    It is a convolution with 16 feature maps, a ReLU, average pooling, and a linear layer.
+    It consists of a convolution with 16 feature maps, a ReLU, average pooling and a linear layer.
 
     Source: the Neuro-MSBG paper, Equation 1.
 
     Args:
-        frequencies: Number of frequencies of the spectrum.
+        frequencies: Number of frequencies of the spectrogram.
 
     >>> AudiogramEncoder(201)(torch.full((2, 8), 40.0)).shape
     torch.Size([2, 201])
@@ -68,7 +68,8 @@ class Unit(nn.Sequential):
     Args:
         conv: The convolution.
         channels: Number of channels of its output.
-        normalise: Add the normalisation, which makes the output independent of the level.
+        normalise: Normalise each item and channel, so that the output does not depend on the level
+            of the input.
 
     >>> Unit(DilatedConv(2, 8, 1), 8, normalise=True)(torch.randn(1, 2, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
@@ -80,14 +81,16 @@ class Unit(nn.Sequential):
 
 
 class DilatedConv(nn.Conv2d):
-    """A 3 x 3 convolution that is dilated in time and keeps the size of its input.
+    """A 3 x 3 convolution that skips frames, so that it covers more time with as many weights.
+
+    The output has as many frames and frequencies as the input.
 
     Shape: (items, inputs, time, frequency) -> (items, outputs, time, frequency).
 
     Args:
         inputs: Number of channels of the input.
         outputs: Number of channels of the output.
-        dilation: Frames between the points of the kernel.
+        dilation: Distance in frames of the three frames that the convolution reads.
 
     >>> DilatedConv(2, 8, dilation=4)(torch.randn(1, 2, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
@@ -119,7 +122,7 @@ class DenseBlock(nn.Module):
     Args:
         channels: Number of channels.
         depth: Number of convolutions. With 0, the output is the input.
-        normalise: Normalise the output of each convolution.
+        normalise: Normalise the output of each convolution per item and channel.
 
     >>> DenseBlock(8, depth=2, normalise=False)(torch.randn(1, 8, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
@@ -140,7 +143,7 @@ class DenseBlock(nn.Module):
 
 
 class DenseEncoder(nn.Module):
-    """Encoder of input channels to feature maps on a coarser grid.
+    """Encoder of the input channels, such as magnitude and phase, to coarser feature maps.
 
     Shape: (items, inputs, time, frequency) -> (items, channels, ceil(time / stride[0]),
         ceil(frequency / stride[1])).
@@ -150,9 +153,9 @@ class DenseEncoder(nn.Module):
     Args:
         inputs: Number of input channels.
         channels: Number of feature maps.
-        depth: Number of convolutions of the dense block.
-        stride: Time and frequency steps of the feature maps.
-        normalise: Normalise the output of each convolution.
+        depth: Number of dilated convolutions after the first one.
+        stride: Frames and frequencies of the input per point of the feature maps.
+        normalise: Normalise the output of each convolution per item and channel.
 
     >>> encoder = DenseEncoder(3, 8, depth=0, stride=(4, 3), normalise=False)
     >>> encoder(torch.randn(1, 3, 20, 65)).shape
@@ -174,7 +177,7 @@ class DenseEncoder(nn.Module):
 
 
 class FrameEncoder(nn.Module):
-    """Linear encoder of each frame to one vector, for the monolithic baselines.
+    """Linear encoder of each frame to a vector, for the paper's baselines without a frequency axis.
 
     Shape: (items, inputs, time, frequency) -> (items, channels, time, 1).
 

@@ -13,13 +13,16 @@ from hlsim.neuro.scan import selective_scan
 
 
 class Mamba(nn.Module):
-    """A causal selective state space model along sequences.
+    """A causal layer for sequences, whose recursive filters depend on the sequence.
+
+    It is the selective state space model of Gu and Dao. The names of arguments and parameters are
+    those of ``mamba_ssm``.
 
     Shape: (items, time, d_model) -> (items, time, d_model).
 
     Args:
         d_model: Number of channels of the sequence.
-        d_state: Number of states per inner channel.
+        d_state: Number of states, values that remember the past, per inner channel.
         expand: Number of inner channels relative to ``d_model``.
 
     >>> Mamba(16, d_state=4)(torch.randn(2, 20, 16)).shape

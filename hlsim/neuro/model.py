@@ -36,28 +36,29 @@ MAX_LOG_MASK = 4.0
 
 
 class NeuroMSBG(EarNetwork):
-    """Simulator of an impaired ear: a neural network that emulates MSBG, time-aligned.
+    """Simulator of an impaired ear: a neural network that emulates MSBG, but faster.
 
-    The input channels are the magnitude, the phase and the encoded audiogram. A dense encoder and
-    dual-path blocks follow. Two decoders predict a mask for the magnitude and a phase shift, and
-    the inverse transform computes the waveform.
+    The output is what the ear perceives, time-aligned with the input. The network multiplies the
+    spectrogram of the input by a complex factor at each point. Its input channels are magnitude,
+    phase and the encoded audiogram. An encoder and dual-path blocks (layers along time, then along
+    frequency) follow, and two decoders predict the magnitude and the phase of the factor.
 
-    With ``config.prior``, the spectrum is first multiplied by MSBG's known gains, which are also
-    the fourth input channel, and the decoders correct them. With the structure ``bands``, a smaller
-    network corrects the gains of MSBG's channels.
+    With ``config.prior``, the spectrogram is first multiplied by an estimate of MSBG's gains by its
+    own formulae, which is also the fourth input channel, and the network corrects it. With the
+    structure ``bands``, a smaller network corrects the gains in MSBG's frequency channels.
 
-    ``torch.func.grad`` works with all blocks. On a CPU, second derivatives work with ``cnn`` and
-    ``lstm`` blocks.
+    ``torch.func.grad`` works with all kinds of blocks. On a CPU, second derivatives work with
+    ``cnn`` and ``lstm`` blocks.
 
     Source: the Neuro-MSBG paper, Section III and Equation 1.
 
     Args:
-        config: Sizes and choices.
+        config: Sizes and choices, by default ``NeuroConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
             the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
-        compute_prior: Compute MSBG's known gains, which takes half a second. Otherwise they are
-            undefined until a state dict is loaded.
+        compute_prior: Compute the constants of MSBG's formulae, which takes half a second. With
+            False, they are undefined until a state dict is loaded.
 
     Attributes:
         emulates_msbg: Whether the simulator emulates MSBG.
@@ -139,7 +140,7 @@ class NeuroMSBG(EarNetwork):
         return self._simulate(signals / rms, ears) * rms
 
     def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Compute outputs from inputs in the scale of the network.
+        """Compute what ears perceive, from signals in pascals or scaled to an RMS of 1.
 
         Shape: (items, time), (items, 8) -> (items, time).
         """
@@ -166,7 +167,7 @@ class NeuroMSBG(EarNetwork):
         severity: Tensor,
         prior_factor: Tensor | None,
     ) -> Tensor:
-        """Predict the factor on the spectrum, besides that of the prior.
+        """Predict the factor on the spectrogram, in addition to that of the prior.
 
         Shape: (items, frames, frequencies), the same, (items, 8), (items,), (items, frames,
             frequencies) -> complex (items, frames, frequencies), or real without a predicted phase.
@@ -217,13 +218,15 @@ class NeuroMSBG(EarNetwork):
 def load_pretrained(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
 ) -> NeuroMSBG:
-    """Load a trained Neuro-MSBG, frozen and in eval mode, without downloads.
+    """Load a trained Neuro-MSBG, in evaluation mode and with weights that are not trained further.
+
+    Nothing is downloaded.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or a checkpoint
-            folder.
+        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or the folder of
+            a checkpoint. ``hlsim.list_pretrained`` lists the names.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, or it is no simulator.

@@ -1,4 +1,4 @@
-"""Base of all networks that process a waveform for an ear."""
+"""Base class of the networks that process a waveform for an ear: calibration, rates and memory."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ _DEVICE_SAMPLES = 960_000
 
 
 class EarNetwork(nn.Module):
-    """Network from waveform and audiogram to waveform, which works in pascals at 16 kHz.
+    """Base class of networks from waveform and audiogram to waveform.
 
+    The class converts the input to pascals at 16 kHz, and the output back to its scale and rate.
     Subclasses set ``config`` and implement ``_process``.
 
-    On a CPU, a few items run at a time. Long signals run in overlapping blocks if the network's
-    receptive field is limited (``cnn`` blocks). Blocks change neither the output nor, without
-    gradients, the memory that the network needs beside its output.
+    On a CPU, a few items run at a time. Long signals run in overlapping parts if a sample of the
+    output depends on a limited part of the input (``cnn`` blocks). This changes no output, and
+    limits the memory for signals of any length if no gradient is computed.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
@@ -46,8 +47,8 @@ class EarNetwork(nn.Module):
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Attributes:
-        checkpoint: Compute activations again in the backward pass, a few items or one block at a
-            time, instead of storing them. False by default.
+        checkpoint: Whether activations are computed again in the backward pass, a few items or one
+            part at a time, instead of being stored. False by default.
 
     Raises:
         ValueError: The rate or the level is out of range.
@@ -71,13 +72,14 @@ class EarNetwork(nn.Module):
         Shape: (..., time) -> (..., time).
 
         Args:
-            audiogram: One audiogram, or audiograms of shape (..., 8) in dB HL that broadcast to the
-                leading dimensions of the waveform. Of an ``Audiogram``, the levels at eight
-                frequencies count, ``Audiogram.thresholds``, from which networks learn.
+            waveform: Input signals.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) in dB HL broadcasts
+                over the leading dimensions of the waveform. Of an ``Audiogram`` with other
+                frequencies, the network gets ``Audiogram.thresholds``, the eight interpolated ones.
 
         Raises:
-            ValueError: There is no audiogram, its levels are outside -10 to 100 dB HL, the shapes
-                do not broadcast, or the waveform is on another device than the weights.
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
+                not broadcast, or the waveform is on another device than the weights.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         # Replicas of nn.DataParallel list no parameters.
@@ -103,7 +105,7 @@ class EarNetwork(nn.Module):
             return torch.cat(outputs).reshape(*batch, -1).to(waveform.dtype)
 
     def _items_at_once(self, signals: Tensor) -> int:
-        """Number of items that run at once."""
+        """Return the number of items that run at once."""
         on_cpu = signals.device.type == "cpu"
         if torch.compiler.is_compiling() or not (on_cpu or self.checkpoint):
             return len(signals)
@@ -122,7 +124,7 @@ class EarNetwork(nn.Module):
         return self._finish(output) / gain
 
     def _run_blocks(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Process long signals in blocks if the output is the same, and others at once.
+        """Process long signals in parts if the receptive field is limited, and others at once.
 
         Shape: (items, time), (items, 8) -> (items, time).
         """
@@ -132,9 +134,9 @@ class EarNetwork(nn.Module):
             process = partial(checkpoint, process, use_reentrant=False, preserve_rng_state=False)
         if self._receptive_field is None or torch.compiler.is_compiling():
             return process(signals, ears)
-        unit, field = self._receptive_field
+        step, field = self._receptive_field
         hop = self._samples_at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES
-        blocks = split_into_blocks(signals.shape[-1], hop, field, field, unit)
+        blocks = split_into_blocks(signals.shape[-1], hop, field, field, step)
         outputs = [block.cut_output(process(block.cut_input(signals), ears)) for block in blocks]
         return outputs[0] if len(outputs) == 1 else torch.cat(outputs, -1)
 
@@ -146,9 +148,10 @@ class EarNetwork(nn.Module):
 
     @property
     def _receptive_field(self) -> tuple[int, int] | None:
-        """Unit of blocks, and samples on either side on which a sample of the output depends.
+        """Step and receptive field in samples at 16 kHz; None if the field is the whole signal.
 
-        Blocks start at multiples of the unit. None if the output depends on the whole signal.
+        Parts of a signal must start at multiples of the step. The receptive field is the number of
+        samples before and after a sample of the output on which it depends.
         """
         raise NotImplementedError
 
@@ -158,9 +161,15 @@ class EarNetwork(nn.Module):
         raise NotImplementedError
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Process pascals at 16 kHz. Shape: (items, time), (items, 8) -> (items, time)."""
+        """Process signals in pascals at 16 kHz for ears in dB HL.
+
+        Shape: (items, time), (items, 8) -> (items, time).
+        """
         raise NotImplementedError
 
     def _finish(self, result: Tensor) -> Tensor:
-        """Process the result at the sample rate. Shape: (items, time) -> (items, time)."""
+        """Return the output in pascals from the result at the sample rate of the input.
+
+        Shape: (items, time) -> (items, time).
+        """
         return result

@@ -1,7 +1,19 @@
-"""MSBG's known gains, from which a network starts: smearing, envelopes and gains on short frames.
+"""The prior: an estimate of what MSBG does to a spectrogram, by MSBG's own formulae.
 
-The weights are computed from MSBG's formulae for each severity. A network learns corrections of
-them.
+A network that starts from it has to learn corrections only. The steps are those of MSBG, on frames
+of 8 ms instead of single samples:
+
+1. ``filter`` applies the fixed filter of the ear to the waveform.
+2. *Smearing* spreads the power of each frame over neighbouring frequencies, as the broad filters of
+   an impaired ear do.
+3. The power in each *channel* of MSBG's filter bank gives a level, and the level, smoothed over
+   time, an *envelope*.
+4. *Recruitment*, the fast growth of loudness of an impaired ear, turns the envelope into a gain.
+5. The channels are added up with their gains. Relative to their sum without gains, this is a
+   complex factor at each frequency.
+
+The *severity* of a loss is its degree, 0 (none) to 3 (severe). As in MSBG, it selects the filter
+bank and the smearing.
 """
 
 import math
@@ -65,21 +77,18 @@ _GRID_RATIO = 160
 
 
 class Prior(nn.Module):
-    """MSBG's gains, estimated on the frames of a short transform.
+    """An estimate of the complex factors by which MSBG multiplies a spectrogram.
 
-    A matrix smears the power of each frame. The sum of the power in each channel of the filter bank
-    gives its level, whose smoothed values are the envelope, which recruitment turns into a gain.
-    The channels are added up with these gains, relative to their sum without gains. That sum is a
-    fixed filter, which ``filter`` applies to the waveform beforehand.
+    The constants of MSBG's formulae are computed for each severity. Each has a correction that is
+    trained, and has no effect before training.
 
     Args:
         stft: Transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
-        compute: Compute the known values. Otherwise they are undefined until a state dict is
-            loaded.
+        compute: Compute the constants. With False, they are undefined until a state dict is loaded.
 
     Attributes:
-        receptive_field: Number of samples on either side on which a sample of the output depends,
-            besides those of the transform.
+        receptive_field: Number of samples before and after a sample of the output on which it
+            depends, in addition to those of the transform.
 
     >>> stft = STFT(128, 128, 32)
     >>> factor = Prior(stft)(torch.ones(1, 50, 65), torch.full((1, 8), 40.0), torch.tensor([2]))
@@ -110,7 +119,7 @@ class Prior(nn.Module):
             self._add_buffer(f"{name}_known", shape)
             self.register_parameter(f"{name}_learned", nn.Parameter(torch.zeros(shape)))
         if compute:
-            for name, values in _known_values(stft).items():
+            for name, values in _msbg_constants(stft).items():
                 buffer = self.get_buffer(f"{name}_known" if name in shapes else name)
                 buffer.copy_(torch.from_numpy(values))
 
@@ -119,7 +128,7 @@ class Prior(nn.Module):
         self.register_buffer(name, torch.empty(shape, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
-        """Apply the learned correction to known values."""
+        """Return the constants of a name with their learned correction."""
         known = getattr(self, f"{name}_known")
         learned = getattr(self, f"{name}_learned")
         if name != "relative":
@@ -130,25 +139,24 @@ class Prior(nn.Module):
         return known + torch.stack((real, imaginary))
 
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
-        """Filter waveforms with the fixed response of each item's filter bank.
+        """Filter waveforms as outer ear, middle ear and filter bank do without a loss.
 
         Shape: (items, time), (items,) -> (items, time).
 
         Args:
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
+            waveform: Signals in pascals at 16 kHz.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
         """
         return filter_without_delay(waveform, self.response[severity].to(waveform))
 
     def forward(self, powers: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Estimate the complex factors by which MSBG multiplies the bins of a spectrum.
-
-        They are computed by MSBG's formulae on frames of 8 ms, from the powers of the bins.
+        """Estimate the complex factor by which MSBG multiplies each point of a spectrogram.
 
         Shape: (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
             frequencies).
 
         Args:
-            powers: Powers of the bins in Pa^2, after MSBG's filter of the outer and middle ear.
+            powers: Power at each point of the spectrogram of the output of ``filter``, in Pa^2.
             thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
@@ -161,30 +169,40 @@ class Prior(nn.Module):
         return factor * _smearing_factor(smeared_powers, powers)
 
     def smear(self, spectrum: Tensor, severity: Tensor) -> tuple[Tensor, Tensor]:
-        """Smear the spectra of filtered waveforms.
+        """Spread the power of each frame over neighbouring frequencies, and keep the phase.
 
         Shape: complex (items, frames, frequencies), (items,) -> complex (items, frames,
             frequencies), (items, frames, frequencies).
 
-        Returns: The smeared spectra and their powers.
+        Args:
+            spectrum: Spectrogram of the output of ``filter``.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
+
+        Returns: The smeared spectrogram and its power in Pa^2, which may be negative.
         """
         return smear_spectrum(spectrum, self._smearing()[severity], SMEARING_GRADIENT_FLOOR)
 
     def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
-        """Compute the square root of the power in each channel.
+        """Compute the level of each channel of MSBG's filter bank: the square root of its power.
 
-        Shape: (items, frames, frequencies), (items,) -> (items, channels, frames).
+        Shape: (items, frames, frequencies), (items,) -> (items, channels, frames) in Pa.
+
+        Args:
+            smeared_powers: Power at each point of the smeared spectrogram in Pa^2.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
         """
         excitation = self._corrected("excitation") * self.ear_power
         channel_powers = smeared_powers.relu() @ excitation[severity].mT
         return (channel_powers + POWER_FLOOR).sqrt().mT
 
     def smooth(self, levels: Tensor, severity: Tensor, step: int = 1) -> Tensor:
-        """Smooth the levels of channels to envelopes in Pa.
+        """Smooth the levels of channels over time, which gives their envelopes in Pa.
 
         Shape: (items, channels, frames), (items,) -> (items, channels, ceil(frames / step)).
 
         Args:
+            levels: Level of each channel in Pa.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the filters.
             step: Number of frames from one value of an envelope to the next.
         """
         items, channels, _ = levels.shape
@@ -196,12 +214,12 @@ class Prior(nn.Module):
         return envelopes.reshape(items, channels, -1).clamp_min(MIN_ENVELOPE)
 
     def log_gain(self, log_envelope: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Compute the natural logarithm of the gain that simulates recruitment in each channel.
+        """Compute the gain that simulates recruitment in each channel, as a natural logarithm.
 
         Shape: (items, channels, steps), (items, 8), (items,) -> (items, channels, steps).
 
         Args:
-            log_envelope: Natural logarithm of envelopes in Pa.
+            log_envelope: Natural logarithm of the envelopes in Pa.
             thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
@@ -210,15 +228,15 @@ class Prior(nn.Module):
         return (log_envelope - _LOG_CATCH_UP).clamp_max(0.0) * exponents
 
     def gains_to_factors(self, gains: Tensor, severity: Tensor) -> Tensor:
-        """Compute complex factors on smeared spectra from complex gains of the channels.
+        """Convert gains of the channels to factors on the smeared spectrogram.
 
         Shape: (items, 2 * channels, steps), (items,) -> (items, steps, frequencies, 2).
 
         Args:
-            gains: Real parts of all channels' gains, followed by the imaginary parts.
+            gains: Complex gains: the real parts of all channels, followed by the imaginary parts.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
 
-        Returns: Real and imaginary parts of the factors.
+        Returns: Real and imaginary part of the factor at each frequency.
         """
         real, imaginary = self._corrected("relative")[:, severity]
         # One matrix product computes real and imaginary parts, which alternate in its columns.
@@ -228,7 +246,7 @@ class Prior(nn.Module):
         return (gains.mT @ matrix).unflatten(-1, (-1, 2))
 
     def _smearing(self) -> Tensor:
-        """Smearing matrices for powers before the outer and the middle ear.
+        """Return the matrices that smear powers before the outer and the middle ear.
 
         MSBG smears after these filters, so the matrices apply their power response and undo it.
 
@@ -256,8 +274,8 @@ def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _known_values(stft: STFT) -> dict[str, NDArray[np.float64]]:
-    """Compute MSBG's formulae at the frequencies of a transform, by the name of the buffer.
+def _msbg_constants(stft: STFT) -> dict[str, NDArray[np.float64]]:
+    """Compute the constants of the prior at the frequencies of a transform, by name.
 
     They take most of the time in which a network is built, and are the same for all networks.
     """

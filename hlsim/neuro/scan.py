@@ -1,4 +1,9 @@
-"""The selective scan of Mamba in plain torch, parallel over time.
+"""The selective scan, the recurrence of the Mamba layer, in plain torch and parallel over time.
+
+Each channel of a signal has several *states*, which remember its past: h[t] = decay[t] h[t - 1] +
+drive[t], where drive is the weighted input. In the order of Mamba's names: decay[t] = exp(delta[t]
+A) and drive[t] = delta[t] B[t] u[t]. Items and channels are divided into *blocks*, whose states are
+computed one block after the other, so that they fit into the cache of the CPU.
 
 Source: Gu and Dao (2023), arXiv:2312.00752.
 """
@@ -7,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from functools import cache, cached_property, partial
+from functools import cache
 from typing import Any
 
 import torch
@@ -24,9 +29,6 @@ _STATES_PER_BLOCK_GPU = 2**27
 _MIN_CHANNELS_PER_BLOCK = 8
 """Smallest number of channels computed at once. Shorter rows cost more than the cache saves."""
 
-_Step = Callable[[], Any]
-"""One tensor operation of a scan, without arguments."""
-
 
 def selective_scan(
     u: Tensor,
@@ -39,10 +41,10 @@ def selective_scan(
     delta_bias: Tensor | None = None,
     delta_softplus: bool = False,
 ) -> Tensor:
-    """Run a linear recurrence whose coefficients depend on time.
+    """Filter each channel with a recursive filter whose coefficients change over time.
 
-    The states are h[t] = exp(delta[t] A) h[t - 1] + delta[t] B[t] u[t] with h[-1] = 0, and the
-    result is (C[t] h[t] + D u[t]) silu(z[t]).
+    This is the core of the Mamba layer. Each channel has states h[t] = exp(delta[t] A) h[t - 1] +
+    delta[t] B[t] u[t] with h[-1] = 0, and the result is (C[t] h[t] + D u[t]) silu(z[t]).
 
     The function has the signature of that of ``mamba_ssm``, and calls it for tensors on a GPU where
     it is installed. Otherwise, the recurrence is computed in about log2(time) steps, each of which
@@ -107,8 +109,8 @@ def _check_shapes(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> 
         )
 
 
-def _forward_steps(decay: Tensor, states: Tensor, scratch: Tensor) -> list[_Step]:
-    """Build the steps that compute h[t] = decay[t] h[t - 1] + drive[t] with h[-1] = 0 in place.
+def _recur_forward(decay: Tensor, states: Tensor, scratch: Tensor) -> None:
+    """Compute h[t] = decay[t] h[t - 1] + drive[t] with h[-1] = 0.
 
     Neighbouring times are joined in pairs. The recurrence of the pairs has half the length and the
     same form, and the times between them follow from it. This takes about three operations per time
@@ -118,67 +120,56 @@ def _forward_steps(decay: Tensor, states: Tensor, scratch: Tensor) -> list[_Step
 
     Args:
         decay: Decays, which are at most 1.
-        states: Drive, which the steps replace by the states.
+        states: Drive, which the states replace.
         scratch: Memory for products of decays.
     """
     time = states.shape[1]
     half = time // 2
     if half == 0:
-        return []
+        return
     # The second time of each pair
     second_states = states[:, 1::2]
     second_decay = decay[:, 1::2]
     first_states = states[:, : time - 1 : 2]
-    steps: list[_Step] = [partial(second_states.addcmul_, second_decay, first_states)]
+    second_states.addcmul_(second_decay, first_states)
     if half > 1:
         pair_decay = scratch[:, :half]
         first_decay = decay[:, : time - 1 : 2]
-        steps.append(partial(torch.mul, second_decay, first_decay, out=pair_decay))
-        steps += _forward_steps(pair_decay, second_states, scratch[:, half:])
+        torch.mul(second_decay, first_decay, out=pair_decay)
+        _recur_forward(pair_decay, second_states, scratch[:, half:])
     if time > 2:
-        later_first_states = states[:, 2::2]
         states_before = second_states[:, : (time - 1) // 2]
-        steps.append(partial(later_first_states.addcmul_, decay[:, 2::2], states_before))
-    return steps
+        states[:, 2::2].addcmul_(decay[:, 2::2], states_before)
 
 
-def _backward_steps(decay: Tensor, states: Tensor, scratch: Tensor) -> list[_Step]:
-    """Build the steps that compute h[t] = decay[t] h[t + 1] + drive[t] with h[time] = 0 in place.
+def _recur_backward(decay: Tensor, states: Tensor, scratch: Tensor) -> None:
+    """Compute h[t] = decay[t] h[t + 1] + drive[t] with h[time] = 0.
 
-    This is ``_forward_steps`` backwards in time, with pairs counted from the end.
+    This is ``_recur_forward`` backwards in time, with pairs counted from the end.
 
     Shape: (items, time - 1, ...) for ``decay``, (items, time, ...) for the others.
     """
     time = states.shape[1]
     half = time // 2
     if half == 0:
-        return []
+        return
     start = time % 2
     first_states = states[:, start::2]
     first_decay = decay[:, start::2]
     second_states = states[:, start + 1 :: 2]
-    steps: list[_Step] = [partial(first_states.addcmul_, first_decay, second_states)]
+    first_states.addcmul_(first_decay, second_states)
     if half > 1:
         pair_decay = scratch[:, : half - 1]
         second_decay = decay[:, start + 1 :: 2]
-        steps.append(partial(torch.mul, first_decay[:, :-1], second_decay, out=pair_decay))
-        steps += _backward_steps(pair_decay, first_states, scratch[:, half:])
+        torch.mul(first_decay[:, :-1], second_decay, out=pair_decay)
+        _recur_backward(pair_decay, first_states, scratch[:, half:])
     if time > 2:
-        earlier_second_states = states[:, 1 - start : -1 : 2]
         states_after = first_states[:, 1 - start :]
-        steps.append(
-            partial(earlier_second_states.addcmul_, decay[:, 1 - start :: 2], states_after)
-        )
-    return steps
-
-
-def _run_steps(steps: list[_Step]) -> None:
-    for step in steps:
-        step()
+        states[:, 1 - start : -1 : 2].addcmul_(decay[:, 1 - start :: 2], states_after)
 
 
 class _SelectiveScan(torch.autograd.Function):
-    """The scan, with channels last and time before states, so that each step works on whole rows.
+    """The scan with its gradient, where channels are last, so that each step works on whole rows.
 
     Shape: (items, time, channels) for delta and u, (items, time, states) for B and C, (states,
         channels) for A -> (items, time, channels).
@@ -188,13 +179,16 @@ class _SelectiveScan(torch.autograd.Function):
     def forward(delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
         y = u.new_empty(u.shape)
         with torch.autocast(u.device.type, enabled=False):
-            for items, channels, workspace in _blocks(u, A, needs_gradient=False):
+            for items, channels, (decay, states, scratch) in _blocks(u, A, tensors=3):
                 block_delta = delta[items, :, channels].contiguous()
                 block_u = u[items, :, channels].contiguous()
                 block_B = B[items].contiguous()
                 block_C = C[items].contiguous()
-                workspace.run_forward(block_delta, block_u, block_B, A[:, channels])
-                block_y = block_C.unsqueeze(-2) @ workspace.states
+                torch.mul(block_delta.unsqueeze(-2), A[:, channels], out=decay).exp_()
+                drive = (block_delta * block_u).unsqueeze(-2)
+                torch.mul(drive, block_B.unsqueeze(-1), out=states)
+                _recur_forward(decay, states, scratch)
+                block_y = block_C.unsqueeze(-2) @ states
                 y[items, :, channels] = block_y.squeeze(-2)
         return y
 
@@ -226,26 +220,31 @@ class _ScanGradient(torch.autograd.Function):
         grad_C = torch.zeros_like(C)
         # The backward pass may run in a region of autocast.
         with torch.autocast(u.device.type, enabled=False):
-            for items, channels, workspace in _blocks(u, A, needs_gradient=True):
+            for items, channels, memory in _blocks(u, A, tensors=4):
+                decay, states, scratch, grad_states = memory
                 block_delta = delta[items, :, channels].contiguous()
                 block_u = u[items, :, channels].contiguous()
                 block_gradient = gradient[items, :, channels].contiguous()
                 block_B = B[items].contiguous()
                 block_C = C[items].contiguous()
                 block_A = A[:, channels]
-                workspace.run_forward(block_delta, block_u, block_B, block_A)
+                torch.mul(block_delta.unsqueeze(-2), block_A, out=decay).exp_()
+                drive = (block_delta * block_u).unsqueeze(-2)
+                torch.mul(drive, block_B.unsqueeze(-1), out=states)
+                _recur_forward(decay, states, scratch)
                 # matmul takes three times as long as vecdot.
-                grad_C[items] += vecdot(workspace.states, block_gradient.unsqueeze(-2))
-                grad_states = workspace.run_backward(block_gradient, block_C)
+                grad_C[items] += vecdot(states, block_gradient.unsqueeze(-2))
+                # The gradient with respect to the states follows the same recurrence backwards in
+                # time, with the decay of the following time.
+                torch.mul(block_C.unsqueeze(-1), block_gradient.unsqueeze(-2), out=grad_states)
+                _recur_backward(decay[:, 1:], grad_states, scratch)
                 grad_drive = (block_B.unsqueeze(-2) @ grad_states).squeeze(-2)
                 grad_u[items, :, channels] = grad_drive * block_delta
-                drive = (block_delta * block_u).unsqueeze(-2)
                 grad_B[items] += vecdot(grad_states, drive)
 
                 # The gradient with respect to the exponent delta[t] A replaces the states.
-                grad_exponent = workspace.states[:, :-1].mul_(workspace.decay[:, 1:])
-                grad_exponent.mul_(grad_states[:, 1:])
-                product = torch.mul(grad_exponent, block_A, out=workspace.scratch[:, 1:])
+                grad_exponent = states[:, :-1].mul_(decay[:, 1:]).mul_(grad_states[:, 1:])
+                product = torch.mul(grad_exponent, block_A, out=scratch[:, 1:])
                 block_grad_delta = grad_drive.mul_(block_u)
                 block_grad_delta[:, 1:] += product.sum(-2)
                 grad_delta[items, :, channels] = block_grad_delta
@@ -265,52 +264,12 @@ class _ScanGradient(torch.autograd.Function):
         )
 
 
-class _Workspace:
-    """Decays and states of a block, in memory that all blocks share.
-
-    Args:
-        shape: (items, time, states, channels) of the block.
-        memory: Three flat tensors, or four if the gradient is computed.
-
-    Attributes:
-        decay: Decays of the states.
-        states: States, which overwrite the drive.
-        scratch: Memory for products of decays.
-        grad_states: Gradient with respect to the states, if it is computed.
-    """
-
-    def __init__(self, shape: tuple[int, ...], memory: list[Tensor]) -> None:
-        views = [part[: math.prod(shape)].view(shape) for part in memory]
-        self.decay, self.states, self.scratch = views[:3]
-        self.grad_states = views[-1]
-        self.forward_steps = _forward_steps(self.decay, self.states, self.scratch)
-
-    def run_forward(self, delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> None:
-        """Compute the decays and the states."""
-        torch.mul(delta.unsqueeze(-2), A, out=self.decay).exp_()
-        torch.mul((delta * u).unsqueeze(-2), B.unsqueeze(-1), out=self.states)
-        _run_steps(self.forward_steps)
-
-    @cached_property
-    def backward_steps(self) -> list[_Step]:
-        return _backward_steps(self.decay[:, 1:], self.grad_states, self.scratch)
-
-    def run_backward(self, gradient: Tensor, C: Tensor) -> Tensor:
-        """Compute the gradient with respect to the states.
-
-        It follows the same recurrence backwards in time, with the decay of the following time.
-        """
-        torch.mul(C.unsqueeze(-1), gradient.unsqueeze(-2), out=self.grad_states)
-        _run_steps(self.backward_steps)
-        return self.grad_states
-
-
-def _blocks(
-    u: Tensor, A: Tensor, needs_gradient: bool
-) -> Iterator[tuple[slice, slice, _Workspace]]:
+def _blocks(u: Tensor, A: Tensor, tensors: int) -> Iterator[tuple[slice, slice, list[Tensor]]]:
     """Divide items and channels into blocks, either of all channels or of one item.
 
-    Yields: Items and channels of the block, and the workspace for it.
+    Yields:
+        Items of the block, its channels, and a number of tensors for values of all its states,
+        (items, time, states, channels) each, in memory that all blocks share.
     """
     items, time, channels = u.shape
     states = len(A)
@@ -320,30 +279,27 @@ def _blocks(
     channels_per_block = math.ceil(channels / math.ceil(channels / rows))
     items_per_block = max(1, min(items, rows // channels))
     values = items_per_block * time * states * channels_per_block
-    memory = [u.new_empty(values) for _ in range(4 if needs_gradient else 3)]
-    workspaces: dict[tuple[int, ...], _Workspace] = {}
+    memory = [u.new_empty(values) for _ in range(tensors)]
     for item in range(0, items, items_per_block):
         for channel in range(0, channels, channels_per_block):
             block_items = min(items_per_block, items - item)
             block_channels = min(channels_per_block, channels - channel)
             shape = (block_items, time, states, block_channels)
-            if shape not in workspaces:
-                workspaces[shape] = _Workspace(shape, memory)
             yield (
-                slice(item, item + items_per_block),
-                slice(channel, channel + channels_per_block),
-                workspaces[shape],
+                slice(item, item + block_items),
+                slice(channel, channel + block_channels),
+                [part[: math.prod(shape)].view(shape) for part in memory],
             )
 
 
 def _kernel_for(u: Tensor) -> Callable[..., Any] | None:
-    """Scan of ``mamba_ssm`` if it works for a tensor, otherwise None."""
+    """Return the scan of ``mamba_ssm`` if it works for a tensor, otherwise None."""
     return _kernel() if u.is_cuda and u.dtype != torch.float64 else None
 
 
 @cache
 def _kernel() -> Callable[..., Any] | None:
-    """Scan of ``mamba_ssm``, or None if it is not installed or lacks its compiled kernel."""
+    """Import the scan of ``mamba_ssm``; None if it or its compiled kernel is not installed."""
     try:
         from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
     except Exception:  # because a build for another torch or GPU may raise anything

@@ -13,38 +13,25 @@ from hlsim.training.recipes import SimulatorRecipe
 
 yaml = pytest.importorskip("yaml")
 
+N3 = Audiogram.standard("N3")
+
 RECIPES = sorted((Path(__file__).parents[2] / "examples").glob("**/*.yaml"))
 SIMULATORS = {
     path.stem: path for path in RECIPES if not path.stem.startswith(("compensator", "hearing-aid"))
 }
-MILLIONS = {
-    "mamba": 1.45,
-    "transformer": 1.45,
-    "cnn": 1.45,
-    "lstm": 1.47,
-    "monolithic-cnn": 1.45,
-    "monolithic-lstm": 1.45,
-    "monolithic-transformer": 1.45,
-}
+MILLIONS = dict.fromkeys(
+    ("mamba", "transformer", "cnn", "monolithic-cnn", "monolithic-lstm", "monolithic-transformer"),
+    1.45,
+) | {"lstm": 1.47}
 SMALL = {"channels": 8, "blocks": 1, "states": 4, "heads": 2}
+BLOCKS = ("cnn", "mamba", "lstm", "transformer")
+MONOLITHIC = {"structure": "monolithic", "prior": False}
 KINDS = {
-    **{block: {"block": block} for block in ("cnn", "mamba", "lstm", "transformer")},
-    **{
-        f"monolithic {block}": {
-            "block": block,
-            "structure": "monolithic",
-            "prior": False,
-            "level_aware": False,
-        }
-        for block in ("cnn", "mamba", "lstm", "transformer")
-    },
+    **{block: {"block": block} for block in BLOCKS},
+    **{f"monolithic {b}": {"block": b, "level_aware": False, **MONOLITHIC} for b in BLOCKS},
     "magnitude only": {"phase": "input", "prior": False},
     "concatenated": {"audiogram": "concatenated", "prior": False},
-    "concatenated monolithic": {
-        "audiogram": "concatenated",
-        "structure": "monolithic",
-        "prior": False,
-    },
+    "concatenated monolithic": {"audiogram": "concatenated", **MONOLITHIC},
     "normalised": {"level_aware": False, "prior": False, "dense_depth": 2},
     "normalised with prior": {"level_aware": False},
     "bands": {"structure": "bands"},
@@ -78,7 +65,7 @@ def test_networks_have_the_sizes_of_the_papers(name: str) -> None:
 def test_every_recipe_builds_a_network(name: str) -> None:
     model = NeuroMSBG(NeuroConfig.from_dict(recipe(name).model))
     with torch.no_grad():
-        assert model(0.02 * torch.randn(2, 1600), Audiogram.standard("N3")).shape == (2, 1600)
+        assert model(0.02 * torch.randn(2, 1600), N3).shape == (2, 1600)
 
 
 def test_ablations_change_one_setting() -> None:
@@ -102,13 +89,9 @@ def test_a_batch_equals_its_items_and_has_the_shape_of_the_input(kind: str) -> N
             assert float((batch[i] - item).norm() / item.norm()) < 1e-4
 
 
-def test_attention_does_not_store_all_pairs_of_times(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    model = network("transformer").eval()
-    waveform = 0.02 * torch.randn(1, 1600)
-    ear = Audiogram.standard("N3")
-    expected = model(waveform, ear).detach()
+def test_attention_does_not_store_all_pairs_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, waveform = network("transformer"), 0.02 * torch.randn(1, 1600)
+    expected = model(waveform, N3).detach()
 
     def fail(*arguments: object) -> None:
         raise AssertionError("torch's implementation for evaluation stores all pairs")
@@ -116,7 +99,7 @@ def test_attention_does_not_store_all_pairs_of_times(
     for name in ("_transformer_encoder_layer_fwd", "_native_multi_head_attention"):
         monkeypatch.setattr(torch, name, fail)
     with torch.no_grad():
-        torch.testing.assert_close(model(waveform, ear), expected)
+        torch.testing.assert_close(model(waveform, N3), expected)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -126,36 +109,15 @@ def test_every_parameter_has_a_finite_gradient(kind: str, level: float) -> None:
     waveform = torch.randn(2, 2000, generator=torch.Generator().manual_seed(3))
     waveform = (waveform * 10.0 ** ((level - 94.0) / 20.0)).requires_grad_()
     model(waveform, torch.tensor([[0.0] * 8, [70.0] * 8])).square().mean().backward()
-    assert waveform.grad is not None and bool(torch.isfinite(waveform.grad).all())
-    for name, parameter in model.named_parameters():
-        assert parameter.grad is not None and bool(torch.isfinite(parameter.grad).all()), name
-
-
-@pytest.mark.parametrize("kind", ["cnn", "mamba", "monolithic lstm", "bands"])
-def test_networks_are_deterministic_and_restored_from_a_checkpoint(
-    kind: str, tmp_path: Path
-) -> None:
-    from hlsim import load_pretrained
-    from hlsim.checkpoint import save_checkpoint
-
-    model = network(kind)
-    waveform = 0.02 * torch.randn(1600)
-    ear = Audiogram.standard("N2")
-    save_checkpoint(tmp_path / "checkpoint", "neuro-msbg", model, model.config.to_dict(), {})
-    loaded = load_pretrained(tmp_path / "checkpoint")
-    for name, value in model.state_dict().items():
-        assert torch.equal(value, loaded.state_dict()[name])
-    with torch.no_grad():
-        output = model(waveform, ear)
-        assert torch.equal(output, network(kind)(waveform, ear))
-        # The last bits may depend on where in memory the weights lie.
-        torch.testing.assert_close(loaded(waveform, ear), output, rtol=1e-4, atol=1e-7)
+    for name, tensor in [("waveform", waveform), *model.named_parameters()]:
+        assert tensor.grad is not None and bool(torch.isfinite(tensor.grad).all()), name
+        assert level != 65.0 or bool(tensor.grad.any()), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_silence_stays_silent(kind: str) -> None:
     waveform = torch.zeros(1600, requires_grad=True)
-    output = network(kind)(waveform, Audiogram.standard("N4"))
+    output = network(kind)(waveform, "N4")
     output.sum().backward()
     assert not bool(output.any()) and bool(torch.isfinite(waveform.grad).all())
 
@@ -172,7 +134,7 @@ def test_a_network_for_the_magnitude_does_not_change_the_phase() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(STFT, "synthesise", synthesise_and_store)
-        model(waveform, Audiogram.standard("N3"))
+        model(waveform, N3)
     factor = spectra[0] / model.stft.analyse(waveform)
     assert float(factor.imag.abs().max() / factor.real.abs().max()) < 1e-4
     assert bool((factor.real > 0.0).all())
@@ -180,12 +142,11 @@ def test_a_network_for_the_magnitude_does_not_change_the_phase() -> None:
 
 def test_networks_depend_on_the_level_except_with_the_papers_normalisation() -> None:
     waveform = 0.02 * torch.randn(4000)
-    ear = Audiogram.standard("N3")
     for kind, is_linear in (("normalised", True), ("magnitude only", False)):
         model = network(kind)
         with torch.no_grad():
-            output_of_louder = model(10.0 * waveform, ear)
-            louder_output = 10.0 * model(waveform, ear)
+            output_of_louder = model(10.0 * waveform, N3)
+            louder_output = 10.0 * model(waveform, N3)
         error = (output_of_louder - louder_output).norm() / louder_output.norm()
         assert (float(error) < 1e-3) == is_linear
 
@@ -194,20 +155,19 @@ def test_a_concatenated_audiogram_affects_the_output() -> None:
     model = network("concatenated")
     waveform = 0.02 * torch.randn(1600)
     with torch.no_grad():
-        outputs = [model(waveform, Audiogram.standard(name)) for name in ("N1", "N4")]
+        outputs = [model(waveform, name) for name in ("N1", "N4")]
     assert model.audiogram_encoder is None and not torch.allclose(*outputs)
 
 
-@pytest.mark.parametrize("block", ["cnn", "lstm", "transformer", "mamba"])
+@pytest.mark.parametrize("block", BLOCKS)
 def test_derivatives_are_exact_or_raise(block: str) -> None:
     """The docstring of NeuroMSBG states which derivatives work for each kind of block."""
     model = network(block).double()
-    ear = Audiogram.standard("N3")
     wave = 0.02 * torch.randn(2, 400, dtype=torch.float64)
     direction = torch.randn(400, dtype=torch.float64)
 
     def energy(waveform: torch.Tensor) -> torch.Tensor:
-        return model(waveform, ear).square().sum()
+        return model(waveform, N3).square().sum()
 
     def slope(waveform: torch.Tensor, create_graph: bool = False) -> torch.Tensor:
         leaf = waveform if create_graph else waveform.detach().requires_grad_()

@@ -55,11 +55,6 @@ def test_scan_and_gradients_equal_those_of_the_recurrence(
     torch.testing.assert_close(gradients, expected_gradients, rtol=1e-10, atol=1e-10)
 
 
-def test_gradients_are_exact() -> None:
-    inputs = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
-    assert torch.autograd.gradcheck(selective_scan, inputs)
-
-
 @pytest.mark.parametrize("number", range(5))
 def test_a_second_derivative_by_any_input_raises_runtime_error(number: int) -> None:
     inputs = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
@@ -76,14 +71,6 @@ def test_skip_gate_bias_and_softplus() -> None:
     step = functional.softplus(delta + bias[:, None])
     expected = (recurrence(u, step, A, B, C) + D[:, None] * u) * functional.silu(z)
     torch.testing.assert_close(output, expected, rtol=1e-10, atol=1e-10)
-
-
-def test_scan_is_causal_and_depends_on_the_past() -> None:
-    u, delta, A, B, C = arguments(40)
-    changed = u.clone()
-    changed[..., 20] += 1.0
-    difference = selective_scan(changed, delta, A, B, C) - selective_scan(u, delta, A, B, C)
-    assert not bool(difference[..., :20].any()) and bool(difference[..., 20:23].abs().min() > 0.0)
 
 
 def test_scan_does_not_overflow_for_extreme_decays() -> None:
@@ -116,10 +103,9 @@ def test_bfloat16_inputs_are_scanned_in_float32() -> None:
 
 def test_shapes_that_do_not_fit_raise_value_error() -> None:
     u, delta, A, B, C = arguments(6)
-    with pytest.raises(ValueError):
-        selective_scan(u, delta, A, B[..., :5], C)
-    with pytest.raises(ValueError):
-        selective_scan(u, delta[:, :2], A, B, C)
+    for inputs in ((u, delta, A, B[..., :5], C), (u, delta[:, :2], A, B, C)):
+        with pytest.raises(ValueError):
+            selective_scan(*inputs)
 
 
 def test_a_kernel_receives_all_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
