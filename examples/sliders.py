@@ -16,7 +16,7 @@ import torch
 from compensators import load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
-from hlsim.evaluation.items import draw_judged_items, read_ears
+from hlsim.evaluation.items import draw_aid_items, read_ears
 from hlsim.metrics import haspi, hasqi
 
 FULL = {"noise_reduction": 1.0, "amplification": 1.0}
@@ -28,7 +28,7 @@ def main(
     speech: str, noise: str, audiograms: str, count: str = "48", name: str = "hearing-aid"
 ) -> None:
     aid, msbg = load_compensator(name), MSBG(sample_rate=16000)
-    items = draw_judged_items(
+    items = draw_aid_items(
         speech, noise, read_ears(audiograms), items=int(count), seconds=3.0, seed=0
     )
     default_release = aid.config.release

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from compensators import NALR, load_compensator
 from hlsim.audio import find_audio, read_audio, write_audio
-from hlsim.audiogram import STANDARD, Audiogram
+from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aid_properties import gain_curves
 from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.comparison import compare
-from hlsim.evaluation.items import INPUT_LEVELS
+from hlsim.evaluation.items import INPUT_LEVELS, ear_name
 from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
 from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
@@ -85,8 +85,8 @@ def demo(
     folder = Path(out)
     training, scored = _split(speech)
     items = _read_items(scored, speech, audiogram, seed)
-    ear_name = _name_ear(audiogram)
-    report(f"Training on {len(training)} utterances for the ear {ear_name}, {steps} steps")
+    ear = f"{ear_name(audiogram)} ({loss_name(audiogram.severity)})"
+    report(f"Training on {len(training)} utterances for the ear {ear}, {steps} steps")
     with one_thread():  # the steps are small: on a busy machine two threads wait for each other
         checkpoint = train_compensator(
             TrainingData(speech=training),
@@ -116,14 +116,14 @@ def demo(
     shortest = min(len(item.clean) for item in items)
     utterances = torch.stack([item.clean[:shortest] for item in items])
     aids = {NAL_R: nal_r, TRAINED: trained}
-    curves = gain_curves(aids, {ear_name: audiogram}, utterances, INPUT_LEVELS)
+    curves = gain_curves(aids, {ear: audiogram}, utterances, INPUT_LEVELS)
     evaluation = replace(
         evaluation,
         comparisons=[comparison for comparison in comparisons if comparison.planned],
         details={"gain_curves": curves},
     )
     outputs, perceived = _compute_signals(items, conditions)
-    page = demo_page(evaluation, ear_name, outputs, perceived, _sentence(scored[-1]))
+    page = demo_page(evaluation, ear, outputs, perceived, _sentence(scored[-1]))
     path = write_page(page, evaluation.to_dict(), folder)
     _write_audio(folder / "audio", items, {"output": outputs, "perceived": perceived})
     return f"\n{page.verdict}\n\n{result_table(evaluation).text()}\n\n{path.as_uri()}"
@@ -205,10 +205,3 @@ def _sentence(path: Path) -> str:
     table = (_BUNDLED / "README.md").read_text(encoding="utf-8")
     row = re.search(rf"`valid/{re.escape(path.name)}` \| [^|]+ \| ([^|]+) \|", table)
     return row[1] if row and path.is_relative_to(_BUNDLED) else ""
-
-
-def _name_ear(audiogram: Audiogram) -> str:
-    """Return the name of a standard audiogram, or the thresholds, and the degree of loss."""
-    levels = ", ".join(f"{level:g}" for level in audiogram.levels)
-    standard = [name for name, values in STANDARD.items() if audiogram == Audiogram(values)]
-    return f"{standard[0] if standard else f'{levels} dB HL'} ({loss_name(audiogram.severity)})"

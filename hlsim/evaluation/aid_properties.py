@@ -1,6 +1,6 @@
-"""Properties of an aid that scores of speech do not show.
+"""Properties of an aid that scores of speech do not show: gain, tones, quiet noise, delay, cost.
 
-These are gain curves, steady tones, quiet noise, look-ahead and cost.
+An aid is a function ``(waveform, ear) -> waveform`` for one signal at 16 kHz in pascals.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.clips import Clips
 
 UTTERANCES = 6
-"""Number of clips of 3 s of speech on which gains are measured."""
+"""Number of clips of speech, of 3 s each, with which gains are measured."""
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """Frequencies of steady tones in Hz. All but 3001 Hz have the same phase in frames that are
@@ -34,28 +34,31 @@ QUIET_LEVELS = (25.0, 40.0)
 """Levels in dB SPL of the noise in a room where nobody speaks."""
 
 CHANGE_POSITIONS = range(8000, 40000, 2003)
-"""Samples from which on the input becomes another sound, at many positions within any hop."""
+"""Samples at which the input becomes another sound, to measure the look-ahead.
 
-CHANGE_THRESHOLD = 1e-4
+An aid that processes frames may change its output earlier for some positions within a frame.
+"""
+
+_CHANGE_THRESHOLD = 1e-4
 """Share of the output's peak that counts as a change. Rounding of Fourier transforms is less."""
 
-SIDEBAND_DISTANCE_HZ = 20.0
+_SIDEBAND_DISTANCE_HZ = 20.0
 """Distance from a tone in Hz from which on power counts as sidebands."""
 
-MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)
-"""Middle second of 2 s, which holds whole periods of each tone."""
+_MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)
+"""Samples of the middle second of 2 s, which holds whole periods of each tone."""
 
-POWER_FLOOR = 1e-30
+_POWER_FLOOR = 1e-30
 """Lowest power of a tone, which keeps ratios finite for JSON."""
 
-RATIO_FLOOR = 1e-20
+_RATIO_FLOOR = 1e-20
 """Lowest ratio of powers."""
 
 Aid = Callable[[Tensor, Audiogram], Tensor]
 Aids = Mapping[str, Aid]
 Ears = Mapping[str, Audiogram]
 Results = list[dict[str, Any]]
-"""One dictionary per ear and aid, with the keys ``ear`` and ``aid``."""
+"""One dictionary per ear and aid, with the names ``ear`` and ``aid`` and the measured values."""
 
 
 def measure_aids(
@@ -65,9 +68,12 @@ def measure_aids(
 
     Args:
         aids: Aids by name.
-        ears: Ears by name.
-        measure: One of the functions below, ``(aid, ear, *arguments) -> results``.
-        arguments: Further arguments of the measure.
+        ears: Audiograms by name.
+        measure: Function ``(aid, ear, *arguments) -> values by name``, such as ``steady_tones``.
+        arguments: Further arguments of this function.
+
+    Returns:
+        One dictionary per ear and aid: the names ``aid`` and ``ear``, and the values.
 
     Raises:
         ValueError: An aid fails; the message names aid and ear.
@@ -89,20 +95,22 @@ def measure_aids(
 def insertion_gain(
     aid: Aid, ear: Audiogram, speech: Tensor, levels: Sequence[float]
 ) -> list[list[float]]:
-    """Measure output power over input power in dB, in 24 bands and over all of the speech.
+    """Measure the gain of an aid for speech in dB, in 24 bands, at each of several levels.
 
-    The signal is speech with its pauses, because an aid may treat a steady noise as noise.
+    The gain of a band is the power of the output over that of the input, over all utterances. They
+    contain the pauses of speech, because an aid may treat a steady noise as noise.
 
     Args:
         aid: The aid.
-        ear: The ear.
-        speech: Utterances at 16 kHz.
-        levels: Levels of each utterance in dB SPL.
+        ear: The audiogram.
+        speech: Utterances at 16 kHz. Shape: (utterances, time).
+        levels: Levels in dB SPL that every utterance has in turn.
 
-    Shape: (utterances, time) -> (levels, 24).
+    Returns:
+        Gains in dB. Shape: (levels, 24).
 
     Raises:
-        ValueError: The aid fails, see ``outputs``.
+        ValueError: The aid fails, or its output is not a waveform.
 
     >>> gains = insertion_gain(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
     >>> round(gains[0][0])
@@ -111,15 +119,19 @@ def insertion_gain(
     curves = []
     for level in levels:
         signals = set_level(speech, level)
-        aided = outputs(aid, signals, ear)
+        aided = _aid_outputs(aid, signals, ear)
         curves.append((10.0 * (_band_powers(aided) / _band_powers(signals)).log10()).tolist())
     return curves
 
 
 def draw_utterances(speech: str | Path, seed: int) -> Tensor:
-    """Draw six clips of 3 s from a folder.
+    """Draw six clips of 3 s from a folder of speech, for ``gain_curves``.
 
-    Shape: -> (6, 48000) at 16 kHz.
+    Args:
+        speech: Folder of recordings.
+        seed: Seed of the draw.
+
+    Returns: The clips at 16 kHz. Shape: (6, 48000).
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> draw_utterances(EXAMPLE_FILE.parent, seed=0).shape
@@ -130,16 +142,17 @@ def draw_utterances(speech: str | Path, seed: int) -> Tensor:
 
 
 def gain_curves(aids: Aids, ears: Ears, utterances: Tensor, levels: Sequence[float]) -> Results:
-    """Measure the insertion gain ``gain_db`` of each aid for each ear.
+    """Measure the gain for speech of each aid for each ear, see ``insertion_gain``.
 
     Args:
         aids: Aids by name.
-        ears: Ears by name.
+        ears: Audiograms by name.
         utterances: Speech at 16 kHz. Shape: (utterances, time).
-        levels: Levels in dB SPL.
+        levels: Levels of the speech in dB SPL.
 
     Returns:
-        Gains of shape (levels, 24), with ``levels`` and ``frequencies``.
+        One dictionary per ear and aid with the names ``aid`` and ``ear``, ``gain_db`` of shape
+        (levels, 24), and its axes ``levels`` (dB SPL) and ``frequencies`` (Hz).
 
     Raises:
         ValueError: An aid fails.
@@ -157,9 +170,13 @@ def gain_curves(aids: Aids, ears: Ears, utterances: Tensor, levels: Sequence[flo
 
 
 def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
-    """Compute sines of 2 s at 16 kHz in pascals, each at each level in dB SPL.
+    """Compute sines of 2 s at 16 kHz in pascals, for each frequency at each level.
 
-    Shape: -> (tones * levels, 32000).
+    Args:
+        hertz: Frequencies in Hz.
+        levels: Levels in dB SPL.
+
+    Returns: The sines; those of the first frequency come first. Shape: (hertz * levels, 32000).
 
     >>> tones([250, 1000], [50.0, 65.0, 80.0]).shape
     torch.Size([6, 32000])
@@ -170,7 +187,7 @@ def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
     return set_level(sines, torch.tensor(levels, dtype=torch.float32).repeat(len(hertz)))
 
 
-def sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
+def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     """Compute the power at more than 20 Hz from a tone, relative to the power near it, in dB.
 
     Args:
@@ -179,32 +196,32 @@ def sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
 
     Returns:
         Ratios of -200 dB or more. Shape: (items,).
-
-    >>> bool(sidebands_db(tones([1000], [65.0]), torch.tensor([1000])) < -100.0)
-    True
     """
-    middle = waveform[:, MIDDLE].double()
+    middle = waveform[:, _MIDDLE].double()
     window = torch.hann_window(middle.shape[-1], dtype=middle.dtype)
     power = torch.fft.fft(middle * window).abs().square()
     bins = torch.fft.fftfreq(middle.shape[-1], 1.0 / NEURO_RATE).abs()
-    near = (bins - hertz.unsqueeze(-1)).abs() <= SIDEBAND_DISTANCE_HZ
+    near = (bins - hertz.unsqueeze(-1)).abs() <= _SIDEBAND_DISTANCE_HZ
     tone, sidebands = (power * near).sum(-1), (power * ~near).sum(-1)
-    ratio = (sidebands / tone.clamp_min(POWER_FLOOR)).clamp_min(RATIO_FLOOR)
+    ratio = (sidebands / tone.clamp_min(_POWER_FLOOR)).clamp_min(_RATIO_FLOOR)
     return 10.0 * ratio.log10()
 
 
 def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str, Any]:
-    """Measure how loud an ear perceives tones after an aid, and which sidebands the aid adds.
+    """Measure loudness errors and distortion of an aid for steady tones of six frequencies.
+
+    Speech does not reveal an aid that removes steady sounds.
 
     Args:
         aid: The aid.
-        ear: The ear.
+        ear: The audiogram.
         levels: Levels of the tones in dB SPL.
 
     Returns:
-        ``loudness_error_db``, the level of the output after the exact MSBG minus that of the tone
-        for a normal ear, and ``sidebands_db`` of the output, both of shape (levels, frequencies),
-        with ``levels`` and ``frequencies``.
+        ``loudness_error_db``, the level that the ear perceives of the output minus the level that a
+        normal ear perceives of the tone, by the exact MSBG; ``sidebands_db``, the power of the
+        output at more than 20 Hz from the tone relative to that near it; both have the shape
+        (levels, frequencies). ``levels`` (dB SPL) and ``frequencies`` (Hz) are the axes.
 
     Raises:
         ValueError: The aid fails.
@@ -214,24 +231,25 @@ def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str,
     """
     sounds = tones(TONES, levels)
     hertz = torch.tensor(TONES).repeat_interleave(len(levels))
-    aided = outputs(aid, sounds, ear)
+    aided = _aid_outputs(aid, sounds, ear)
     errors = _perceived_level(aided, ear) - _perceived_level(sounds, NORMAL)
-    values = {"loudness_error_db": errors, "sidebands_db": sidebands_db(aided, hertz)}
+    values = {"loudness_error_db": errors, "sidebands_db": _sidebands_db(aided, hertz)}
     by_level = {name: v.reshape(len(TONES), -1).T.tolist() for name, v in values.items()}
     return {"levels": list(levels), "frequencies": list(TONES), **by_level}
 
 
 def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
-    """Measure whether an aid can be worn: its look-ahead, its gain in quiet rooms, and its cost.
+    """Measure what decides whether an aid can be worn: look-ahead, gain for quiet noise, cost.
 
     Args:
         aid: The aid.
-        ear: The ear.
-        speech: 3 s at 16 kHz. Shape: (time,).
+        ear: The audiogram.
+        speech: Utterance of 3 s at 16 kHz. Shape: (48000,).
 
     Returns:
-        ``look_ahead_ms``, see ``look_ahead``; ``quiet_gain_db``, the gain for white noise at
-        ``QUIET_LEVELS``; and ``cpu_ms``, the processor time per second of sound on one thread.
+        ``look_ahead_ms``, by how many ms an output changes before its input; ``quiet_gain_db``, the
+        gains in dB for white noise at each of ``QUIET_LEVELS``; and ``cpu_ms``, the processor time
+        in ms for one second of sound on one thread.
 
     Raises:
         ValueError: The aid fails.
@@ -245,11 +263,11 @@ def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
     signals = [*changed_signals(speech, other, CHANGE_POSITIONS), *quiet]
     with one_thread():
         start = time.process_time()
-        aided = outputs(aid, signals, ear)
+        aided = _aid_outputs(aid, signals, ear)
         seconds = time.process_time() - start
     samples = look_ahead(aided[: -len(quiet)], CHANGE_POSITIONS)
     gains = [
-        float(level_spl(after[MIDDLE]) - level_spl(before[MIDDLE]))
+        float(level_spl(after[_MIDDLE]) - level_spl(before[_MIDDLE]))
         for after, before in zip(aided[-len(quiet) :], quiet, strict=True)
     ]
     return {
@@ -260,9 +278,14 @@ def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
 
 
 def changed_signals(signal: Tensor, other: Tensor, positions: Iterable[int]) -> list[Tensor]:
-    """Return a signal, and versions of it that become another sound at each position.
+    """Return the inputs with which ``look_ahead`` is measured.
 
-    Shape: (..., time) twice -> (..., time) each.
+    Args:
+        signal: First sound. Shape: (..., time).
+        other: Second sound. Shape: (..., time).
+        positions: Samples from which on the second sound replaces the first one.
+
+    Returns: The first sound alone, and for each position a signal that changes there.
 
     >>> [signal.tolist() for signal in changed_signals(torch.zeros(3), torch.ones(3), [2])]
     [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -274,21 +297,21 @@ def changed_signals(signal: Tensor, other: Tensor, positions: Iterable[int]) -> 
 def look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
     """Return by how many samples an output changes before its input becomes another sound.
 
-    Differences of more than 1e-4 of the output's peak count.
+    A change is a difference of more than 1e-4 of the output's peak.
 
     Args:
-        outputs: Outputs for the signals of ``changed_signals``, in the same order: that for the
-            unchanged signal, and one for each position. Shape: (..., time) each.
-        positions: Samples from which on the input becomes another sound.
+        outputs: Outputs of an aid for the signals of ``changed_signals``, in the same order. Shape
+            of each: (..., time).
+        positions: Samples from which on the second sound replaces the first one.
 
     Returns:
-        The largest number at any position, at least 0.
+        The largest number of samples at any position, 0 for an aid without look-ahead.
 
     >>> look_ahead(changed_signals(torch.ones(9), torch.zeros(9), [3]), [5])
     2
     """
     unchanged, *changed = outputs
-    threshold, largest = CHANGE_THRESHOLD * float(unchanged.abs().max()), 0
+    threshold, largest = _CHANGE_THRESHOLD * float(unchanged.abs().max()), 0
     for output, position in zip(changed, positions, strict=True):
         difference = (output - unchanged).abs().reshape(-1, unchanged.shape[-1]).amax(0)
         differs = difference > threshold
@@ -297,16 +320,18 @@ def look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
     return largest
 
 
-def outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
+def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
     """Return the outputs of an aid for several signals, which are processed one at a time.
 
-    Shape: signals of (time,) -> (signals, time).
+    Args:
+        aid: The aid.
+        signals: Signals of equal length. Shape of each: (time,).
+        ear: The audiogram.
+
+    Returns: Outputs, cut to the length of the signals. Shape: (signals, time).
 
     Raises:
         ValueError: The aid fails, or its output is not a finite tensor of the input's shape.
-
-    >>> outputs(lambda signal, ear: signal, torch.ones(2, 10), Audiogram.standard("N3")).shape
-    torch.Size([2, 10])
     """
     results: list[Tensor] = []
     for signal in signals:
@@ -315,22 +340,24 @@ def outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
                 output = aid(signal, ear)
         except Exception as error:  # The aid may be code of a user.
             raise ValueError(describe_error(error)) from error
-        if not isinstance(output, Tensor) or output.ndim != 1:
-            shape = getattr(output, "shape", type(output).__name__)
-            raise ValueError(f"expected an output of shape {tuple(signal.shape)}, got {shape}")
+        is_waveform = isinstance(output, Tensor) and output.ndim == 1
+        if not (is_waveform and output.isfinite().all()):
+            kind = getattr(output, "shape", type(output).__name__)
+            problem = "NaN or infinite samples" if is_waveform else kind
+            raise ValueError(
+                f"expected a finite output of shape {tuple(signal.shape)}, got {problem}"
+            )
         lengths = len(signal), len(output)
-        output = output[: common_length(lengths, NEURO_RATE, ("the input", "the output"))]
-        if not output.isfinite().all():
-            raise ValueError("the output has samples that are NaN or infinite")
-        results.append(output)
+        samples = common_length(lengths, NEURO_RATE, ("the input", "the output"))
+        results.append(output[:samples])
     return torch.stack(results)
 
 
 def _band_powers(signal: Tensor) -> Tensor:
-    """Return the mean power of each band. Shape: (utterances, time) -> (24,)."""
+    """Return the mean power in each of 24 bands. Shape: (utterances, time) -> (24,)."""
     return (10.0 ** (band_levels(signal.double(), NEURO_RATE) / 10.0)).mean((0, 1))
 
 
 def _perceived_level(sounds: Tensor, ear: Audiogram) -> Tensor:
     """Return the level of the middle second in dB SPL. Shape: (items, time) -> (items,)."""
-    return level_spl(perceive(sounds, ear, NEURO_RATE)[:, MIDDLE])
+    return level_spl(perceive(sounds, ear, NEURO_RATE)[:, _MIDDLE])

@@ -1,4 +1,7 @@
-"""Aids with which others are compared: no aid, an equaliser, and an aid at the level of another."""
+"""Aids of the studies' conditions: no aid, an equaliser, an aid at another's level, and your own.
+
+An aid is a function or module ``(waveform, ear) -> waveform``.
+"""
 
 from __future__ import annotations
 
@@ -19,25 +22,27 @@ from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aid_properties import insertion_gain
 from hlsim.losses.band_levels import band_centres
-from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
 
-EQUALISER_TAPS = 513
+_EQUALISER_TAPS = 513
 """Number of taps of an equaliser, which gives it a resolution of 31 Hz at 16 kHz."""
 
-LOWEST_GAIN_DB = -100.0
+_LOWEST_GAIN_DB = -100.0
 """Lowest gain of an equaliser in dB."""
 
-SPEECH_FILE = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
+_SPEECH_FILE = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
 """Speech on which an enhancer is tried when it is loaded."""
 
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
-"""Gains of the equalisers of this process, by their identifier and the ear."""
+"""Gains in dB that equalisers have measured in this process, by equaliser and ear.
+
+Processes receive copies of an equaliser with each item, so that a copy cannot store its gains.
+"""
 
 
 class Unaided(nn.Module):
-    """No hearing aid: the output is the input.
+    """Condition without a hearing aid: the output is the input.
 
     >>> Unaided()(torch.ones(2), Audiogram.standard("N3"))
     tensor([1., 1.])
@@ -49,7 +54,13 @@ class Unaided(nn.Module):
 
 
 class AtLevelOf(nn.Module):
-    """Aid whose output has the RMS level of another aid's output for the same input.
+    """Aid whose output is scaled to the RMS level of another aid's output for the same input.
+
+    HASPI rewards any gain, so that aids are compared at equal level.
+
+    Args:
+        aid: The aid whose output is returned.
+        other: The aid whose level the output gets.
 
     >>> AtLevelOf(Unaided(), Unaided())(torch.ones(2), Audiogram.standard("N3"))
     tensor([1., 1.])
@@ -65,13 +76,13 @@ class AtLevelOf(nn.Module):
 
 
 class EqualiserLike(nn.Module):
-    """Fixed filter for each ear with an aid's mean insertion gain.
+    """Linear filter with the mean gain that an aid has for speech, measured for each ear.
 
-    Everything that an aid achieves beyond it is not due to gain.
+    What the aid achieves beyond this filter is not due to gain.
 
     Args:
         aid: The aid.
-        utterances: Speech on which the gain is measured. Shape: (utterances, time) at 16 kHz.
+        utterances: Speech at 16 kHz with which the gain is measured. Shape: (utterances, time).
         levels: Levels of the speech in dB SPL, over which the gain in dB is averaged.
 
     >>> equaliser = EqualiserLike(Unaided(), torch.randn(1, 16000), (65.0,))
@@ -88,39 +99,38 @@ class EqualiserLike(nn.Module):
         self._identifier = uuid.uuid4().hex  # the same in every process that receives a copy
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Filter the waveform. The gains of an ear are measured once per process."""
+        """Filter a waveform at 16 kHz. The gains of an ear are measured once per process."""
         key = self._identifier, audiogram
         if key not in _GAINS:
             _GAINS[key] = self.gains_db(audiogram)
-        return equalise_bands(waveform, _GAINS[key])
+        return _equalise_bands(waveform, _GAINS[key])
 
     def gains_db(self, audiogram: Audiogram) -> list[float]:
-        """Measure the gain of each band in dB, rounded to 0.1 dB."""
+        """Measure the aid's mean gain in dB in 24 bands, rounded to 0.1 dB."""
         gains = insertion_gain(self.aid, audiogram, self.utterances, self.levels)
-        mean = np.mean(gains, 0).clip(LOWEST_GAIN_DB, None)
+        mean = np.mean(gains, 0).clip(_LOWEST_GAIN_DB, None)
         return [round(gain, 1) for gain in mean.tolist()]
 
 
-def equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
-    """Filter a waveform at 16 kHz with one gain per band, with linear phase and without delay.
+def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
+    """Filter a waveform at 16 kHz with linear phase and without delay.
 
     Args:
-        waveform: Signal with shape (..., time).
-        gains_db: Gains in dB at the frequencies of ``band_centres``.
-
-    >>> equalise_bands(torch.ones(1000), [6.0] * 24).shape
-    torch.Size([1000])
+        waveform: Signals with shape (..., time).
+        gains_db: Gains in dB at the 24 frequencies of ``band_centres``.
     """
-    hertz = np.linspace(0.0, NEURO_RATE / 2.0, EQUALISER_TAPS)
+    hertz = np.linspace(0.0, NEURO_RATE / 2.0, _EQUALISER_TAPS)
     gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
-    taps = firwin2(EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
+    taps = firwin2(_EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
     return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
 
 
 class PluginAid(nn.Module):
     """Aid of a user for two ears, a function ``(waveform, listener, sample_rate) -> waveform``.
 
-    An output that is longer than the input by up to 0.1 s is cut.
+    Args:
+        name: ``package.module:name`` or ``path/to/file.py:name``.
+        sample_rate: Sample rate in Hz with which the function is called.
 
     >>> PluginAid("builtins:max", 16000)
     PluginAid()
@@ -135,26 +145,23 @@ class PluginAid(nn.Module):
         """Call the user's function.
 
         Args:
-            waveform: Signals at the left and the right ear in pascals. Shape: (2, time).
+            waveform: Signals at the left and the right ear. Shape: (2, time).
             listener: Audiograms of both ears, an ``hlsim.Listener``.
 
         Returns:
-            Outputs for both ears. Shape: (2, time).
+            Outputs for both ears. Shape: (2, time), where ``time`` may differ from the input's.
         """
-        output = self.plugin(waveform, listener, self.sample_rate)
-        lengths = waveform.shape[-1], output.shape[-1]
-        names = ("the input", f"the output of {self.plugin.name}")
-        return output[..., : common_length(lengths, self.sample_rate, names)]
+        return self.plugin(waveform, listener, self.sample_rate)
 
 
 class Enhanced(nn.Module):
-    """Aid after an enhancer that reduces noise.
+    """Aid that receives the output of an enhancer, which reduces noise, instead of the input.
 
     Args:
-        enhancer: The enhancer, for signals in pascals.
+        enhancer: Enhancer of signals in pascals.
         aid: The aid.
-        sample_rate: Rate in Hz.
-        full_scale_spl: Level in dB SPL of RMS 1.0 at the input of the aid.
+        sample_rate: Sample rate in Hz.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0 for the aid.
 
     >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
@@ -174,17 +181,19 @@ class Enhanced(nn.Module):
         self.limit_spl = output_limit_spl(aid)
 
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
-        """Process the output of the enhancer."""
+        """Return the output of the aid for the enhanced waveform, with shape (..., time)."""
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
         aided: Tensor = self.aid(enhanced, ear)
         return aided
 
 
 def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
-    """Load enhancers ``(waveform, sample_rate) -> waveform`` of (..., time) in pascals.
+    """Load functions ``(waveform, sample_rate) -> waveform`` that reduce noise before an aid.
+
+    They process signals in pascals with shape (..., time), and are tried on two seconds of speech.
 
     Args:
-        names: ``package.module:name`` or ``path/to/file.py:name``.
+        names: ``package.module:name`` or ``path/to/file.py:name`` of each function.
 
     Returns:
         The enhancers by the part of their names after the colon.
@@ -196,7 +205,7 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
     >>> load_enhancers([])
     {}
     """
-    recording, rate = read_audio(SPEECH_FILE)
+    recording, rate = read_audio(_SPEECH_FILE)
     speech = set_level(resample(recording[0], rate, NEURO_RATE)[: 2 * NEURO_RATE], 65.0)
     enhancers: dict[str, WaveformPlugin] = {}
     for name in names:
@@ -210,7 +219,9 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
 
 
 def output_limit_spl(aid: Any) -> float | None:
-    """Return the peak in dB SPL that an aid guarantees not to exceed, or None.
+    """Return the peak in dB SPL that an aid promises not to exceed, or None without a promise.
+
+    It is the attribute ``limit_spl`` of the aid or of its ``config``.
 
     >>> output_limit_spl(Unaided()) is None
     True

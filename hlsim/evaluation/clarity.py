@@ -1,4 +1,4 @@
-"""Scenes of the Clarity enhancement challenges: aids of both ears, scored by the better ear.
+"""The study of ``clarity``: aids of both ears on scenes of the Clarity enhancement challenges.
 
 As in the challenges' scripts (claritychallenge/clarity, recipes/icassp_2023 and cec3), the
 reference is the target without its room, at the level of the target in the room. An RMS of 1.0 in a
@@ -27,11 +27,12 @@ from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import set_level
 from hlsim.evaluation.aid_properties import changed_signals, look_ahead
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
+from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.parallel import describe_error, one_thread, run_parallel
 from hlsim.evaluation.recordings import Recording, score_recordings
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.store import content_hash, settings_hash
+from hlsim.evaluation.store import content_hash
 from hlsim.evaluation.study import DEAD_PROCESS, Condition
 from hlsim.files import write_atomically
 from hlsim.metrics.pair import common_length
@@ -45,37 +46,55 @@ RULE_MS = 5.0
 UNAIDED, NAL_R = "unaided", "NAL-R"
 """Conditions with which every pair of aids is compared."""
 
-MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
-"""Ends of the names of files of the front microphones."""
+_MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
+"""Ends of the names of files with the signals of the front microphones."""
 
-REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
-"""Ends of the names of references. The last one already has its level."""
+_REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
+"""Ends of the names of references. The last one already has the target's level in the room."""
 
-IN_ROOM_ENDING = "_target_CH1.wav"
-"""End of the names of files of the target in the room."""
+_IN_ROOM_ENDING = "_target_CH1.wav"
+"""End of the names of files with the target in the room."""
 
-PROBE_POSITIONS = 8
+_CHANGES = 8
 """Number of positions at which the scene becomes another sound, to measure the look-ahead."""
 
-MAX_PROBE_SECONDS = 4.0
-"""Length of the scene on which the look-ahead is measured."""
+_LOOK_AHEAD_SECONDS = 4.0
+"""Length of the part of a scene on which the look-ahead is measured."""
 
 
-class Scene(NamedTuple):
+class _Scene(NamedTuple):
     """Files of a scene.
 
     Attributes:
-        mix: Front microphones.
-        reference: Target without its room.
-        in_room: Target in the room, whose level the reference gets; None if it has its level.
-
-    >>> Scene(Path("S1_mix_CH1.wav"), Path("S1_reference.wav"), None).mix.name
-    'S1_mix_CH1.wav'
+        mix: File with the signals of the front microphones.
+        reference: File with the target without its room.
+        in_room: File with the target in the room, whose level the reference gets; None if the
+            reference has this level.
     """
 
     mix: Path
     reference: Path
     in_room: Path | None
+
+
+class _Pair(NamedTuple):
+    """A scene for a listener.
+
+    Attributes:
+        scene: Name of the scene.
+        files: Files of the scene.
+        name: Name of the listener.
+        listener: Both ears of the listener.
+    """
+
+    scene: str
+    files: _Scene
+    name: str
+    listener: Listener
+
+    def output_file(self, folder: Path) -> Path:
+        """Return the file of an output in the folder of its condition."""
+        return folder / f"{self.scene}_{self.name}_HA-output.wav"
 
 
 def evaluate_scenes(
@@ -93,32 +112,33 @@ def evaluate_scenes(
     seed: int = 0,
     **running: Any,
 ) -> Evaluation:
-    """Compare pairs of aids with no aid and NAL-R on binaural scenes, by HASPI and HASQI.
+    """Compare aids of both ears with no aid and NAL-R on binaural scenes, by HASPI and HASQI.
 
     The outputs are written to ``out/signals/CONDITION/SCENE_LISTENER_HA-output.wav`` (the
     challenges' names), the references to ``out/reference``, and the scores to
-    ``out/scores.jsonl``. An interrupted run can be continued. The comparison of each pair of aids
-    with NAL-R by HASPI is planned.
+    ``out/scores.jsonl``. An interrupted run can be continued. The score of a scene is that of the
+    better ear. The comparison of each aid with NAL-R by HASPI is planned.
 
     Args:
-        aids: Name or folder of a compensator by its label, or ``package.module:name`` of a function
-            ``(waveform, listener, sample_rate) -> waveform`` for (2, time) at the files' scale.
+        aids: Compensators (name or folder) and aids of your own, by their label in tables. An aid
+            is ``package.module:name`` of a function ``(waveform, listener, sample_rate) ->
+            waveform`` for signals with shape (2, time) at the scale of the files.
         scenes: Folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``) with two channels, and
             ``SCENE_target_anechoic_CH1.wav`` (or ``_target_anechoic``, ``_reference``) with one or
             two. If there is a ``SCENE_target_CH1.wav``, each channel of the reference gets its
             level.
         listeners: Clarity's ``listeners.json``, or a CSV file, see ``read_listeners``. Only
             listeners that are used are validated.
-        out: Folder for the results.
+        out: Folder of the results.
         scenes_listeners: JSON file with the names of the listeners of each scene; by default all
             scenes and listeners are combined.
         stride: N for every n-th pair of scene and listener. 15 gives the challenges' small test.
         enhancers: ``package.module:name`` of functions that reduce noise before each aid.
         measures: Measures in addition to HASPI and HASQI.
         linked: Whether one level sets the gains of both ears, in compensators that support it.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
+        full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI and HASQI add.
-        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
+        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
     Returns:
         The evaluation of all conditions, ``unaided`` first. Its detail ``look_ahead_ms`` is by
@@ -131,37 +151,33 @@ def evaluate_scenes(
     """
     names = ["haspi", "hasqi", *measures]
     find_measures(names)
-    if stride < 1:
-        raise ValueError(f"stride is {stride}; expected 1 or more")
-    known, folder = read_scenes(scenes), Path(out)
-    pairs = read_pairs(known, listeners, scenes_listeners, stride)
+    files_by_scene, folder = _read_scenes(Path(scenes)), Path(out)
+    pairs = _read_pairs(files_by_scene, listeners, scenes_listeners, stride)
     first = pairs[0]
     rate = read_audio(first.files.mix)[1]
     conditions = _make_conditions(aids, enhancers, linked, rate, full_scale_spl)
     folders = _signal_folders(conditions, folder / "signals")
-    look_ahead_ms = _measure_look_ahead(conditions, first.files.mix, first.listener)
-    _remove_outdated(conditions, folders, known.values())
+    look_ahead_ms = _measure_look_ahead(conditions, first)
+    _remove_outdated(conditions, folders, files_by_scene.values())
     write = partial(_write_signals, rate=rate, conditions=conditions, folders=folders, out=folder)
     parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
     recordings = []
-    problems = dict(run_parallel(write, pairs, **parallel))
-    for pair, ear in product(pairs, EARS):
-        problem = problems[pair]
-        if problem is None:
-            problem = dict.fromkeys(folders, DEAD_PROCESS)
-        files = {name: pair.output_file(path) for name, path in folders.items()}
-        recording = Recording(
-            pair.scene,
-            _reference_file(folder, pair.scene),
-            {name: path for name, path in files.items() if name not in problem},
-            getattr(pair.listener, ear),
-            listener=pair.name,
-            ear=ear,
-            full_scale_spl=full_scale_spl,
-            seed=seed,
-            problems=problem,
-        )
-        recordings.append(recording)
+    for pair, written in run_parallel(write, pairs, **parallel):
+        problems = dict.fromkeys(folders, DEAD_PROCESS) if written is None else written
+        files = {name: pair.output_file(signals) for name, signals in folders.items()}
+        for ear in EARS:
+            recording = Recording(
+                pair.scene,
+                _reference_file(folder, pair.scene),
+                {name: path for name, path in files.items() if name not in problems},
+                getattr(pair.listener, ear),
+                listener=pair.name,
+                ear=ear,
+                full_scale_spl=full_scale_spl,
+                seed=seed,
+                problems=problems,
+            )
+            recordings.append(recording)
     evaluation = score_recordings(
         recordings,
         [replace(condition, process=None) for condition in conditions],
@@ -174,100 +190,76 @@ def evaluate_scenes(
     return replace(evaluation, details={"look_ahead_ms": look_ahead_ms})
 
 
-def read_scenes(folder: str | Path) -> dict[str, Scene]:
+def _read_scenes(folder: Path) -> dict[str, _Scene]:
     """Return the scenes of a folder by name.
 
     Raises:
         ValueError: There is no scene, or a scene lacks its reference.
     """
-    folder, scenes = Path(folder), {}
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder")
-    for ending in MIX_ENDINGS:
+    scenes = {}
+    for ending in _MIX_ENDINGS:
         for mix in folder.glob(f"*{ending}"):
             name = mix.name.removesuffix(ending)
-            candidates = [folder / (name + end) for end in REFERENCE_ENDINGS]
-            references = [path for path in candidates if path.is_file()]
-            if not references:
+            candidates = [folder / f"{name}{end}" for end in _REFERENCE_ENDINGS]
+            reference = next(filter(Path.is_file, candidates), None)
+            if reference is None:
                 expected = " or ".join(path.name for path in candidates)
                 raise ValueError(f"{mix} has no reference; put {expected} beside it")
-            in_room = folder / (name + IN_ROOM_ENDING)
-            has_level = references[0] == candidates[-1] or not in_room.is_file()
-            scenes[name] = Scene(mix, references[0], None if has_level else in_room)
+            in_room = folder / f"{name}{_IN_ROOM_ENDING}"
+            has_level = reference == candidates[-1] or not in_room.is_file()
+            scenes[name] = _Scene(mix, reference, None if has_level else in_room)
     if not scenes:
-        raise ValueError(f"{folder} has no files that end with {' or '.join(MIX_ENDINGS)}")
+        raise ValueError(
+            f"{folder}: expected a folder with files that end with {' or '.join(_MIX_ENDINGS)}"
+        )
     return dict(sorted(scenes.items()))
 
 
-class ListenerInScene(NamedTuple):
-    """One scene for one listener.
-
-    Attributes:
-        scene: Name of the scene.
-        name: Name of the listener.
-        files: Files of the scene.
-        listener: The listener.
-    """
-
-    scene: str
-    name: str
-    files: Scene
-    listener: Listener
-
-    def output_file(self, folder: Path) -> Path:
-        """Return the file of the output in the folder of a condition."""
-        return folder / f"{self.scene}_{self.name}_HA-output.wav"
-
-
-def read_pairs(
-    scenes: Mapping[str, Scene],
+def _read_pairs(
+    scenes: Mapping[str, _Scene],
     listeners: str | Path,
-    scenes_listeners: str | Path | None = None,
-    stride: int = 1,
-) -> list[ListenerInScene]:
-    """Return pairs of scene and listener.
-
-    Args:
-        scenes: Scenes by name.
-        listeners: Clarity's ``listeners.json``, or a CSV file.
-        scenes_listeners: Clarity's ``scenes_listeners.json``; by default all scenes and listeners
-            are combined.
-        stride: N for every n-th pair.
+    scenes_listeners: str | Path | None,
+    stride: int,
+) -> list[_Pair]:
+    """Return every n-th pair of scene and listener, see ``evaluate_scenes``.
 
     Raises:
         ValueError: A file is broken or names an unknown scene or listener, or a listener who is
-            used lacks an ear.
+            used lacks an ear or has a name that no file can have.
     """
+    if stride < 1:
+        raise ValueError(f"expected a stride of 1 or more, got {stride}")
     if scenes_listeners is None:
         people = read_listeners(listeners)
-        pairs = list(product(scenes, people))[::stride]
+        names = list(product(scenes, people))[::stride]
     else:
-        pairs = _read_names(Path(scenes_listeners))[::stride]
-        people = read_listeners(listeners, {name for _, name in pairs})
-    for scene, name in pairs:
+        names = _read_names(Path(scenes_listeners))[::stride]
+        people = read_listeners(listeners, {name for _, name in names})
+    for scene, name in names:
         if scene not in scenes:
             raise ValueError(f"{scenes_listeners}: there is no scene {scene!r}")
-        if Path(name).name != name:
-            raise ValueError(f"the listener {name!r} has a name that no file can have")
-        for ear in EARS:
-            if getattr(people[name], ear) is None:
-                raise ValueError(f"the {ear} ear of listener {name} is missing")
-    return [ListenerInScene(scene, name, scenes[scene], people[name]) for scene, name in pairs]
+        has_ears = people[name].left is not None and people[name].right is not None
+        if Path(name).name != name or not has_ears:
+            raise ValueError(
+                f"{listeners}: expected a left and a right ear of listener {name!r}, and a name "
+                "that a file can have"
+            )
+    if not names:
+        raise ValueError(f"{scenes_listeners or listeners}: no scene has a listener")
+    return [_Pair(scene, scenes[scene], name, people[name]) for scene, name in names]
 
 
 def _read_names(path: Path) -> list[tuple[str, str]]:
     """Return the names of scenes and listeners in ``scenes_listeners.json``."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        pairs = [(scene, name) for scene, names in entries.items() for name in names]
+        names = [(scene, name) for scene, listeners in entries.items() for name in listeners]
+        return list(dict.fromkeys(names))
     except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
         raise ValueError(
             f"{path}: cannot be read ({error}); expected an object with a list of listeners for "
             "each scene"
         ) from error
-    if not pairs:
-        raise ValueError(f"{path}: no scene has a listener")
-    return list(dict.fromkeys(pairs))
 
 
 def _make_conditions(
@@ -277,6 +269,7 @@ def _make_conditions(
     rate: int,
     full_scale_spl: float,
 ) -> list[Condition]:
+    """Return no aid, NAL-R and all aids, each of them also after every enhancer."""
     levels: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
     loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
     for label, name in aids.items():
@@ -312,27 +305,24 @@ def _signal_folders(conditions: Sequence[Condition], root: Path) -> dict[str, Pa
 
 
 @torch.no_grad()
-def _measure_look_ahead(
-    conditions: Sequence[Condition], mix: Path, listener: Listener
-) -> dict[str, float | None]:
+def _measure_look_ahead(conditions: Sequence[Condition], pair: _Pair) -> dict[str, float | None]:
     """Measure the look-ahead in ms on the beginning of a scene, or None for an aid that fails."""
-    scene, rate = read_audio(mix)
-    scene = scene[:, : int(MAX_PROBE_SECONDS * rate)]
-    time = scene.shape[-1]
+    scene, rate = read_audio(pair.files.mix)
+    scene = scene[:, : int(_LOOK_AHEAD_SECONDS * rate)]
     generator = torch.Generator().manual_seed(0)
     other = set_level(torch.randn(scene.shape, generator=generator), 65.0)
     if scene.any():
         other *= scene.square().mean().sqrt() / other.square().mean().sqrt()
     else:
         scene = set_level(torch.randn(scene.shape, generator=generator), 65.0)
-    step = max(1, time // (PROBE_POSITIONS + 3))
-    positions = range(time // 4, time, step)[:PROBE_POSITIONS]
+    time = scene.shape[-1]
+    positions = range(time // 4, time, max(1, time // (_CHANGES + 3)))[:_CHANGES]
     signals = changed_signals(scene, other, positions)
     look_ahead_ms: dict[str, float | None] = {}
     for condition in conditions:
         assert condition.process is not None
         try:
-            outputs = [condition.process(signal, listener) for signal in signals]
+            outputs = [condition.process(signal, pair.listener) for signal in signals]
             look_ahead_ms[condition.name] = 1000.0 * look_ahead(outputs, positions) / rate
         except ValueError:
             look_ahead_ms[condition.name] = None
@@ -344,18 +334,21 @@ def _reference_file(out: Path, scene: str) -> Path:
 
 
 def _remove_outdated(
-    conditions: Sequence[Condition], folders: Mapping[str, Path], scenes: Iterable[Scene]
+    conditions: Sequence[Condition], folders: Mapping[str, Path], scenes: Iterable[_Scene]
 ) -> None:
-    """Remove the signals of a condition whose processing or scenes have changed."""
+    """Remove the signals of a condition whose processing or scenes have changed.
+
+    Args:
+        conditions: Conditions.
+        folders: Folder of the signals, by condition, where a file contains their fingerprint.
+        scenes: All scenes.
+    """
     mixes = [content_hash(scene.mix) for scene in scenes]
     for condition in conditions:
         folder = folders[condition.name]
-        note, state = (
-            folder / "fingerprint.txt",
-            settings_hash({"of": [condition.fingerprint, mixes]}),
-        )
-        is_unknown = condition.fingerprint is None
-        if is_unknown or not note.is_file() or note.read_text() != state:
+        note, state = folder / "fingerprint.txt", value_hash([condition.fingerprint, mixes])
+        is_known = condition.fingerprint is not None and note.is_file()
+        if not is_known or note.read_text() != state:
             for path in folder.glob("*_HA-output.wav"):
                 path.unlink()
             write_atomically(note, state)
@@ -364,13 +357,13 @@ def _remove_outdated(
 @one_thread()
 @torch.no_grad()
 def _write_signals(
-    pair: ListenerInScene,
+    pair: _Pair,
     rate: int,
     conditions: Sequence[Condition],
     folders: Mapping[str, Path],
     out: Path,
 ) -> dict[str, str]:
-    """Write the reference and the missing outputs of a pair.
+    """Write the reference and the missing outputs of a scene for a listener.
 
     Returns:
         For each condition without an output, the reason.
@@ -396,10 +389,10 @@ def _write(path: Path, waveform: Tensor, rate: int) -> None:
     write_audio(path, waveform, rate)
 
 
-def _read_scene(scene: Scene, rate: int) -> tuple[Tensor, Tensor]:
-    """Return the mix, and the target without its room at the level of the target in the room.
+def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:
+    """Read the microphones' signals, and the reference at the level of the target in the room.
 
-    Shape: -> (2, time) twice.
+    Returns: Both signals, for the left and the right ear. Shape: (2, time) each.
 
     Raises:
         ValueError: A file is broken, or has another rate or length.
@@ -424,10 +417,11 @@ def _read_scene(scene: Scene, rate: int) -> tuple[Tensor, Tensor]:
 
 
 def _read_channels(path: Path, rate: int) -> Tensor:
-    """Read one or two channels. Shape: -> (channels, time)."""
+    """Read a file of one or two channels. Shape: (channels, time)."""
     waveform, file_rate = read_audio(path)
-    if file_rate != rate:
-        raise ValueError(f"{path} has {file_rate} Hz, and the first scene {rate} Hz")
-    if len(waveform) > 2:
-        raise ValueError(f"{path} has {len(waveform)} channels; expected left and right")
+    if file_rate != rate or len(waveform) > 2:
+        raise ValueError(
+            f"{path} has {len(waveform)} channels at {file_rate} Hz; expected left and right at "
+            f"the rate of the first scene, {rate} Hz"
+        )
     return waveform

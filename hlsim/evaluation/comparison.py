@@ -1,4 +1,4 @@
-"""Two conditions compared by one measure: overall, by degree of loss, by listener, and in words."""
+"""Comparisons of two conditions by one measure, over the items of a study, and in sentences."""
 
 from __future__ import annotations
 
@@ -23,29 +23,31 @@ ALPHA = 0.05
 LEVEL_TOLERANCE_DB = 1.0
 """Change of the level in dB that is too small to explain a change of a score."""
 
-Pair = tuple[str, str, str]
-"""Measure, condition before and condition after."""
+PlannedComparison = tuple[str, str, str]
+"""A comparison that was planned before the scores were known: measure and both conditions."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of two conditions by one measure, for the items that have both scores.
+    """Comparison of two conditions by one measure, over the items that have both scores.
 
     Attributes:
-        measure: Column of the score.
-        before, after: Names of the conditions.
-        overall: Comparison over all items, with p values that are not adjusted.
+        measure: Column of the score, such as ``"haspi"``.
+        before, after: Names of the two conditions. A change is the score of the second minus that
+            of the first.
+        overall: Statistics over all items, with p values that are not adjusted.
         level_before_mean, level_after_mean: Mean output levels of the same items in dB SPL; NaN if
             they are not known.
-        by_severity: Comparison for each degree of loss that occurs.
-        unit: Column within which the items are nested, such as ``"listener"``.
-        unit_means: Comparison of the means of each unit; None unless there are two units or more.
+        by_severity: The same statistics for the items of each degree of hearing loss that occurs.
+        unit: Column of the table that several items share, such as ``"listener"``.
+        unit_means: The same statistics over one mean score per unit, because items of one listener
+            are not independent; None unless there are two units or more.
         left_out: Number of items that lack one of the two scores.
-        p_t, p_w: P values of the t-test and of Wilcoxon's test to be stated.
+        p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state.
         planned: Whether the comparison was planned before the scores were known. Its p values are
             not adjusted; those of all other comparisons are adjusted by Holm over the family of the
             measure.
-        family: Number of comparisons for which the p values are adjusted.
+        family: Number of comparisons by the measure for which the p values are adjusted.
 
     >>> import pandas
     >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
@@ -85,17 +87,17 @@ class Comparison:
         return abs(self.level_change) < LEVEL_TOLERANCE_DB
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the attributes and the sentences for ``report.json``."""
         return asdict(self) | {"in_words": f"{self.verdict()} {self.limits()}"}
 
     def verdict(self, subject: str = "", rival: str = "") -> str:
-        """Return one sentence that compares the second condition with the first.
+        """Return a sentence that says which condition is better, with scores and p values.
 
         A higher score is called better only at equal level, because HASPI rewards gain.
 
         Args:
-            subject: Name of the second condition at the start of a sentence, by default its own.
-            rival: Name of the first condition within a sentence, by default its own.
+            subject: Other words for the condition ``after``, which begin the sentence.
+            rival: Other words for the condition ``before``.
         """
         c = self.overall
         rises = c.delta > 0
@@ -119,7 +121,7 @@ class Comparison:
         return f"{text}: {means} ({facts}; {self._describe_tests()})."
 
     def limits(self) -> str:
-        """Return sentences about everything that the scores do not show."""
+        """Return sentences about levels, dependent items and other limits of the verdict."""
         sentences = [self._describe_level(), self._describe_units()]
         if self.left_out:
             sentences.append(f"{_count_items(self.left_out)} without both scores are left out.")
@@ -187,22 +189,21 @@ def compare(
     measures: Sequence[str],
     *,
     baseline: str | None = None,
-    planned: Collection[Pair] = (),
+    planned: Collection[PlannedComparison] = (),
     unit: str = "listener",
 ) -> list[Comparison]:
     """Compare each condition of a study with every earlier one.
 
     Args:
-        table: Table that ``run_study`` returns.
+        table: Table of ``run_study``, with one row per item and condition.
         measures: Columns of scores.
-        baseline: Condition with which all other conditions are compared, instead of every earlier
-            one.
+        baseline: Name of the only condition with which all others are compared.
         planned: Comparisons that were planned before the scores were known. The p values of all
             other comparisons by the same measure are adjusted by Holm.
-        unit: Column of the unit within which items are nested.
+        unit: Column that several items share, such as ``"listener"``; their means are compared too.
 
     Returns:
-        The comparisons of each measure, for the pairs of conditions with both scores of an item.
+        The comparisons of each measure in turn, without pairs that have both scores of no item.
 
     >>> import pandas
     >>> rows = [(i, c, 0.1 * i + 0.2 * (c == "b")) for i in range(6) for c in "ab"]
@@ -224,20 +225,20 @@ def compare(
     return comparisons
 
 
-def _adjust(comparisons: Sequence[Comparison], planned: Collection[Pair]) -> list[Comparison]:
-    """Mark planned comparisons, and adjust the p values of all others."""
+def _adjust(
+    comparisons: Sequence[Comparison], planned: Collection[PlannedComparison]
+) -> list[Comparison]:
+    """Mark the planned comparisons of a measure, and adjust the p values of all others."""
     if len(comparisons) > 1:
         is_planned = [(c.measure, c.before, c.after) in planned for c in comparisons]
         comparisons = [replace(c, planned=p) for c, p in zip(comparisons, is_planned, strict=True)]
-    family = [comparison for comparison in comparisons if not comparison.planned]
-    adjusted_t = iter(holm(comparison.p_t for comparison in family))
-    adjusted_w = iter(holm(comparison.p_w for comparison in family))
-    return [
-        c
-        if c.planned
-        else replace(c, p_t=next(adjusted_t), p_w=next(adjusted_w), family=len(family))
-        for c in comparisons
-    ]
+    family = [c for c in comparisons if not c.planned]
+    adjusted_p = zip(holm(c.p_t for c in family), holm(c.p_w for c in family), strict=True)
+    adjusted = {
+        (c.before, c.after): replace(c, p_t=p_t, p_w=p_w, family=len(family))
+        for c, (p_t, p_w) in zip(family, adjusted_p, strict=True)
+    }
+    return [adjusted.get((c.before, c.after), c) for c in comparisons]
 
 
 def _compare_pair(
@@ -290,7 +291,7 @@ def _compare_units(
 
 
 def p_text(p: float) -> str:
-    """Return a p value as text, with five decimals.
+    """Return a p value as reports state it, with five decimals.
 
     >>> p_text(0.0125)
     'p = 0.01250'

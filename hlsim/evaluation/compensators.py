@@ -1,4 +1,4 @@
-"""Compensators compared with other choices of a user, for the same speech, ears and noise."""
+"""The study of ``evaluate-compensator``: compensators are compared with other hearing aids."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from hlsim.evaluation.aids import (
     output_limit_spl,
 )
 from hlsim.evaluation.comparison import compare
-from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
+from hlsim.evaluation.items import INPUT_LEVELS, draw_aid_items, ear_name, read_ears
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
@@ -44,7 +44,7 @@ UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
 HARD = 0.6
 """Unaided HASPI below which an item belongs to the group ``hard``."""
 
-PEAK_TOLERANCE_DB = 1e-4
+_PEAK_TOLERANCE_DB = 1e-4
 """Excess of a peak over an output limit that is due to rounding in float32."""
 
 
@@ -72,40 +72,49 @@ def evaluate_compensators(
     gain for speech at ``levels``. The comparison with NAL-R at the compensator's level by HASPI is
     planned.
 
-    Values are stored as they become known. An interrupted run can be continued, and a run with one
-    more compensator, or with another simulator, computes only the values that are missing. An item
-    counts only if every condition has all its values.
+    Scores are stored as they become known. An interrupted run can be continued, and a run with one
+    more compensator, or with another simulator, computes only the scores that are missing. An item
+    counts only if every condition has all its scores.
 
     Args:
         compensators: Modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
             waveform and an ear. If a module has the attribute ``limit_spl`` or
-            ``config.limit_spl``, its peaks are compared with that limit.
-        speech, noise: Folders of recordings. With ``noise``, every second item is noisy, at 2.5 to
-            17.5 dB.
-        store: File of values, which is created if it does not exist; None stores nothing.
+            ``config.limit_spl``, its peaks are compared with that limit in dB SPL.
+        speech: Folder of recordings of clean speech.
+        store: File of scores, which is created if it does not exist; None stores nothing.
         audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3.
-        audiogram: Single ear for everything, for a compensator that was trained for it.
+        audiogram: Single ear for everything instead, for a compensator that was trained for it.
+        noise: Folder of recordings of noise. Every second item is then noisy, at 2.5 to 17.5 dB.
         enhancers: Names ``package.module:name`` of functions ``(waveform, sample_rate) ->
             waveform`` that reduce noise before each aid, in conditions such as ``gtcrn + NAL-R``.
-        simulator: Neuro-MSBG of the surrogate gap, by name or folder.
-        measures: Measures in addition to HASPI and HASQI.
-        items: Number of items. 400 items give each main row 200 pairs.
-        seconds: Length of an item. HASPI is not reliable much below 3.
+        simulator: Name or folder of the Neuro-MSBG whose training loss is compared with that of
+            the exact MSBG, because an aid may exploit errors of the network.
+        measures: Names of measures in addition to HASPI and HASQI.
+        items: Number of items. 400 items give each main row of the page 200 pairs.
+        seconds: Length of an item in seconds. HASPI is not reliable much below 3.
         levels: Levels of the clean speech in dB SPL, in turn.
-        gain_ears: Standard ears of the gain curves and the steady tones.
+        gain_ears: Names of the standard ears for gain curves and steady tones.
         seed: Seed of all random draws.
-        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
+        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
     Returns:
         The evaluation with the groups ``clean``, ``noisy`` and ``hard`` if they have items, and the
-        details ``gain_curves``, ``steady_tones`` and ``wearing``.
+        details ``gain_curves``, ``steady_tones`` and ``wearing``, see ``aid_properties``.
 
     Raises:
-        ValueError: Data or settings are not valid, or no item has all its values.
+        ValueError: Data or settings are not valid, or no item has all its scores.
         MissingExtraError: A package is not installed.
     """
     require("pandas", "eval")
-    _check_arguments(compensators, items, levels)
+    is_in_range = all(0.0 <= level <= 120.0 for level in levels)
+    if items < 1 or not compensators or not levels or not is_in_range:
+        raise ValueError(
+            "expected at least one compensator, one item and one level, and levels from 0 to 120 "
+            f"dB SPL, got {len(compensators)} compensators, {items} items and the levels "
+            f"{', '.join(f'{level:g}' for level in levels)}"
+        )
+    for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION}:
+        raise ValueError(f"{name} is always evaluated; give the compensator another name")
     ears, gain_curve_ears = _choose_ears(audiograms, audiogram, gain_ears)
     utterances = draw_utterances(speech, seed)
     enhancer_plugins = load_enhancers(enhancers)
@@ -122,20 +131,20 @@ def evaluate_compensators(
         "steady_tones": measure_aids(with_unaided, gain_curve_ears, steady_tones, levels),
         "wearing": measure_aids(wearable, gain_curve_ears, wearing, utterances[0]),
     }
-    drawn = draw_judged_items(
-        speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels
-    )
+    settings: dict[str, Any] = {
+        "items": items,
+        "seconds": seconds,
+        "seed": seed,
+        "levels": list(levels),
+    }
     scores = find_measures(["haspi", "hasqi", *measures])
     evaluation = Evaluation.run(
-        drawn,
+        draw_aid_items(speech, noise, ears, **settings),
         conditions,
         [*scores, LEVELS, PERCEPTION, network_loss(load_pretrained(simulator))],
         store=store,
         settings={
-            "items": items,
-            "seconds": seconds,
-            "seed": seed,
-            "levels": list(levels),
+            **settings,
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),
         },
@@ -146,23 +155,10 @@ def evaluate_compensators(
     limit = table["condition"].map(limits).astype(float)
     relative_loss = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0)
     table = table.assign(
-        beyond_limit=table["peak"] > limit + PEAK_TOLERANCE_DB, gap=relative_loss - 1.0
+        beyond_limit=table["peak"] > limit + _PEAK_TOLERANCE_DB, gap=relative_loss - 1.0
     )
     evaluation = replace(evaluation, table=table, details=details)
     return replace(evaluation, groups=_make_groups(evaluation))
-
-
-def _check_arguments(
-    compensators: Mapping[str, nn.Module], items: int, levels: Sequence[float]
-) -> None:
-    if items < 1 or not compensators or not levels:
-        raise ValueError("an evaluation needs at least one compensator, one item and one level")
-    for level in levels:
-        if not 0.0 <= level <= 120.0:
-            raise ValueError(f"the level is {level:g} dB SPL; expected 0 to 120")
-    for name in compensators:
-        if name in (UNAIDED, NAL_R, COMPRESSION):
-            raise ValueError(f"{name} is always evaluated; give the compensator another name")
 
 
 def _choose_ears(
@@ -177,8 +173,7 @@ def _choose_ears(
         gain_curve_ears = {name: Audiogram.standard(name) for name in gain_ears}
         ears = read_ears(audiograms)
     else:
-        thresholds = " ".join(f"{level:g}" for level in audiogram.levels)
-        gain_curve_ears = {f"{thresholds} dB HL": audiogram}
+        gain_curve_ears = {ear_name(audiogram): audiogram}
         ears = list(gain_curve_ears.items())
     for ear in gain_curve_ears.values():
         as_thresholds(ear)  # rejects thresholds that a simulator does not accept
@@ -190,9 +185,12 @@ def _make_conditions(
     equalisers: Mapping[str, nn.Module],
     enhancers: Mapping[str, WaveformPlugin],
 ) -> list[Condition]:
-    """Return all conditions, each after those with which it is compared.
+    """Return all conditions, each of them after those with which it is compared.
 
-    Aids without an equaliser are prescriptions.
+    Args:
+        aids: Prescriptions and compensators by name.
+        equalisers: Equaliser with the mean gain of each compensator.
+        enhancers: Enhancers, by the part of their names after the colon.
     """
     conditions = [Condition(UNAIDED, Unaided(), kind="unaided")]
     for name, aid in aids.items():
@@ -218,7 +216,7 @@ def _make_conditions(
 
 
 def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
-    """Return the evaluation of clean speech, of noisy speech, and of hard items.
+    """Return the evaluations of clean speech, of noisy speech, and of hard items, by name.
 
     An item that lacks a value in one condition is in no group.
     """

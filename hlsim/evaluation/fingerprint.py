@@ -1,8 +1,9 @@
-"""Fingerprints of modules: everything that decides whether a stored score is still valid.
+"""Fingerprints: hashes that show whether a stored score is still valid.
 
-A fingerprint covers class names, configurations and tensors. Source code is not read, so that
-moving a class or editing a comment invalidates nothing. Authors of other modules change the
-attribute ``fingerprint`` when the outputs of a module change.
+A fingerprint covers everything that decides the outputs of a module: class names, settings and
+tensors. Source code is not read, so that moving a class or editing a comment invalidates nothing.
+Authors of modules outside hlsim add an attribute ``fingerprint``, such as a version, and change it
+when the outputs change.
 """
 
 from __future__ import annotations
@@ -20,83 +21,77 @@ from torch import Tensor, nn
 from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
 
-HLSIM_PACKAGES = ("hlsim", "compensators")
+_HLSIM_PACKAGES = ("hlsim", "compensators")
 """Packages whose classes include the version of hlsim in their fingerprints."""
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
+"""Attributes of every module, which say nothing about its outputs."""
 
 
-def fingerprint(thing: Any) -> str | None:
-    """Compute the SHA-256 of everything that decides the outputs of a module or function.
+def fingerprint(processing: Any) -> str | None:
+    """Compute a hash that changes when the outputs of a module or function may have changed.
 
-    An attribute ``fingerprint`` replaces everything else. A module is described by the classes, the
-    public attributes and the tensors of all its submodules.
+    Args:
+        processing: Function or ``torch.nn.Module``. If it has an attribute ``fingerprint``, its
+            name and this attribute decide. Otherwise, the classes, the public attributes and the
+            tensors of a module and its submodules do.
 
     Returns:
-        The hash in hexadecimal, or None if the outputs may change without notice: for a function
-        without the attribute, for a module of another package without tensors and ``config``, and
-        for a module with a public attribute that cannot be described.
+        The SHA-256 in hexadecimal, or None if the outputs could change without notice: for a
+        function without the attribute, for a module outside hlsim without tensors and ``config``,
+        and for a module with a public attribute that cannot be described, such as a lambda.
 
     >>> fingerprint(nn.Linear(2, 2)) == fingerprint(nn.Linear(2, 2))  # random weights
     False
     >>> fingerprint(abs) is None
     True
     """
-    if isinstance(thing, WaveformPlugin):
-        thing = thing.function
-    stated = getattr(thing, "fingerprint", None)
+    if isinstance(processing, WaveformPlugin):
+        processing = processing.function
+    stated = getattr(processing, "fingerprint", None)
     if stated is not None:
-        return text_hash(f"{_name(thing)} {stated}")
-    if not isinstance(thing, nn.Module):
+        return value_hash(f"{_name(processing)} {stated}")
+    if not isinstance(processing, nn.Module):
         return None
-    tensors = dict([*thing.named_parameters(), *thing.named_buffers()])
-    if not (_is_from_hlsim(type(thing)) or tensors or hasattr(thing, "config")):
+    tensors = dict([*processing.named_parameters(), *processing.named_buffers()])
+    if not (_is_from_hlsim(type(processing)) or tensors or hasattr(processing, "config")):
         return None
-    parts = {name: [_name(part), _public_attributes(part)] for name, part in thing.named_modules()}
+    modules = processing.named_modules()
+    parts = {name: [_name(module), _public_attributes(module)] for name, module in modules}
     try:
-        return text_hash(_describe([parts, tensors]))
+        return value_hash([parts, tensors])
     except TypeError:
         return None
 
 
-def combined_fingerprint(*parts: str | None) -> str | None:
-    """Compute one fingerprint of several parts, or return None if that of a part is unknown.
+def value_hash(value: Any) -> str:
+    """Compute the SHA-256 of a value in hexadecimal, the same in every process.
 
-    >>> combined_fingerprint("a", None) is None
+    Args:
+        value: Texts, numbers, lists and dictionaries (in any order), tensors, arrays, paths,
+            dataclasses, and modules with a fingerprint.
+
+    Raises:
+        TypeError: The value contains something else, such as a lambda.
+
+    >>> value_hash({"a": 1, "b": [2.0]}) == value_hash({"b": [2.0], "a": 1})
     True
     """
-    return None if None in parts else text_hash(" ".join(map(str, parts)))
-
-
-def text_hash(text: str) -> str:
-    """Compute the SHA-256 of a text, in hexadecimal.
-
-    >>> text_hash("abc")[:8]
-    'ba7816bf'
-    """
+    text = json.dumps(value, sort_keys=True, default=_describe)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def samples_hash(*signals: Tensor) -> str:
-    """Compute the SHA-256 of the samples of signals, in hexadecimal.
-
-    >>> samples_hash(torch.ones(3)) == samples_hash(torch.ones(4))
-    False
-    """
-    return text_hash(_describe(signals))
-
-
-def _public_attributes(part: nn.Module) -> dict[str, Any]:
-    """Return the public attributes of one submodule, without those of every module."""
+def _public_attributes(module: nn.Module) -> dict[str, Any]:
+    """Return the public attributes of a module without those that every module has."""
     return {
         name: value
-        for name, value in vars(part).items()
+        for name, value in vars(module).items()
         if name not in _MODULE_ATTRIBUTES and not name.startswith("_")
     }
 
 
 def _is_from_hlsim(kind: Any) -> bool:
-    return kind.__module__.split(".")[0] in HLSIM_PACKAGES
+    return kind.__module__.split(".")[0] in _HLSIM_PACKAGES
 
 
 def _name(thing: Any) -> str:
@@ -106,13 +101,8 @@ def _name(thing: Any) -> str:
     return f"{kind.__qualname__}{version}"
 
 
-def _describe(value: Any) -> str:
-    """Return a text that differs between different settings and is the same in every process."""
-    return json.dumps(value, sort_keys=True, default=_describe_object)
-
-
-def _describe_object(value: Any) -> Any:
-    """Convert an object that JSON cannot represent.
+def _describe(value: Any) -> Any:
+    """Convert an object that JSON cannot represent to one that it can.
 
     Raises:
         TypeError: The object cannot be described.

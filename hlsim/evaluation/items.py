@@ -1,4 +1,4 @@
-"""Drawn items: speech in noise for the ears and levels of a study, all from one seed."""
+"""Items of studies that are drawn from a seed: speech in noise, for several ears and levels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from compensators.nalr import NALR
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.study import Item
@@ -25,20 +25,20 @@ SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 """Levels of the input in dB SPL that items for simulators have in turn."""
 
 INPUT_LEVELS = (50.0, 65.0, 80.0)
-"""Levels of the clean speech in dB SPL that items for compensators have in turn."""
+"""Levels of the clean speech in dB SPL that items for hearing aids have in turn."""
 
 SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB that noisy items have in turn, as in the paper."""
 
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
-"""Bisgaard's audiograms that are part of every comparison of compensators."""
+"""Bisgaard's audiograms that are part of every comparison of hearing aids."""
 
 TREATMENTS = ("as-is", "louder", "nal-r", "compressed", "compensated")
-"""Processing of the input of a simulator: none, 20 dB of gain, NAL-R for the ear, compression of
-3:1, or a compensator."""
+"""Names of ways to process the input of a simulator: not at all, by 20 dB of gain, by NAL-R for the
+ear, by compression of 3:1, or by a compensator."""
 
 
-def draw_items(
+def draw_simulator_items(
     speech: str | Path,
     noise: str | Path | None,
     audiograms: str | Path,
@@ -48,7 +48,7 @@ def draw_items(
     seed: int,
     levels: Sequence[float] = SIMULATOR_LEVELS,
 ) -> list[Item]:
-    """Draw items for simulators.
+    """Draw the items on which simulators are compared: clips of speech, each for one ear.
 
     Half of the ears are from ``audiograms``, a quarter are mild standard ears (NH, N1, N2, S1) and
     a quarter are random. With noise, every second item is noisy, with one of four signal-to-noise
@@ -56,16 +56,21 @@ def draw_items(
     ear once.
 
     Args:
-        speech, noise: Folders of recordings.
-        audiograms: CSV file of ears, or ``"standard"``.
+        speech: Folder of recordings of clean speech.
+        noise: Folder of recordings of noise, or None.
+        audiograms: CSV file of ears, or ``"standard"`` for Bisgaard's.
         items: Number of items.
-        seconds: Length of an item.
+        seconds: Length of an item in seconds.
         seed: Seed of all random draws.
-        levels: Levels of the signal in dB SPL, in turn.
+        levels: Levels of the signal with its noise in dB SPL, in turn.
+
+    Returns: Items at 16 kHz. Their facts are ``severity``, ``input_level``, ``speech``,
+        ``noise_snr`` and ``audiogram``.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> settings = {"items": 2, "seconds": 1.0, "seed": 0}
-    >>> [item.name for item in draw_items(EXAMPLE_FILE.parent, None, "standard", **settings)]
+    >>> items = draw_simulator_items(EXAMPLE_FILE.parent, None, "standard", **settings)
+    >>> [item.name for item in items]
     ['item 0', 'item 1']
     """
     generator = torch.Generator().manual_seed(seed)
@@ -87,7 +92,7 @@ def draw_items(
     return drawn
 
 
-def draw_judged_items(
+def draw_aid_items(
     speech: str | Path,
     noise: str | Path | None,
     ears: Sequence[tuple[str, Audiogram]],
@@ -97,22 +102,26 @@ def draw_judged_items(
     seed: int,
     levels: Sequence[float] = INPUT_LEVELS,
 ) -> list[Item]:
-    """Draw items for compensators: random clips for the ears in turn.
+    """Draw the items on which hearing aids are compared: clips of speech, for the ears in turn.
 
-    The level is that of the clean speech. With noise, every second item is noisy. Every ear meets
-    every combination of level and ratio.
+    With noise, every second item is noisy. Every ear occurs with every combination of level and
+    signal-to-noise ratio.
 
     Args:
-        speech, noise: Folders of recordings.
-        ears: Ears with their names.
+        speech: Folder of recordings of clean speech.
+        noise: Folder of recordings of noise, or None.
+        ears: Names and audiograms of the ears.
         items: Number of items.
-        seconds: Length of an item.
+        seconds: Length of an item in seconds.
         seed: Seed of all random draws.
         levels: Levels of the clean speech in dB SPL, in turn.
 
+    Returns: Items at 16 kHz. Their facts are ``ear``, ``severity``, ``input_level``, ``speech``,
+        ``snr`` and ``audiogram``.
+
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> settings = {"items": 1, "seconds": 1.0, "seed": 0}
-    >>> (item,) = draw_judged_items(EXAMPLE_FILE.parent, None, read_ears(None), **settings)
+    >>> (item,) = draw_aid_items(EXAMPLE_FILE.parent, None, read_ears(None), **settings)
     >>> item.facts["ear"], item.facts["input_level"]
     ('N2', 50.0)
     """
@@ -131,9 +140,13 @@ def draw_judged_items(
 
 
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
-    """Return the standard ears and those of a CSV file, named by listener and ear or by row.
+    """Return names and audiograms of the ears N2 to N6 and S1 to S3, and of those in a CSV file.
 
-    No two ears have the same name. A standard ear that is also in the file is returned once.
+    An ear of the file is named by its columns ``listener`` and ``ear``, and by the number of its
+    row if another ear has this name. A standard ear that is also in the file is returned once.
+
+    Args:
+        audiograms: CSV file of ears, or None.
 
     >>> [name for name, _ in read_ears(None)]
     ['N2', 'N3', 'N4', 'N5', 'N6', 'S1', 'S2', 'S3']
@@ -150,41 +163,53 @@ def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     return ears
 
 
+def ear_name(audiogram: Audiogram) -> str:
+    """Return the name of a standard ear, or the thresholds of another one.
+
+    >>> ear_name(Audiogram.standard("N4")), ear_name(Audiogram([30, 40], [500, 4000]))
+    ('N4', '30, 40 dB HL')
+    """
+    names = [name for name, levels in STANDARD.items() if audiogram == Audiogram(levels)]
+    levels = ", ".join(f"{level:g}" for level in audiogram.levels)
+    return names[0] if names else f"{levels} dB HL"
+
+
 def treat(
     items: Sequence[Item], treatments: Sequence[str], compensator: nn.Module | None = None
 ) -> list[Item]:
-    """Return each item under each treatment in turn, named in its fact ``treatment``.
+    """Return the items with inputs that were processed in several ways, such as by an aid.
 
     Args:
-        items: Items.
-        treatments: Names in ``TREATMENTS``.
-        compensator: The compensator of the treatment ``compensated``.
+        items: Items without processing.
+        treatments: Names of ways to process the input, see ``TREATMENTS``.
+        compensator: The compensator of the treatment ``"compensated"``.
+
+    Returns: Each item under each treatment in turn, which is its fact ``treatment``.
 
     Raises:
-        ValueError: A treatment is unknown, or ``compensated`` lacks a compensator.
+        ValueError: A treatment is unknown, or ``"compensated"`` lacks a compensator.
 
     >>> clean = torch.ones(1600)
     >>> item = Item("item 1", clean, clean, Audiogram.standard("N3"))
     >>> [float(item.signal[0]) for item in treat([item], ["as-is", "louder"])]
     [1.0, 10.0]
     """
+    three_to_one = torch.tensor([3.0])
     functions: dict[str, Callable[[Tensor, Any], Tensor]] = {
         "as-is": lambda signal, ear: signal,
         "louder": lambda signal, ear: 10.0 * signal,
         "nal-r": NALR(sample_rate=NEURO_RATE),
-        "compressed": lambda signal, ear: compress(signal[None], torch.tensor([3.0]), NEURO_RATE)[
-            0
-        ],
+        "compressed": lambda signal, ear: compress(signal[None], three_to_one, NEURO_RATE)[0],
     }
     if compensator is not None:
         functions["compensated"] = compensator
+    if not functions.keys() >= set(treatments):
+        raise ValueError(
+            f"expected inputs of {', '.join(functions)}, got {', '.join(treatments)}; the input "
+            "compensated needs a compensator"
+        )
     treated = []
     for item, treatment in product(items, treatments):
-        if treatment not in functions:
-            raise ValueError(
-                f"expected the inputs {', '.join(functions)}, got {treatment!r}; the input "
-                "compensated needs a compensator"
-            )
         with torch.no_grad():
             signal = functions[treatment](item.signal, item.ear)
         facts = {**item.facts, "treatment": treatment}
@@ -199,9 +224,9 @@ def _draw_clips(
     seconds: float,
     generator: torch.Generator,
 ) -> Iterator[tuple[int, Tensor, Tensor | None]]:
-    """Yield the number of each item, its speech, and for every second item a noise to add.
+    """Yield the number of each item, its speech, and for every second item a noise, else None.
 
-    Shape: (time,).
+    Shape of speech and noise: (time,).
     """
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
     noises = None
@@ -213,25 +238,31 @@ def _draw_clips(
         yield number, clean, noises.draw(1, generator)[0] if noises and is_noisy else None
 
 
-def _level_and_snr(place: int, turn: int, levels: Sequence[float]) -> tuple[float, float, int]:
-    """Return level and SNR of an ear's turn. Each turn shifts both, so that all combinations occur.
+def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float, float, int]:
+    """Return level and SNR so that each ear occurs with all combinations.
 
-    Returns also how often the ratios were shifted once more: with an even number of levels, both
-    would otherwise repeat together.
+    Args:
+        ear: Number of the ear, or of the kind of ear.
+        turn: Number of earlier items with this ear.
+        levels: Levels in dB SPL.
+
+    Returns: The level, the SNR in dB, and by how many places the ratios are shifted in addition.
+        Without this shift, an even number of levels and the ratios would repeat together.
     """
     shift = 0 if len(levels) % 2 else turn // len(levels)
-    number = place + turn
+    number = ear + turn
     return levels[number % len(levels)], SNRS_DB[(number + shift) % len(SNRS_DB)], shift
 
 
 def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor, float]:
-    """Return the noisy signal and its SNR in dB, which is NaN without noise."""
+    """Return speech in noise at an SNR in dB, and this SNR, which is NaN without noise."""
     if noise is None:
         return clean, math.nan
     return mix(clean[None], noise[None], torch.tensor([snr]))[0], snr
 
 
 def _facts(ear: Audiogram, level: float, snr_column: str, snr: float) -> dict[str, Any]:
+    """Return the facts of an item. ``snr_column`` is the name of the fact with the SNR."""
     return {
         "severity": ear.severity,
         "input_level": level,

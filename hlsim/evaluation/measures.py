@@ -1,6 +1,7 @@
-"""Measures: scores of speech for an ear, levels, perceived sound, and measures of your own.
+"""Measures of a study: scores of speech for an ear, levels, loudness errors, and your own.
 
-A measure is a function of an item and an output that returns numbers by column.
+A measure is a function of an ``Item`` and the output of a condition that returns numbers by the
+column of the study's table.
 """
 
 from __future__ import annotations
@@ -32,11 +33,17 @@ from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
 
 NORMAL = Audiogram.standard("NH")
-"""The normal ear."""
+"""The normal ear, whose perception is the goal of an aid."""
 
 
 def _ear_measure(name: str, score: Callable[..., Tensor], rewards_gain: bool = False) -> Measure:
-    """Return the measure of HASPI, HASQI or HAAQI."""
+    """Return the measure of a score that depends on the ear.
+
+    Args:
+        name: ``"haspi"``, ``"hasqi"`` or ``"haaqi"``.
+        score: Function of ``hlsim.metrics`` that computes it.
+        rewards_gain: Whether a higher level alone increases the score.
+    """
     return Measure(
         name,
         partial(_score_for_ear, name, score),
@@ -44,12 +51,12 @@ def _ear_measure(name: str, score: Callable[..., Tensor], rewards_gain: bool = F
         packages=["numpy"],  # which draws the noise
         knows_hearing=True,
         rewards_gain=rewards_gain,
-        ends=(0.0, 1.0),
+        score_range=(0.0, 1.0),
     )
 
 
 def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: Tensor) -> Values:
-    """Compute a score with the noise and the whole kHz of pyclarity.
+    """Compute a score with pyclarity's noise, and with its rounding of the rate to whole kHz.
 
     Single precision takes half the time, but may align a channel differently by one sample.
     """
@@ -73,7 +80,7 @@ STOI = Measure(
     partial(_score_signal, "stoi", fidelity.stoi),
     title="STOI",
     packages=["pystoi", "numpy", "scipy"],
-    ends=(0.0, 1.0),
+    score_range=(0.0, 1.0),
 )
 
 PESQ = Measure(
@@ -81,7 +88,7 @@ PESQ = Measure(
     partial(_score_signal, "pesq", fidelity.pesq_wb),
     title="PESQ",
     packages=["pesq", "numpy"],
-    ends=(1.0, 4.64),
+    score_range=(1.0, 4.64),
 )
 
 MEASURES = {
@@ -93,15 +100,15 @@ MEASURES = {
 }
 """The scores of ``--measures`` by name. Higher is better for all of them."""
 
-PACKAGES = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
-"""Optional package of a measure, and the extra that installs it."""
+_PACKAGES = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
+"""Optional package of a measure, and the extra of hlsim that installs it."""
 
 
 def find_measures(names: Iterable[str]) -> list[Measure]:
-    """Return measures by name, without duplicates.
+    """Return the measures of some names, without duplicates.
 
     Args:
-        names: Names in ``MEASURES``, or ``package.module:name``.
+        names: Names in ``MEASURES``, or ``package.module:name`` of your own functions.
 
     Raises:
         ValueError: There is no such measure, or no name at all.
@@ -111,26 +118,20 @@ def find_measures(names: Iterable[str]) -> list[Measure]:
     ['HASPI', 'HASQI']
     """
     unique = list(dict.fromkeys(names))
-    if not unique:
-        raise ValueError(f"no measure is named; name one or more of {', '.join(MEASURES)}")
-    for name in unique:
-        if name in PACKAGES:
-            require(*PACKAGES[name])
-        elif name not in MEASURES and ":" not in name:
-            raise ValueError(
-                f"there is no measure {name!r}; expected one of {', '.join(MEASURES)} or "
-                "package.module:name"
-            )
+    if not unique or not all(name in MEASURES or ":" in name for name in unique):
+        raise ValueError(
+            f"expected one measure or more of {', '.join(MEASURES)} or package.module:name, got "
+            f"{', '.join(unique) or 'none'}"
+        )
+    for name in _PACKAGES.keys() & unique:
+        require(*_PACKAGES[name])
     return [MEASURES[name] if name in MEASURES else load_measure(name) for name in unique]
 
 
-class PluginMeasure:
-    """Function ``(item, output) -> numbers`` of a user, ``package.module:name``.
+class _PluginMeasure:
+    """Function ``(item, output) -> numbers by column`` of a user.
 
     It is pickled by its name, so that other processes import it in the same way.
-
-    >>> PluginMeasure("builtins:max").name
-    'builtins:max'
     """
 
     def __init__(self, name: str) -> None:
@@ -138,7 +139,7 @@ class PluginMeasure:
         self.function = load_plugin(name, "measure")
 
     def __reduce__(self) -> Any:
-        return PluginMeasure, (self.name,)
+        return _PluginMeasure, (self.name,)
 
     def __call__(self, item: Item, output: Tensor) -> Values:
         values = self.function(item, output)
@@ -148,7 +149,10 @@ class PluginMeasure:
 
 
 def load_measure(name: str) -> Measure:
-    """Load the measure ``package.module:name``.
+    """Load a measure of your own, a function ``(item, output) -> dict of numbers``.
+
+    Args:
+        name: ``package.module:name`` or ``path/to/file.py:name``.
 
     Raises:
         ValueError: It cannot be loaded.
@@ -156,12 +160,12 @@ def load_measure(name: str) -> Measure:
     >>> load_measure("builtins:max").name
     'builtins:max'
     """
-    plugin = PluginMeasure(name)
+    plugin = _PluginMeasure(name)
     return Measure(name, plugin, settings=fingerprint(plugin.function))
 
 
 def title_of(column: str) -> str:
-    """Return the title of a score's column.
+    """Return the title, in tables and plots, of a column with scores.
 
     >>> title_of("haspi"), title_of("crest factor")
     ('HASPI', 'crest factor')
@@ -187,9 +191,14 @@ LEVELS = Measure("levels", _measure_levels)
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
-    """Simulate what an ear perceives, by the exact MSBG.
+    """Simulate what an ear perceives of a signal, by the exact MSBG, without a gradient.
 
-    Shape: (time,) -> (time,), in pascals.
+    Args:
+        signal: Signals in pascals. Shape: (..., time).
+        ear: The audiogram.
+        sample_rate: Sample rate in Hz.
+
+    Returns: The perceived signals in pascals. Shape: (..., time).
 
     >>> perceive(torch.ones(1600), Audiogram.standard("N3"), 16000).shape
     torch.Size([1600])
@@ -208,13 +217,13 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
     normal_level = float(level_spl(normal_input))
     normal_clean_level = float(level_spl(reference))
     return {
-        "peak": peak_spl(output),
+        "peak": _peak_spl(output),
         "perceived_level": level,
         "normal_level": normal_level,
         "normal_clean_level": normal_clean_level,
         "loudness_error": level - normal_level,
         "loudness_error_clean": level - normal_clean_level,
-        "band_error": band_error_db(perceived, reference, rate),
+        "band_error": _band_error_db(perceived, reference, rate),
         "loss_msbg": float(band_level_loss(perceived, reference, rate)),
     }
 
@@ -225,8 +234,8 @@ PERCEPTION = Measure("perception", _measure_perception, packages=["hlsim"])
 ``peak`` is the largest sample of the output, and ``perceived_level`` the level after MSBG.
 ``normal_level`` and ``normal_clean_level`` are the levels of the input (with its noise) and of the
 clean speech for a normal ear; ``loudness_error`` and ``loudness_error_clean`` are the differences
-from them. ``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by
-``band_error_db`` and by ``HearingLossLoss(criterion="bands")``.
+from them. ``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by the
+median difference of levels in 24 bands, and by ``HearingLossLoss(criterion="bands")``.
 """
 
 OTHER_COLUMNS = (
@@ -235,11 +244,16 @@ OTHER_COLUMNS = (
     *("loss_msbg", "loss_neuro", "loudness_error", "loudness_error_clean"),
     *("beyond_limit", "gap", "source"),
 )
-"""Columns of measures that are no scores."""
+"""Columns that the measures of hlsim return beside scores."""
 
 
 def network_loss(simulator: nn.Module) -> Measure:
-    """Return the measure ``loss_neuro``: the loss of ``loss_msbg`` with a network as simulator.
+    """Return the measure of the column ``loss_neuro``, the training loss of an aid.
+
+    It is the loss ``loss_msbg`` of ``PERCEPTION`` with a network in place of the exact MSBG.
+
+    Args:
+        simulator: The network, a Neuro-MSBG.
 
     >>> network_loss(nn.Identity()).name
     'network loss'
@@ -253,28 +267,23 @@ def network_loss(simulator: nn.Module) -> Measure:
     return Measure("network loss", compute, packages=["hlsim"], settings=fingerprint(simulator))
 
 
-def peak_spl(waveform: Tensor) -> float:
-    """Compute the level of the largest sample in dB SPL, where a sample of 1.0 is 94.
-
-    >>> peak_spl(torch.tensor([0.0, -10.0]))
-    114.0
-    """
+def _peak_spl(waveform: Tensor) -> float:
+    """Return the level of the largest sample in dB SPL, where a sample of 1.0 is 94."""
     return float(20.0 * waveform.abs().max().clamp_min(1e-10).log10()) + PASCAL_SPL
 
 
-def band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:
-    """Compute the median absolute difference of band levels in dB.
+def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:
+    """Compute the median absolute difference between the levels of ERB-wide bands, in dB.
 
-    Only bands and frames of the reference that are audible for a normal ear count.
+    Only those bands and frames count in which a normal ear finds the reference audible.
 
-    Shape: (time,) and (time,), in pascals.
+    Args:
+        perceived: Output as an ear perceives it, in pascals. Shape: (time,).
+        reference: Clean speech as a normal ear perceives it, in pascals. Shape: (time,).
+        sample_rate: Sample rate in Hz.
 
     Raises:
         ValueError: Nothing is audible.
-
-    >>> noise = torch.randn(16000, generator=torch.Generator().manual_seed(0))
-    >>> round(band_error_db(0.1 * noise, noise, 16000))
-    20
     """
     levels = band_levels(perceived, sample_rate)
     reference_levels = band_levels(reference, sample_rate)

@@ -35,7 +35,9 @@ def describe_error(error: Exception) -> str:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch to one thread, because several threads wait for each other in small tasks.
+    """Limit torch to one thread in a ``with`` block or a decorated function.
+
+    In small tasks, several threads wait for each other.
 
     >>> with one_thread():
     ...     torch.get_num_threads()
@@ -56,7 +58,7 @@ def run_parallel(
     jobs: int | None = None,
     dask: str | None = None,
 ) -> Iterator[tuple[Task, Result | None]]:
-    """Yield each task with its result, in the order in which they finish.
+    """Call a function for each task, and yield the tasks with their results, in the same order.
 
     If a process ends (after a crash in compiled code, or because memory ran out), the tasks that
     were running are repeated one by one. The task that ends its process again yields None.
@@ -84,46 +86,35 @@ def run_parallel(
             yield task, function(task)
         return
     joblib = require("joblib", "eval")
-    unfinished = dict(enumerate(tasks))
-    started: list[int] = []
-
-    def calls() -> Iterator[Any]:
-        for number, task in list(unfinished.items()):
-            started.append(number)
-            yield joblib.delayed(_call_numbered)(function, number, task)
-
+    tasks = list(tasks)
     with ExitStack() as stack:
         settings: dict[str, Any] = {"backend": "loky", "inner_max_num_threads": 1}
         if dask is not None:
             settings = {"backend": "dask", "client": stack.enter_context(_connect(dask))}
         stack.enter_context(joblib.parallel_config(**settings))
-        # A batch of several tasks would be lost as a whole if its process ends.
         pool = joblib.Parallel(
             n_jobs=jobs if jobs and dask is None else -1,
-            return_as="generator_unordered",
+            return_as="generator",
+            # A batch of several tasks would be lost as a whole if its process ends.
             batch_size=1,
         )
-        while unfinished:
-            started.clear()
+        finished = 0
+        while finished < len(tasks):
+            numbers = iter(range(finished, len(tasks)))  # which joblib reads to start tasks
             try:
-                for number, result in pool(calls()):
-                    yield unfinished.pop(number), result
+                for result in pool(joblib.delayed(function)(tasks[number]) for number in numbers):
+                    yield tasks[finished], result
+                    finished += 1
             except Exception as error:
                 _check_process_ended(error)
-            for number in sorted(unfinished.keys() & started):
-                task = unfinished.pop(number)
+            for task in tasks[finished : next(numbers, len(tasks))]:
                 repeated: Result | None = None
                 try:
-                    ((_, repeated),) = pool([joblib.delayed(_call_numbered)(function, 0, task)])
+                    (repeated,) = pool([joblib.delayed(function)(task)])
                 except Exception as error:
                     _check_process_ended(error)
                 yield task, repeated
-
-
-def _call_numbered(
-    function: Callable[[Task], Result], number: int, task: Task
-) -> tuple[int, Result]:
-    return number, function(task)
+                finished += 1
 
 
 def _check_process_ended(error: Exception) -> None:
@@ -133,6 +124,7 @@ def _check_process_ended(error: Exception) -> None:
 
 
 def _connect(scheduler: str) -> Any:
+    """Return a client of the Dask scheduler at an address."""
     distributed = require("distributed", "cluster")
     try:
         return distributed.Client(scheduler, set_as_default=False, timeout=CONNECTION_TIMEOUT)

@@ -1,4 +1,4 @@
-"""Recorded outputs as the items of a study: ``haspi-report`` scores files.
+"""The study of ``haspi-report``: outputs that were recorded in files are scored and compared.
 
 The files are in folders, or in a manifest, a CSV file with one row for each output file::
 
@@ -30,49 +30,52 @@ from hlsim.audiogram.listener import EAR_NAMES, EARS
 from hlsim.audiogram.table import read_rows
 from hlsim.audiogram.value import convert_at
 from hlsim.calibration import check_full_scale, dbfs
-from hlsim.evaluation.comparison import Pair, compare
+from hlsim.evaluation.comparison import PlannedComparison, compare
+from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.store import content_hash, settings_hash
+from hlsim.evaluation.store import content_hash
 from hlsim.evaluation.study import Condition, Item
 from hlsim.files import EXTENSIONS, read_table, resolve_links
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-REQUIRED_COLUMNS = {"condition", "clean", "processed"}
+_REQUIRED_COLUMNS = {"condition", "clean", "processed"}
 """Columns that a manifest must have."""
 
-LEVEL_COLUMNS = {"spl", "full_scale_spl"}
+_LEVEL_COLUMNS = {"spl", "full_scale_spl"}
 """Columns that a manifest must not have, because levels are options."""
 
-UTTERANCE_COLUMNS = ["listener", "utterance", "snr"]
+_UTTERANCE_COLUMNS = ["listener", "utterance", "snr"]
 """Columns of the table that both ears of an utterance share."""
 
-EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level")
+_EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level")
 """Columns of the table that describe the item of one ear."""
 
-Row = Mapping[str, str]
+_Row = Mapping[str, str]
 """Values of a row of a CSV file, by column."""
+
+_Ears = Mapping[tuple[str, str], tuple[str, _Row]]
+"""Rows of a CSV file of ears, with the place of each in the file, by name and ear."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One utterance for one ear, in files.
+    """Recorded outputs of one or more conditions for one utterance and one ear, in files.
 
     Args:
         utterance: Name of the utterance, the same for both ears of a listener.
         clean: File of clean speech.
-        outputs: File of the output for each condition.
+        outputs: File of the output, by condition.
         audiogram: The ear.
         listener: Name of the listener; empty if unknown.
         ear: ``"left"``, ``"right"`` or empty. It selects the channel of a file with two channels.
-        snr: signal-to-noise ratio in dB; NaN if unknown.
-        full_scale_spl: Level in dB SPL of a file with RMS 1.0.
-        spl: Level of the clean file in dB SPL, instead of ``full_scale_spl``.
-        seed: Seed of the study. Each clean file has its own seed, which depends on this one and on
-            its contents.
-        problems: Reason why there is no file, for conditions without one.
+        snr: Signal-to-noise ratio in dB; NaN if unknown.
+        full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
+        spl: Level of the clean file in dB SPL, which replaces ``full_scale_spl``.
+        seed: Seed of the study. The seed of each clean file depends on this one and its contents.
+        problems: Reason why there is no output, by condition.
 
     >>> ear = Audiogram.standard("N3")
     >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
@@ -98,7 +101,7 @@ class Recording:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Columns of the table that describe the item, without its name."""
+        """Columns of the table that describe the recording, without its name."""
         return {
             "listener": self.listener,
             "ear": self.ear,
@@ -109,17 +112,20 @@ class Recording:
         }
 
     def digest(self, condition: str) -> str:
-        """Return the SHA-256 of both files, the ear, the level and the seed."""
+        """Return a hash of both files, the ear, the level and the seed, which decide all scores."""
         files = [content_hash(self.clean), content_hash(self._output_file(condition))]
         level = [self.full_scale_spl if self.spl is None else None, self.spl]
-        ear = [self.ear, list(self.audiogram.thresholds)]
-        return settings_hash({"files": files, "ear": ear, "level": level, "seed": self.seed})
+        return value_hash([files, level, self.ear, self.audiogram.thresholds, self.seed])
 
     def load(self) -> Item:
-        """Read the clean speech. Outputs are read when they are measured."""
+        """Read the clean speech. Outputs are read when they are measured.
+
+        Raises:
+            ValueError: The file cannot be read, or there is no output under any condition.
+        """
         if self.problems and not self.outputs:
             raise ValueError(next(iter(self.problems.values())))
-        clean, rate = read_channel(self.clean, self.ear)
+        clean, rate = self._read_channel(self.clean)
         full_scale = self.full_scale_spl
         if self.spl is not None:
             full_scale = check_full_scale(self.spl - float(dbfs(clean)))
@@ -143,43 +149,27 @@ class Recording:
 
     def _read_output(self, condition: str, rate: int) -> Tensor:
         path = self._output_file(condition)
-        output, output_rate = read_channel(path, self.ear)
+        output, output_rate = self._read_channel(path)
         if output_rate != rate:
             raise ValueError(f"{path} has {output_rate} Hz and {self.clean} {rate} Hz")
         return output
+
+    def _read_channel(self, path: Path) -> tuple[Tensor, int]:
+        """Read the ear's channel, in float64 with shape (time,), and the sample rate in Hz."""
+        waveform, rate = read_audio(path)
+        channels = len(waveform)
+        if channels > 2 or (channels == 2 and not self.ear):
+            raise ValueError(
+                f"{path} has {channels} channels; one ear needs 1, or 2 and the ear's name"
+            )
+        channel = waveform[EARS.index(self.ear) if channels == 2 else 0]
+        return channel.double(), rate
 
 
 def _join_name(*parts: str | float) -> str:
     """Join the known parts of an item's name. A number is an SNR in dB."""
     texts = [part if isinstance(part, str) else f"{part:g} dB" for part in parts if part == part]
     return " ".join(filter(None, texts))
-
-
-def read_channel(path: Path, ear: str = "") -> tuple[Tensor, int]:
-    """Read the channel of one ear at the scale of the file.
-
-    Args:
-        path: Audio file.
-        ear: ``"left"`` for the first and ``"right"`` for the second of two channels.
-
-    Returns:
-        Samples with shape (time,) in float64, and the rate in Hz.
-
-    Raises:
-        ValueError: The file cannot be read, or its channels do not fit the ear.
-
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
-    >>> read_channel(EXAMPLE_FILE)[1]
-    16000
-    """
-    waveform, rate = read_audio(path)
-    channels = len(waveform)
-    if channels > 2 or (channels == 2 and not ear):
-        raise ValueError(
-            f"{path} has {channels} channels; one ear needs 1, or 2 and the ear's name"
-        )
-    channel = waveform[EARS.index(ear) if channels == 2 else 0]
-    return channel.double(), rate
 
 
 def haspi_report(
@@ -205,10 +195,13 @@ def haspi_report(
     An interrupted run can be continued. A file that cannot be scored is listed with the reason.
 
     Args:
-        clean, before, after: Folders, see ``read_folders``. Without ``before``, there is one
-            condition, and scores without a comparison.
-        audiogram, audiograms: The ear of all files, or a CSV file of ears.
-        manifest, root: A CSV file instead of the folders, see ``read_manifest``.
+        clean: Folder of clean speech.
+        before, after: Folders of the speech before and after a treatment, such as an aid, with
+            files of the same names. Without ``before``, there are scores and no comparison.
+        audiogram: The ear of all files.
+        audiograms: CSV file of ears instead, see ``read_folders`` and ``read_manifest``.
+        manifest: CSV file instead of the folders, see ``read_manifest``.
+        root: Folder to which the paths in the manifest are relative; by default the manifest's.
         measures: Names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
             ``stoi``, ``pesq`` or ``package.module:name``.
         baseline: Condition with which all other conditions are compared. By default, all
@@ -216,10 +209,10 @@ def haspi_report(
         better_ear: Whether to use the better ear's score of each utterance, for which a manifest
             with both ears is needed.
         store: File of scores, which is created if it does not exist; None stores nothing.
-        full_scale_spl: Level in dB SPL of a file with RMS 1.0.
-        spl: Level of every clean file in dB SPL, instead of ``full_scale_spl``.
+        full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
+        spl: Level of every clean file in dB SPL, which replaces ``full_scale_spl``.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
-        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
+        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
     Returns:
         The evaluation. The comparison of the last condition with the first counts as planned
@@ -267,19 +260,21 @@ def score_recordings(
     *,
     baseline: str | None = None,
     better_ear: bool = False,
-    planned: Sequence[Pair] = (),
+    planned: Sequence[PlannedComparison] = (),
     **running: Any,
 ) -> Evaluation:
     """Score recordings and compare their conditions.
 
     Args:
-        recordings: Recordings.
-        conditions: Conditions of the recordings' outputs.
-        measures, baseline, better_ear: See ``haspi_report``.
+        recordings: One recording per utterance and ear.
+        conditions: Conditions under which outputs were recorded.
+        measures: Names of measures, the most important first.
+        baseline: Condition with which all others are compared; by default, all pairs are compared.
+        better_ear: Whether to use the better ear's score of each utterance.
         planned: Planned comparisons; by default that of the first with the last condition by the
             first measure.
-        running: ``store`` as in ``haspi_report``; ``jobs``, ``dask`` and ``progress`` as in
-            ``run_study``.
+        running: Argument ``store``, a file of scores or None, and the arguments ``jobs``, ``dask``
+            and ``progress`` of ``run_study``.
 
     Returns:
         The evaluation; with ``better_ear``, its group ``ears`` has the scores of each ear.
@@ -324,15 +319,18 @@ def _check_both_ears(recordings: Iterable[Recording]) -> None:
 
 
 def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
-    """Return one row per utterance and condition instead of one row per ear.
+    """Keep the better ear's score of each utterance and condition.
 
-    A score is the higher one of both ears. Other values are those of the ear with the higher score
-    by the first measure. Facts of an item are those of the better ear in the last condition, whose
-    number is in the column ``source``.
+    Each measure chooses its own better ear. Values that are not scores are those of the better ear
+    by the first measure.
 
     Args:
-        table: Table of a study with two ears for each utterance.
+        table: Table of ``run_study`` for recordings of both ears of each utterance.
         measures: Columns of scores.
+
+    Returns:
+        The table with one row per utterance and condition. Facts of the item are those of the
+        better ear in the last condition, whose number is in the column ``source``.
 
     >>> import pandas
     >>> facts = {"listener": "L1", "utterance": "s01", "snr": 5.0, "condition": "unaided"}
@@ -342,7 +340,7 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     (['L1 s01 5 dB'], ['right'], [0.7])
     """
     conditions = list(dict.fromkeys(table["condition"]))
-    numbers = table.groupby(UTTERANCE_COLUMNS, sort=False, dropna=False).ngroup()
+    numbers = table.groupby(_UTTERANCE_COLUMNS, sort=False, dropna=False).ngroup()
     table = table.assign(source=table["item"], item=numbers)
     # The left ear counts if both ears have the same score.
     order = table.sort_values([measures[0], "ear"], ascending=[False, True], kind="stable")
@@ -353,9 +351,9 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
         best[measure] = table.groupby(row)[measure].max()
     last = best.xs(conditions[-1], level="condition")
     best = best.reset_index()
-    for fact in set(EAR_FACTS) & set(best):
+    for fact in set(_EAR_FACTS) & set(best):
         best[fact] = best["item"].map(last[fact])
-    utterances = best[UTTERANCE_COLUMNS].itertuples(index=False)
+    utterances = best[_UTTERANCE_COLUMNS].itertuples(index=False)
     return best.assign(name=[_join_name(*utterance) for utterance in utterances])
 
 
@@ -366,16 +364,16 @@ def read_folders(
     audiograms: str | Path | None = None,
     **settings: Any,
 ) -> list[Recording]:
-    """Read the recordings of folders, one for each name of a file.
+    """Return one recording per file of a folder of clean speech.
 
     Args:
         clean: Folder of clean speech.
-        folders: Folder of the outputs of each condition, or None to leave it out. The files of all
+        folders: Folder of the outputs by condition; None leaves the condition out. The files of all
             folders have the same names, whatever their extension.
         audiogram: The ear of all files.
         audiograms: CSV file of ears instead, with the columns ``file`` (name below the folder, with
             or without extension) and ``hl_250``, ``hl_500``, .... Rows of other files are ignored.
-        settings: ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
+        settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
         ValueError: The names differ, or a file has no audiogram.
@@ -388,22 +386,23 @@ def read_folders(
     if (audiogram is None) == (audiograms is None):
         raise ValueError("give either audiogram, the ear of all files, or audiograms, a CSV file")
     speech = _files_by_name(clean)
-    rows = []
-    for condition, folder in folders.items():
-        outputs = {} if folder is None else _files_by_name(folder)
-        different_names = sorted(outputs.keys() ^ speech.keys())
-        if outputs and different_names:
+    outputs = {name: _files_by_name(folder) for name, folder in folders.items() if folder}
+    for condition, files in outputs.items():
+        different_names = sorted(files.keys() ^ speech.keys())
+        if different_names:
             raise ValueError(
-                f"{clean} and {folder}: expected files with the same names, but only one of them "
-                f"has {different_names[0]} ({len(different_names)} differences)"
+                f"{clean} and {folders[condition]}: expected files with the same names, but only "
+                f"one of them has {different_names[0]} ({len(different_names)} differences)"
             )
-        for name, output in outputs.items():
-            files = {"clean": str(speech[name].absolute()), "processed": str(output.absolute())}
-            rows.append(
-                (str(output), {"condition": condition, "item": name, "file": name, **files})
-            )
-    root = Path(Path.cwd().anchor)
-    return _read_recordings(rows, "file", root, audiogram, audiograms, settings)
+    ears = {} if audiograms is None else _read_ears(audiograms, "file")
+    recordings = []
+    for name, path in speech.items():
+        ear = _find_ear(ears, name) or audiogram
+        if ear is None:
+            raise ValueError(f"{audiograms}: there is no audiogram of file {name!r}; add a row")
+        files = {condition: files[name] for condition, files in outputs.items()}
+        recordings.append(Recording(name, path, files, ear, **settings))
+    return recordings
 
 
 def read_manifest(
@@ -413,17 +412,17 @@ def read_manifest(
     audiograms: str | Path | None = None,
     **settings: Any,
 ) -> list[Recording]:
-    """Read the recordings of a manifest, in the order of their first rows.
+    """Return the recordings of a manifest, in the order of their first rows.
 
     Args:
-        path: CSV file with the columns ``clean`` and ``processed`` (files) and ``condition``, and
-            optionally ``utterance``, ``listener``, ``ear``, ``snr`` and ``hl_250``, ....
+        path: CSV file with one row per output and the columns that the top of this module
+            describes: ``condition``, ``clean`` and ``processed``, and others if they are known.
         root: Folder to which the paths are relative and which contains them; by default that of
             the manifest.
         audiogram: The ear of rows without an audiogram.
-        audiograms: CSV file with the columns ``listener``, ``ear`` (if left and right differ) and
-            ``hl_250``, ....
-        settings: ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
+        audiograms: CSV file of ears with the columns ``listener``, ``ear`` (if left and right
+            differ) and ``hl_250``, ``hl_500``, ....
+        settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
         ValueError: A row is not valid; the message names its line.
@@ -441,40 +440,16 @@ def read_manifest(
         raise ValueError(f"{folder}: no such folder; the paths of the manifest are relative to it")
     rows = read_table(path, "the manifest")
     columns = rows[0][1].keys() if rows else set()
-    if not columns >= REQUIRED_COLUMNS or columns & LEVEL_COLUMNS:
+    if not columns >= _REQUIRED_COLUMNS or columns & _LEVEL_COLUMNS:
         raise ValueError(
-            f"{path}: expected rows with the columns {', '.join(sorted(REQUIRED_COLUMNS))}, and "
+            f"{path}: expected rows with the columns {', '.join(sorted(_REQUIRED_COLUMNS))}, and "
             "the level as an option, not as a column"
         )
-    places = [(f"{path}, line {line}", row) for line, row in rows]
-    return _read_recordings(places, "listener", folder, audiogram, audiograms, settings)
-
-
-def _read_recordings(
-    rows: Iterable[tuple[str, Row]],
-    column: str,
-    root: Path,
-    audiogram: Audiogram | None,
-    audiograms: str | Path | None,
-    settings: Mapping[str, Any],
-) -> list[Recording]:
-    """Return the recordings of rows with their places.
-
-    Args:
-        rows: Rows of a manifest, one for each output.
-        column: Column that names the ear in ``audiograms``.
-        root: Folder that contains all files.
-        audiogram: The ear of rows without an audiogram.
-        audiograms: CSV file of ears.
-        settings: Further arguments of the recordings.
-    """
-    ears = {} if audiograms is None else _read_ears(audiograms, column)
+    ears = {} if audiograms is None else _read_ears(audiograms, "listener")
     recordings: dict[tuple[str, Path], Recording] = {}
-    for place, row in rows:
-        name, ear = row.get(column, ""), convert_at(place, _ear_name, row)
-        entry = ears.get((name, ear)) or ears.get((name, ""))
-        default = convert_at(entry[0], Audiogram.from_row, entry[1]) if entry else audiogram
-        recording = convert_at(place, _read_row, row, root, default, settings)
+    for line, row in rows:
+        place = f"{path}, line {line}"
+        recording = convert_at(place, _read_row, row, folder, ears, audiogram, settings)
         key = recording.name, recording.clean
         if key in recordings:
             recording = convert_at(place, _merge, recordings[key], recording)
@@ -483,21 +458,32 @@ def _read_recordings(
 
 
 def _read_row(
-    row: Row, root: Path, audiogram: Audiogram | None, settings: Mapping[str, Any]
+    row: _Row,
+    root: Path,
+    ears: _Ears,
+    audiogram: Audiogram | None,
+    settings: Mapping[str, Any],
 ) -> Recording:
-    """Return the recording of a row, with one output."""
+    """Return the recording of a row of a manifest, which has one output.
+
+    Args:
+        row: The row.
+        root: Folder that contains all files.
+        ears: Rows of the CSV file of ears.
+        audiogram: The ear if neither the row nor the CSV file has an audiogram.
+        settings: Further arguments of the recording.
+    """
     condition, listener, ear = row["condition"], row.get("listener", ""), _ear_name(row)
     thresholds = {name: text for name, text in row.items() if name.lower().startswith("hl")}
     if any(thresholds.values()):
         audiogram = Audiogram.from_row(thresholds)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
+    else:
+        audiogram = _find_ear(ears, listener, ear) or audiogram
     if audiogram is None:
-        owner = f"listener {listener!r}, ear {ear!r}"
-        if "file" in row:
-            owner = f"file {row['file']!r}"
         raise ValueError(
-            f"no audiogram of {owner}: add columns hl_250, hl_500, ... "
+            f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... "
             "or a column audiogram, or name a file of audiograms"
         )
     if not condition:
@@ -515,19 +501,19 @@ def _read_row(
 
 
 def _merge(recording: Recording, other: Recording) -> Recording:
-    """Return a recording with the output of another row of the same item."""
-    if recording.audiogram != other.audiogram:
-        raise ValueError(f"the audiogram differs from that of other rows of {recording.name}")
-    for condition in recording.outputs.keys() & other.outputs.keys():
-        raise ValueError(f"a second row of {recording.name} under {condition}")
+    """Return a recording with the output of another row of the same utterance and ear."""
+    if recording.audiogram != other.audiogram or recording.outputs.keys() & other.outputs:
+        raise ValueError(
+            f"expected one row of {recording.name} for each condition, with the same audiogram"
+        )
     return replace(recording, outputs={**recording.outputs, **other.outputs})
 
 
 def _path_below(root: Path, name: str) -> Path:
-    """Return a path below the root, with links followed.
+    """Return a path below a folder, with links followed.
 
     Raises:
-        ValueError: The path leads out of the root.
+        ValueError: The path leads out of the folder.
     """
     path = resolve_links(root / name)
     if not name or not path.is_relative_to(root):
@@ -535,36 +521,40 @@ def _path_below(root: Path, name: str) -> Path:
     return path
 
 
-def _ear_name(row: Row) -> str:
+def _ear_name(row: _Row) -> str:
+    """Return ``"left"``, ``"right"`` or, if the row names no ear, an empty text."""
     text = row.get("ear", "").lower()
     if text and text not in EAR_NAMES:
         raise ValueError(f"the ear is {text!r}; expected left or right")
     return EAR_NAMES.get(text, "")
 
 
-def _read_ears(path: str | Path, column: str) -> dict[tuple[str, str], tuple[str, Row]]:
-    """Read the rows of a CSV file of ears, whose audiograms are validated when they are used.
+def _read_ears(path: str | Path, column: str) -> _Ears:
+    """Read the rows of a CSV file of ears. Audiograms are validated when they are used.
 
     Args:
         path: The file.
         column: Column with the name of the ear, ``"listener"`` or ``"file"``.
-
-    Returns:
-        The place and the values of the row for each name and ear.
     """
-    ears: dict[tuple[str, str], tuple[str, Row]] = {}
+    ears: dict[tuple[str, str], tuple[str, _Row]] = {}
     for line, row in read_rows(path):
         place = f"{path}, line {line}"
-        if not row.get(column):
-            raise ValueError(f"{place}: expected a name in the column {column}")
-        name = row[column]
+        name = row.get(column, "")
         if column == "file":
             name = _without_extension(PurePath(name))
         key = name, convert_at(place, _ear_name, row)
-        if key in ears:
-            raise ValueError(f"{place}: a second row of {' '.join(key)}")
+        if not row.get(column) or key in ears:
+            raise ValueError(
+                f"{place}: expected a name in the column {column}, and one row per ear"
+            )
         ears[key] = place, row
     return ears
+
+
+def _find_ear(ears: _Ears, name: str, ear: str = "") -> Audiogram | None:
+    """Return the audiogram of a listener or file in a CSV file of ears, or None."""
+    entry = ears.get((name, ear)) or ears.get((name, ""))
+    return convert_at(entry[0], Audiogram.from_row, entry[1]) if entry else None
 
 
 def _without_extension(path: PurePath) -> str:
@@ -573,6 +563,7 @@ def _without_extension(path: PurePath) -> str:
 
 
 def _files_by_name(folder: str | Path) -> dict[str, Path]:
+    """Return the audio files of a folder by their path below it, without extension."""
     files: dict[str, Path] = {}
     for path in find_audio(folder):
         name = _without_extension(path.relative_to(folder))

@@ -1,4 +1,4 @@
-"""Result of an evaluation: the table of its study, the comparisons, and the settings."""
+"""The result of an evaluation: the table of its study, the comparisons, and the settings."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import OTHER_COLUMNS
 from hlsim.evaluation.store import ScoreStore
 from hlsim.evaluation.study import Condition, Measure, Source, installed_versions, run_study
+from hlsim.metrics.words import WordsChange, words_change
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -23,12 +24,13 @@ class Evaluation:
 
     Attributes:
         items, conditions, measures: The three inputs of ``run_study``.
-        table: One row per item and condition, see ``run_study``.
-        comparisons: Comparisons of the conditions, see ``compare``.
-        settings: Settings on which the values depend, such as the seed.
-        notes: Sentences with which the report begins.
-        details: Further results for JSON, such as gain curves.
-        groups: The same evaluation for a part of the items, by the name of the part.
+        table: Table with one row per item and condition, see ``run_study``.
+        comparisons: Comparisons of two conditions by one measure each, see ``compare``.
+        settings: Settings on which the values depend, such as the seed, by name.
+        notes: Sentences with which the page of the evaluation begins.
+        details: Further results for ``report.json`` and the page, such as gain curves, by name.
+        groups: The same evaluation for a part of the items, such as noisy speech, by the name of
+            the part.
 
     >>> import pandas
     >>> table = pandas.DataFrame({"item": [0], "condition": ["aid"], "haspi": [0.5]})
@@ -57,7 +59,13 @@ class Evaluation:
         settings: Mapping[str, Any],
         **running: Any,
     ) -> Evaluation:
-        """Run a study, see ``run_study``.
+        """Run a study, and return its evaluation without comparisons.
+
+        Args:
+            items, conditions, measures: The three inputs of ``run_study``.
+            store: File of scores; None stores nothing.
+            settings: Settings on which the values depend, by name.
+            running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
         Raises:
             ValueError: No output could be scored.
@@ -78,12 +86,12 @@ class Evaluation:
         return [condition.name for condition in self.conditions]
 
     def of_kind(self, *kinds: str) -> list[str]:
-        """Return the names of the conditions of some kinds."""
+        """Return the names of the conditions with one of some kinds, such as ``"aid"``."""
         return [condition.name for condition in self.conditions if condition.kind in kinds]
 
     @property
     def scores(self) -> list[str]:
-        """Columns of the scores: those of the measures in their order, then those of plug-ins."""
+        """Columns of the table with scores: those of hlsim's measures, then those of your own."""
         named = [measure.name for measure in self.measures if measure.name in self.table]
         facts = self.items[0].facts
         no_scores = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
@@ -91,13 +99,16 @@ class Evaluation:
 
     @property
     def headline(self) -> Comparison | None:
-        """The first planned comparison, or else the first one; None if there is none."""
+        """Comparison with which a page begins: the first planned one, or else the first one.
+
+        It is None if there is no comparison.
+        """
         planned = [comparison for comparison in self.comparisons if comparison.planned]
         return next(iter([*planned, *self.comparisons]), None)
 
     @property
     def failures(self) -> DataFrame:
-        """Rows of the table that lack values."""
+        """Rows of the table that lack values, with the reason in the column ``failure``."""
         return self.table[self.table["failure"].notna()]
 
     @property
@@ -107,12 +118,21 @@ class Evaluation:
         return installed_versions(["hlsim", *packages, "scipy"])
 
     def wide(self, column: str) -> DataFrame:
-        """Return one column with a row for each item and a column for each condition."""
+        """Return a column of the table with one row per item and one column per condition."""
         table = self.table.pivot(index="item", columns="condition", values=column)
         return table.reindex(columns=self.names)
 
+    def words(self, before: str, after: str) -> WordsChange:
+        """Predict from HASPI how many words a listener understands under two conditions.
+
+        Args:
+            before, after: Names of the conditions, which may be the same.
+        """
+        scores = self.wide("haspi").dropna(subset=[before, after]).clip(0.0, 1.0)
+        return words_change(scores[before].to_numpy(), scores[after].to_numpy())
+
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON, with None for missing values."""
+        """Return the contents of ``report.json``, with None for missing values."""
         fields = ("name", "kind", "of", "rivals")
         conditions = [{name: getattr(c, name) for name in fields} for c in self.conditions]
         groups = {

@@ -1,4 +1,7 @@
-"""Simulators compared with the exact MSBG, or another teacher, on the same items."""
+"""The study of ``evaluate-simulator``: simulators are compared with a teacher.
+
+The teacher is the simulator whose output others should match: the exact MSBG, or one of your own.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from torch import Tensor, nn
 
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.fingerprint import fingerprint
-from hlsim.evaluation.items import SIMULATOR_LEVELS, draw_items, treat
+from hlsim.evaluation.items import SIMULATOR_LEVELS, draw_simulator_items, treat
 from hlsim.evaluation.measures import load_measure, perceive
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item, Measure, Values
@@ -25,7 +28,7 @@ from hlsim.training.teacher import PluginTeacher, find_teacher
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-SHORTEST_SECONDS = 0.02
+_SHORTEST_SECONDS = 0.02
 """Shortest item in seconds, which is one window of the spectrograms."""
 
 
@@ -52,25 +55,27 @@ def evaluate_simulators(
     more simulator computes only its values.
 
     Args:
-        simulators: Modules by name, at 16 kHz and 94 dB SPL full scale.
-        speech, noise: Folders of recordings. With ``noise``, every second item is noisy.
-        audiograms: CSV file of ears, see ``draw_items``.
-        store: File of values, which is created if it does not exist; None stores nothing.
+        simulators: Modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
+            waveform and an ear.
+        speech: Folder of recordings of clean speech.
+        audiograms: CSV file of ears, see ``draw_simulator_items``.
+        store: File of scores, which is created if it does not exist; None stores nothing.
+        noise: Folder of recordings of noise. Every second item is then noisy.
         teacher: The simulator to compare with: ``"msbg"``, the exact one, or
             ``package.module:name``.
         measures: Further measures, ``package.module:name``.
-        items: Number of items; each is measured for each of ``inputs``.
-        seconds: Length of an item; PESQ and STOI need 2 or more.
-        levels: Levels in dB SPL that the items have in turn.
-        inputs: Treatments of the signal before the simulator, see ``TREATMENTS``.
-        compensator: Module of the treatment ``compensated``.
+        items: Number of items, each of which is measured for each of ``inputs``.
+        seconds: Length of an item in seconds; PESQ and STOI need 2 or more.
+        levels: Levels of the input in dB SPL that the items have in turn.
+        inputs: Names of ways to process the input before the simulator, see ``TREATMENTS``.
+        compensator: Module of the treatment ``"compensated"``.
         seed: Seed of all random draws.
-        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
+        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
     Returns:
-        The evaluation with one group per treatment. The SNR of a simulator is that of the teacher's
-        output relative to the simulator's error. In each group, the SNR of every simulator is
-        compared with that of the first one in ``simulators``.
+        The evaluation with one group per name in ``inputs``. The SNR of a simulator is that of the
+        teacher's output relative to the simulator's error. In each group, the SNR of every
+        simulator is compared with that of the first one in ``simulators``.
 
     Raises:
         ValueError: Data or settings are not valid, or no item has a value.
@@ -79,28 +84,26 @@ def evaluate_simulators(
     """
     require("pandas", "eval")
     require("pystoi", "eval")
-    if items < 1 or not simulators or not inputs or not levels:
-        raise ValueError("an evaluation needs at least one simulator, item, level and input")
-    if len(set(inputs)) < len(inputs):
-        raise ValueError(f"one of the inputs {', '.join(inputs)} is named twice")
-    if seconds < SHORTEST_SECONDS:
-        raise ValueError(f"items of {seconds:g} s are too short; PESQ and STOI need 2 s")
-    drawn = draw_items(
-        speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels
-    )
+    is_complete = items > 0 and simulators and inputs and levels and seconds >= _SHORTEST_SECONDS
+    if not is_complete or len(set(inputs)) < len(inputs):
+        raise ValueError(
+            f"expected at least one simulator, item and level, items of {_SHORTEST_SECONDS:g} s or "
+            f"more, and different inputs, got {len(simulators)} simulators, {items} items, "
+            f"{len(levels)} levels, {seconds:g} s and the inputs {', '.join(inputs) or 'none'}"
+        )
+    settings: dict[str, Any] = {
+        "items": items,
+        "seconds": seconds,
+        "seed": seed,
+        "levels": list(levels),
+    }
+    drawn = draw_simulator_items(speech, noise, audiograms, **settings)
     evaluation = Evaluation.run(
         treat(drawn, inputs, compensator),
         [Condition(name, module, "simulator") for name, module in simulators.items()],
-        [fidelity_to(teacher), *map(load_measure, measures)],
+        [_fidelity_to(teacher), *map(load_measure, measures)],
         store=store,
-        settings={
-            "teacher": teacher,
-            "items": items,
-            "seconds": seconds,
-            "seed": seed,
-            "levels": list(levels),
-            "inputs": list(inputs),
-        },
+        settings={"teacher": teacher, **settings, "inputs": list(inputs)},
         **running,
     )
     groups: dict[str, Evaluation] = {}
@@ -111,17 +114,12 @@ def evaluate_simulators(
     return replace(evaluation, groups=groups)
 
 
-def teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
+def _teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
     """Return the teacher's output for an item, which is computed once per item.
 
     Args:
         teacher: The teacher; None is the exact MSBG.
         item: The item.
-
-    >>> from hlsim import Audiogram
-    >>> clean = torch.ones(1600)
-    >>> teacher_output(None, Item("item 1", clean, clean, Audiogram.standard("N3"))).shape
-    torch.Size([1600])
     """
 
     def compute() -> Tensor:
@@ -133,15 +131,15 @@ def teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
     return output
 
 
-def fidelity_to(name: str) -> Measure:
-    """Return the measure of a simulator's fidelity to a teacher.
+def _fidelity_to(name: str) -> Measure:
+    """Return the measure that compares a simulator's output with that of a teacher.
 
     Its values are the SNR, the scaled mean squared error, the error of third-octave bands, and STOI
     and PESQ of teacher and simulator against the clean speech, if they are defined. PESQ is left
     out if pesq is not installed.
 
-    >>> fidelity_to("msbg").name
-    'fidelity'
+    Args:
+        name: Name of the teacher, see ``evaluate_simulators``.
     """
     teacher = find_teacher(name)
     scores = {"stoi": fidelity.stoi}
@@ -149,7 +147,7 @@ def fidelity_to(name: str) -> Measure:
         scores["pesq"] = fidelity.pesq_wb
 
     def compute(item: Item, output: Tensor) -> Values:
-        expected = teacher_output(teacher, item)
+        expected = _teacher_output(teacher, item)
         values = {
             "snr": fidelity.snr_db(expected, output),
             "raw_mse": fidelity.raw_mse(expected, output),
@@ -169,15 +167,15 @@ def fidelity_to(name: str) -> Measure:
 
 
 def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
-    """Compute the agreement of simulator and teacher in a score.
+    """Compute how well the scores of a simulator's outputs agree with those of the teacher's.
 
     Args:
-        rows: Rows of the table.
+        rows: Rows of the table of ``evaluate_simulators`` for one simulator.
         score: ``"stoi"`` or ``"pesq"``.
 
     Returns:
-        Linear and rank correlation (``lcc``, ``srcc``) and the mean squared difference (``mse``);
-        None where they are not defined.
+        Linear correlation ``lcc``, rank correlation ``srcc`` and mean squared difference ``mse``,
+        by name; None where they are not defined.
 
     >>> import pandas
     >>> rows = pandas.DataFrame({"stoi_teacher": [0.1, 0.5], "stoi_simulator": [0.2, 0.6]})
@@ -194,15 +192,20 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
 
 
 def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
-    """Return an item to show, and the teacher's output for it.
+    """Return an item to be played on the page, and the teacher's output for it.
 
     It has the first treatment and, if there are such items, a moderate loss and loud, clean speech:
     much of it is lost, and much is still perceived.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_simulators``.
+
+    Returns: The item, and the output with shape (time,) at 16 kHz.
     """
     rows = evaluation.table.dropna(subset="snr")
     rows = rows[rows["treatment"] == rows["treatment"].iloc[0]]
-    rows = rows.assign(is_other_loss=rows["severity"] != "moderate")
-    columns = ["is_other_loss", "input_level", "speech"]
+    rows = rows.assign(is_not_moderate=rows["severity"] != "moderate")
+    columns = ["is_not_moderate", "input_level", "speech"]
     order = rows.sort_values(columns, ascending=[True, False, True])
     item = evaluation.items[order["item"].iloc[0]].load()
-    return item, teacher_output(find_teacher(evaluation.settings["teacher"]), item)
+    return item, _teacher_output(find_teacher(evaluation.settings["teacher"]), item)

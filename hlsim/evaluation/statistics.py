@@ -1,4 +1,4 @@
-"""Paired tests of two scores of the same items, and intervals for their mean difference."""
+"""Paired tests of two scores per item, and intervals for their mean difference."""
 
 from __future__ import annotations
 
@@ -24,25 +24,27 @@ RELATIVE_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """Comparison of two scores of the same items, before and after a treatment.
+    """Statistics of two scores per item, before and after a treatment.
 
-    Differences are after minus before. Differences up to 1e-7 of the largest score count as zero.
-    Values that the data do not define are None: with one pair all that need a standard deviation,
-    with equal differences t, p_t and d, without any difference w and p_w.
+    A difference is the score after minus the score before. Differences up to 1e-7 of the largest
+    score count as zero. Values that the data do not define are None: with one pair those that need
+    a standard deviation, with equal differences ``t``, ``p_t`` and ``cohens_d``, and without any
+    difference ``w`` and ``p_w``.
 
     Attributes:
-        n, zeros: Number of pairs, and of pairs whose difference is zero. Wilcoxon's test leaves out
-            the latter.
+        n: Number of items.
+        zeros: Number of items whose difference is zero, which Wilcoxon's test leaves out.
         before_mean, after_mean: Mean scores.
         before_std, after_std: Standard deviations with n - 1.
         delta: Mean difference.
-        t, p_t: Paired t-test with n - 1 degrees of freedom, two-sided.
-        w, p_w: Wilcoxon's signed-rank test, two-sided; w is the smaller rank sum. Differences that
-            are equal up to rounding share a rank. The p value is exact for up to 50 differences (13
-            if some share a rank), and a normal approximation with a correction for ties otherwise.
+        t, p_t: Statistic and p value of the paired t-test with n - 1 degrees of freedom, two-sided.
+        w, p_w: Statistic (the smaller rank sum) and p value of Wilcoxon's signed-rank test,
+            two-sided. Differences that are equal up to rounding share a rank. The p value is exact
+            for up to 50 differences (13 if some share a rank), and a normal approximation with a
+            correction for ties otherwise.
         cohens_d: ``delta`` over the standard deviation of the differences, which is t / sqrt(n).
         ci_low, ci_high: 95 % interval of ``delta`` by ``bootstrap_interval`` with seed 0; None for
-            fewer than six pairs.
+            fewer than six items.
 
     >>> paired_comparison([0.1, 0.2, 0.3], [0.2, 0.4, 0.3]).zeros
     1
@@ -64,30 +66,32 @@ class PairedComparison:
     ci_high: float | None = None
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """Return a dictionary for JSON."""
+        """Return the attributes by name."""
         return asdict(self)
 
 
 def paired_comparison(before: Iterable[float], after: Iterable[float]) -> PairedComparison:
-    """Compare two scores of the same items.
+    """Test whether the scores of the same items differ before and after a treatment.
 
-    The tests treat the pairs as independent. If several pairs share a talker or a listener, the p
-    values are too small.
+    The tests treat the items as independent. If several share a talker or a listener, the p values
+    are too small.
 
     Args:
-        before, after: Scores in the same order.
+        before, after: One score per item, in the same order. Scores have any scale.
 
     Raises:
-        ValueError: There are no pairs, the numbers differ, or a score is NaN or infinite.
+        ValueError: There are no scores, their numbers differ, or a score is NaN or infinite.
 
     >>> round(paired_comparison([0.1, 0.2, 0.3], [0.2, 0.4, 0.3]).delta, 3)
     0.1
     """
-    first, second = _as_scores(before, "before"), _as_scores(after, "after")
-    if len(first) != len(second):
+    first, second = (np.array(list(scores), dtype=np.float64) for scores in (before, after))
+    is_finite = np.isfinite(first).all() and np.isfinite(second).all()
+    if not (0 < len(first) == len(second) and is_finite):
         raise ValueError(
-            f"expected one pair of scores per item, got {len(first)} scores before and "
-            f"{len(second)} after"
+            "expected finite scores before and after for the same items, got "
+            f"{np.isfinite(first).sum()} finite of {len(first)} scores before and "
+            f"{np.isfinite(second).sum()} of {len(second)} after"
         )
     largest = max(float(np.abs(first).max()), float(np.abs(second).max()))
     tolerance = RELATIVE_TOLERANCE * largest
@@ -130,7 +134,7 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
 def bootstrap_interval(
     values: Iterable[float], *, confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
 ) -> tuple[float, float]:
-    """Compute the bootstrap interval of the mean of independent values.
+    """Compute an interval that contains the true mean of independent values with some confidence.
 
     The limits are percentiles of the means of resamples (Efron 1979), expanded by Student's t
     (Hesterberg 2015, Am. Stat. 69), because plain percentiles are too narrow for few values. For
@@ -140,7 +144,7 @@ def bootstrap_interval(
     Args:
         values: Six values or more.
         confidence: Probability that the interval contains the mean.
-        resamples: Number of resamples.
+        resamples: Number of bootstrap resamples.
         seed: Seed of the resamples.
 
     Returns:
@@ -156,7 +160,7 @@ def bootstrap_interval(
     data = np.asarray(list(values), dtype=np.float64)
     n = len(data)
     if n < MIN_ITEMS_FOR_INTERVAL:
-        raise ValueError(f"{n} values; an interval needs {MIN_ITEMS_FOR_INTERVAL} or more")
+        raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}")
     generator = np.random.default_rng(seed)
     at_once = max(1, DRAWN_INDICES // n)
     sizes = [min(at_once, resamples - start) for start in range(0, resamples, at_once)]
@@ -168,9 +172,12 @@ def bootstrap_interval(
 
 
 def holm(p_values: Iterable[float | None]) -> list[float | None]:
-    """Adjust p values for their number by the method of Holm (1979, Scand. J. Statist. 6).
+    """Adjust p values for the number of tests by the method of Holm (1979, Scand. J. Statist. 6).
 
-    Undefined p values stay None, and count as comparisons.
+    Args:
+        p_values: P values of all tests of a family. None, an undefined one, counts as a test.
+
+    Returns: The adjusted p values in the same order. Undefined ones stay None.
 
     >>> holm([0.03, 0.01, None])
     [0.06, 0.03, None]
@@ -183,18 +190,3 @@ def holm(p_values: Iterable[float | None]) -> list[float | None]:
         largest = max(largest, min(1.0, (len(values) - rank) * p))
         adjusted[i] = largest
     return adjusted
-
-
-def _as_scores(values: Iterable[float], name: str) -> np.ndarray:
-    """Convert scores to an array.
-
-    Raises:
-        ValueError: There is no score, or one is NaN or infinite.
-    """
-    scores = np.array([float(value) for value in values], dtype=np.float64)
-    if not len(scores):
-        raise ValueError(f"no scores {name}; a paired comparison needs at least one pair")
-    for index, score in enumerate(scores):
-        if not math.isfinite(score):
-            raise ValueError(f"score {index} {name} is {score}; expected a finite number")
-    return scores

@@ -11,18 +11,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hlsim.evaluation.fingerprint import text_hash
 from hlsim.files import sha256
 
 
 class ScoreStore:
-    """Records by key in a file of JSON lines, ``{"key": ..., ...}``, which only grows.
+    """Stored scores, by a hash of everything that decides a score.
 
-    The last line with a key counts. A line that an interruption cut short is ignored.
+    The file has one line ``{"key": ..., "values": ...}`` per score, and only grows. The last line
+    with a key counts. A line that an interruption cut short is ignored.
 
     Args:
-        path: File of records, which is created with the first record. None keeps the records in
-            memory.
+        path: File of scores, which is created with the first one. None keeps them in memory.
 
     Raises:
         ValueError: The file cannot be read.
@@ -49,11 +48,11 @@ class ScoreStore:
                 self.records[record.pop("key")] = record
 
     def get(self, key: str) -> dict[str, Any] | None:
-        """Return the record with a key, or None."""
+        """Return the record that was stored under a key, or None if there is none."""
         return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Store a record, which is in the file when this returns.
+        """Store a record under a key. It is in the file when this method returns.
 
         Raises:
             ValueError: The file cannot be written, or JSON cannot represent the record.
@@ -83,12 +82,3 @@ def content_hash(path: str | Path) -> str:
         return sha256(Path(path))
     except OSError as error:
         raise ValueError(f"{path}: {str(error.strerror).lower()}") from error
-
-
-def settings_hash(settings: Mapping[str, Any]) -> str:
-    """Compute the SHA-256 of settings that JSON can represent, whatever their order.
-
-    >>> settings_hash({"a": 1, "b": 2}) == settings_hash({"b": 2, "a": 1})
-    True
-    """
-    return text_hash(json.dumps(settings, sort_keys=True, allow_nan=False))

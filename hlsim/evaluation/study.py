@@ -1,8 +1,8 @@
-"""A study: items, conditions and measures in, one table out.
+"""Studies: items, conditions and measures in, one table out.
 
-Every evaluation in hlsim is a study. ``haspi-report``, ``evaluate-compensator``,
-``evaluate-simulator``, ``clarity`` and the demo differ in their items (files, drawn clips, scenes),
-their conditions (recorded files, hearing aids, simulators) and their measures, and in nothing else.
+An item is speech for an ear, a condition processes it (no aid, a hearing aid, a simulator), and a
+measure scores the output. ``haspi-report``, ``evaluate-compensator``, ``evaluate-simulator``,
+``clarity`` and the demo are studies that differ in these three and in nothing else.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_waveform, loud_outputs
-from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint, samples_hash
+from hlsim.evaluation.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.parallel import Progress, describe_error, one_thread, run_parallel
-from hlsim.evaluation.store import ScoreStore, settings_hash
+from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
@@ -34,13 +34,16 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Values = Mapping[str, float | str]
-"""Values by the name of their column."""
+"""Values that a measure returns for one output, by the column of the table."""
 
 DEAD_PROCESS = "its process ended (after a crash in compiled code, or because memory ran out)"
+"""Failure of all scores of an item whose process ended."""
 
 
 class Source(Protocol):
-    """Source of an item: memory, as ``Item`` itself, or files.
+    """An item that is loaded only when it is measured, such as recorded files.
+
+    An ``Item`` is its own source.
 
     >>> source: Source = Item("item 1", torch.ones(8), torch.ones(8), Audiogram.standard("N3"))
     >>> source.load().name
@@ -54,27 +57,25 @@ class Source(Protocol):
     def facts(self) -> Mapping[str, Any]: ...
 
     def digest(self, condition: str) -> str:
-        """Return a SHA-256 of the item and of a condition's output, if that is recorded."""
+        """Return a hash of everything in the item that decides its scores under a condition."""
 
     def load(self) -> Item: ...
 
 
 @dataclass(frozen=True)
 class Item:
-    """One signal for one ear.
+    """Speech for one ear: the input that conditions process, and its clean reference.
 
     Args:
         name: Name in tables.
-        clean: Clean speech, the reference of measures.
-        signal: Input of the conditions.
+        clean: Clean speech, with which measures compare an output. Shape: (time,).
+        signal: Input of the conditions, such as noisy speech. Shape: (time,).
         ear: The audiogram.
-        sample_rate: Rate in Hz.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
-        seed: Seed of random numbers that a measure draws.
-        facts: Columns of the table, such as ``listener`` or ``snr``.
-        recorded: Functions that read recorded outputs, by the name of their condition.
-
-    Shape: (time,).
+        sample_rate: Sample rate in Hz.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+        seed: Seed of the random numbers that a measure draws.
+        facts: Further columns of the table that describe the item, such as ``listener`` or ``snr``.
+        recorded: For outputs that were recorded, a function that reads them, by condition.
 
     >>> clean = torch.ones(8)
     >>> Item("item 1", clean, clean, Audiogram.standard("N3")).sample_rate
@@ -93,19 +94,20 @@ class Item:
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def load(self) -> Item:
-        """Return a copy of the item without the values that ``once`` has computed for it."""
+        """Return a copy without the values that ``once`` has computed, which need memory."""
         return replace(self)
 
     def digest(self, condition: str) -> str:
-        """Return the SHA-256 of samples, ear, rate, level and seed."""
-        samples = samples_hash(self.clean, self.signal)
+        """Return a hash of samples, ear, rate, level and seed, which decide all scores."""
         settings = [self.sample_rate, self.full_scale_spl, self.seed]
-        return settings_hash({"samples": samples, "ear": self.ear.to_dict(), "settings": settings})
+        return value_hash([self.clean, self.signal, self.ear.to_dict(), settings])
 
     def once(self, name: str, compute: Callable[[], Any]) -> Any:
-        """Return the result of ``compute``, which runs once per item.
+        """Compute a value that does not depend on the condition, once for all conditions.
 
-        All conditions share such a result, for example a reference.
+        Args:
+            name: Name of the value, such as ``"reference"``.
+            compute: Function that computes it when the name is used for the first time.
         """
         if name not in self._computed:
             self._computed[name] = compute()
@@ -114,12 +116,12 @@ class Item:
 
 @dataclass(frozen=True)
 class Condition:
-    """One way of processing an item.
+    """One way of processing items, such as a hearing aid.
 
     Args:
         name: Name in tables.
-        process: Function of an input and an ear that returns an output of the same shape; None if
-            the outputs were recorded.
+        process: Function ``(signal, ear) -> output``, for a signal with shape (time,) and an
+            ``Audiogram``; None if the outputs were recorded.
         kind: Role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
         of: Name of the condition to which this one belongs, such as the aid whose level it has.
         rivals: Names of the conditions with which this one is compared, most important first.
@@ -140,7 +142,11 @@ class Condition:
         return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
-        """Process an item, or read its recorded output."""
+        """Process an item, or read its recorded output.
+
+        Raises:
+            ValueError: No output is recorded.
+        """
         if self.process is not None:
             return self.process(item.signal, item.ear)
         if self.name not in item.recorded:
@@ -150,19 +156,20 @@ class Condition:
 
 @dataclass(frozen=True)
 class Measure:
-    """A function of an item and an output, and its properties.
+    """A function that scores the output of a condition, and its properties.
 
     Args:
-        name: Name in options and files. The column of a score has the same name.
-        compute: Function that returns values by column, or raises ValueError if there are none.
+        name: Name in options and files. If the measure has one value, it is also its column.
+        compute: Function ``(item, output) -> values by column``, for an ``Item`` and an output with
+            shape (time,). It raises ValueError if there are no values.
         title: Name in tables and plots.
         packages: Packages whose versions decide the values.
         revision: Number to be increased when a change of hlsim changes a value.
-        settings: Fingerprint of other settings that decide the values, such as a teacher; None if
-            it is unknown.
-        knows_hearing: Whether the values depend on audiogram and level.
+        settings: Fingerprint of further settings that decide the values, such as a network; None
+            if it is unknown.
+        knows_hearing: Whether the values depend on the audiogram and the level.
         rewards_gain: Whether a higher level alone increases the score.
-        ends: Lowest and highest score, for the axes of plots.
+        score_range: Lowest and highest score, for the axes of plots.
 
     >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).revision
     1
@@ -176,20 +183,21 @@ class Measure:
     settings: str | None = ""
     knows_hearing: bool = False
     rewards_gain: bool = False
-    ends: tuple[float, float] | None = None
+    score_range: tuple[float, float] | None = None
 
     @cached_property
     def fingerprint(self) -> str | None:
-        """Fingerprint of revision, versions and settings; None if the settings are unknown."""
-        versions = str(installed_versions(self.packages))
-        return combined_fingerprint(str(self.revision), versions, self.settings)
+        """Fingerprint of everything that decides the values. If it is None, none is stored."""
+        if self.settings is None:
+            return None
+        return value_hash([self.revision, installed_versions(self.packages), self.settings])
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
-    """Return the installed version of each package.
+    """Return the installed version of each package, or "not installed".
 
-    >>> sorted(installed_versions(["hlsim", "no-such-package"]))
-    ['hlsim', 'no-such-package']
+    >>> installed_versions(["no-such-package"])
+    {'no-such-package': 'not installed'}
     """
     versions = {}
     for package in dict.fromkeys(packages):
@@ -203,11 +211,11 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
 
 
 class _Task(NamedTuple):
-    """One item with the conditions and measures that are still missing."""
+    """One item with its missing scores: condition, measure, and key in the store."""
 
     number: int
     source: Source
-    missing: list[tuple[Condition, Measure]]
+    missing: list[tuple[Condition, Measure, str]]
 
 
 def run_study(
@@ -228,13 +236,13 @@ def run_study(
 
     Args:
         items: Items, or sources that load them.
-        conditions: Conditions.
-        measures: Measures.
-        store: Values of earlier runs, to which new ones are added. A value is computed again only
+        conditions: Conditions that process each item.
+        measures: Measures that score each output.
+        store: Scores of earlier runs, to which new ones are added. A score is computed again only
             if samples, ear, condition or measure have changed.
         jobs: Number of processes; all cores by default.
         dask: Address of a Dask scheduler, whose workers replace the processes.
-        progress: Function that is called with the number of finished values and of all values.
+        progress: Function that is called with the numbers of finished scores and of all scores.
 
     Returns:
         One row per item and condition: ``item`` (its number), ``name``, the item's facts,
@@ -255,37 +263,34 @@ def run_study(
     [1.0]
     """
     store = ScoreStore() if store is None else store
-    show = progress or (lambda done, total: None)
+    report_progress = progress or (lambda finished, total: None)
     _warn_of_unknown_fingerprints([*conditions, *measures])
     results: dict[tuple[int, str, str], Values | str] = {}
-    keys: dict[tuple[int, str, str], str] = {}
     tasks = []
     for number, source in enumerate(items):
-        missing = []
+        task = _Task(number, source, [])
         for condition in conditions:
             digest = _digest(source, condition)
             for measure in measures:
                 key = _key(digest, condition, measure)
                 record = store.get(key)
                 if record is None:
-                    missing.append((condition, measure))
-                    keys[number, condition.name, measure.name] = key
+                    task.missing.append((condition, measure, key))
                 else:
                     results[number, condition.name, measure.name] = record["values"]
-        if missing:
-            tasks.append(_Task(number, source, missing))
+        if task.missing:
+            tasks.append(task)
     total = len(items) * len(conditions) * len(measures)
-    show(len(results), total)
+    report_progress(len(results), total)
     for task, measured in run_parallel(_measure_item, tasks, jobs=jobs, dask=dask):
         if measured is None:
             measured = [DEAD_PROCESS] * len(task.missing)
-        for (condition, measure), values in zip(task.missing, measured, strict=True):
-            place = task.number, condition.name, measure.name
-            results[place] = values
-            if keys[place] and not isinstance(values, str):
-                names = {"item": task.source.name, "condition": place[1], "measure": place[2]}
-                store.append(keys[place], {**names, "values": values})
-        show(len(results), total)
+        for (condition, measure, key), values in zip(task.missing, measured, strict=True):
+            results[task.number, condition.name, measure.name] = values
+            if key and not isinstance(values, str):
+                names = {"condition": condition.name, "measure": measure.name}
+                store.append(key, {"item": task.source.name, **names, "values": values})
+        report_progress(len(results), total)
     return _make_table(items, conditions, measures, results)
 
 
@@ -298,11 +303,12 @@ def _digest(source: Source, condition: Condition) -> str | None:
 
 def _key(digest: str | None, condition: Condition, measure: Measure) -> str:
     """Return the key of stored values, which is empty if they cannot be stored."""
-    parts = (digest, condition.fingerprint, measure.fingerprint)
-    return "" if None in parts else settings_hash({"value": [*parts, measure.name]})
+    parts = [digest, condition.fingerprint, measure.fingerprint]
+    return "" if None in parts else value_hash([*parts, measure.name])
 
 
 def _warn_of_unknown_fingerprints(parts: Sequence[Condition | Measure]) -> None:
+    """Warn of conditions and measures whose scores cannot be stored."""
     unknown = [part.name for part in parts if part.fingerprint is None]
     if unknown:
         warnings.warn(
@@ -324,13 +330,15 @@ def _measure_item(task: _Task) -> list[Values | str]:
         return [describe_error(error)] * len(task.missing)
     results: list[Values | str] = []
     pairs: dict[str, tuple[Item, Tensor]] = {}
-    for condition, measure in task.missing:
+    for condition, measure, _ in task.missing:
         try:
             if condition.name not in pairs:
                 pairs[condition.name] = _item_and_output(condition, item)
             with loud_outputs():
                 values = measure.compute(*pairs[condition.name])
-            _check_finite(values)
+            for name, value in values.items():
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise ValueError(f"{name} is {value}, not a finite number")
             results.append(values)
         except Exception as error:
             results.append(describe_error(error))
@@ -349,18 +357,22 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     return item, output[:samples]
 
 
-def _check_finite(values: Values) -> None:
-    for name, value in values.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"{name} is {value}, not a finite number")
-
-
 def _make_table(
     items: Sequence[Source],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
     results: Mapping[tuple[int, str, str], Values | str],
 ) -> DataFrame:
+    """Return the table of a study.
+
+    Args:
+        items, conditions, measures: See ``run_study``.
+        results: The values of each score, or the reason why there are none, by the number of the
+            item and the names of condition and measure.
+
+    Raises:
+        ValueError: Two measures return the same column.
+    """
     rows = []
     for (number, source), condition in product(enumerate(items), conditions):
         row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}

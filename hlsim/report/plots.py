@@ -262,7 +262,7 @@ def pictures_sections(evaluation: Evaluation) -> list[Section]:
         return []
     scores = evaluation.wide(c.measure)
     before, after = scores[[c.before, c.after]].dropna().to_numpy().T
-    ends = MEASURES[c.measure].ends if c.measure in MEASURES else None
+    ends = MEASURES[c.measure].score_range if c.measure in MEASURES else None
     margins = None if ends is None else (ends[0] - 0.03, ends[1] + 0.03)
     axis_titles = (f"{c.title}, {c.before}", f"{c.title}, {c.after}")
     title = f"{c.title} of the {len(before)} items"

@@ -16,7 +16,7 @@ from hlsim.cli.main import main
 from hlsim.evaluation import Item, aid_properties
 from hlsim.evaluation.aids import Unaided, load_enhancers
 from hlsim.evaluation.compensators import evaluate_compensators
-from hlsim.evaluation.measures import NORMAL, PERCEPTION, band_error_db, network_loss
+from hlsim.evaluation.measures import NORMAL, PERCEPTION, _band_error_db, network_loss
 from hlsim.report.compensators import compensators_page
 
 for module in ("matplotlib", "joblib", "pandas"):
@@ -71,7 +71,7 @@ def test_perception_is_that_of_the_exact_model_and_of_the_loss(
             expected = HearingLossLoss(N3, criterion="bands", simulator=simulator)(output, clean)
             assert loss == pytest.approx(float(expected), rel=1e-4)
     with pytest.raises(ValueError, match="audible"):
-        band_error_db(clean, 1e-9 * clean, 16000)
+        _band_error_db(clean, 1e-9 * clean, 16000)
 
 
 ENHANCERS = """

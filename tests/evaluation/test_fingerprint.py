@@ -12,7 +12,7 @@ from torch import nn
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import SIMULATOR, shipped_checkpoints
-from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint
+from hlsim.evaluation.fingerprint import fingerprint, value_hash
 from hlsim.neuro import load_pretrained
 
 N3 = Audiogram.standard("N3")
@@ -71,4 +71,8 @@ def test_objects_that_cannot_be_described_need_an_attribute(thing: Any) -> None:
     first = fingerprint(thing)
     thing.fingerprint = "version 2"
     assert None is not first != fingerprint(thing)
-    assert combined_fingerprint("a", None) is None != combined_fingerprint("a", "b")
+
+
+def test_values_have_the_same_hash_whatever_the_order_of_names() -> None:
+    assert value_hash({"a": 1, "b": [1.0, 2.0]}) == value_hash({"b": [1.0, 2.0], "a": 1})
+    assert len({value_hash({"a": value}) for value in (1, 2, "1", None)}) == 4

@@ -13,8 +13,8 @@ from hlsim.calibration import level_spl
 from hlsim.evaluation.items import (
     SIMULATOR_LEVELS,
     TREATMENTS,
-    draw_items,
-    draw_judged_items,
+    draw_aid_items,
+    draw_simulator_items,
     read_ears,
     treat,
 )
@@ -45,7 +45,7 @@ def test_every_ear_has_every_level_and_ratio(
     ears = [(f"{i}", Audiogram((float(i),) * 8)) for i in range(count)]
     expected = 4 * len(levels) * count
     settings: dict[str, Any] = {"items": 2 * expected, "seconds": 0.05, "seed": 0, "levels": levels}
-    drawn = draw_judged_items(speech_dir / "valid", speech_dir / "train", ears, **settings)
+    drawn = draw_aid_items(speech_dir / "valid", speech_dir / "train", ears, **settings)
     noisy = [item.facts for item in drawn if item.facts["speech"] == "noisy"]
     combinations = {(facts["ear"], facts["input_level"], facts["snr"]) for facts in noisy}
     assert len(noisy) == len(combinations) == expected
@@ -57,7 +57,7 @@ def test_every_kind_of_ear_of_simulators_has_every_level_and_ratio(
 ) -> None:
     levels, expected = [50.0, 55.0, 60.0, 70.0, 80.0][:count], 16 * count
     settings: dict[str, Any] = {"items": 2 * expected, "seconds": 0.1, "seed": 0, "levels": levels}
-    drawn = draw_items(speech_dir / "valid", speech_dir / "train", ears_file, **settings)
+    drawn = draw_simulator_items(speech_dir / "valid", speech_dir / "train", ears_file, **settings)
     noisy = [item.facts for item in drawn if item.facts["speech"] == "noisy"]
     pairs = enumerate((facts["input_level"], facts["noise_snr"]) for facts in noisy)
     assert len({(number % 4, *pair) for number, pair in pairs}) == expected == len(noisy)
@@ -73,8 +73,8 @@ def test_items_depend_on_the_seed_and_have_their_level_and_ratio(
         folders = speech_dir / "valid", speech_dir / "train"
         settings: dict[str, Any] = {"items": 16, "seconds": 1.0, "seed": seed}
         if judged:
-            return draw_judged_items(*folders, [("N3", Audiogram.standard("N3"))], **settings)
-        return draw_items(*folders, ears_file, **settings)
+            return draw_aid_items(*folders, [("N3", Audiogram.standard("N3"))], **settings)
+        return draw_simulator_items(*folders, ears_file, **settings)
 
     drawn, again, different = draw(0), draw(0), draw(1)
     assert all(torch.equal(a.signal, b.signal) for a, b in zip(drawn, again, strict=True))
@@ -93,7 +93,7 @@ def test_items_depend_on_the_seed_and_have_their_level_and_ratio(
 
 def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     settings: dict[str, Any] = {"items": 1, "seconds": 1.5, "seed": 0, "levels": (65.0,)}
-    drawn = draw_items(speech_dir / "valid", None, ears_file, **settings)
+    drawn = draw_simulator_items(speech_dir / "valid", None, ears_file, **settings)
     halving = torch.nn.Module()
     halving.forward = lambda waveform, ear: 0.5 * waveform  # type: ignore[method-assign]
     treated = treat(drawn, TREATMENTS, halving)

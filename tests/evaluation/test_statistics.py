@@ -147,16 +147,11 @@ def test_undefined_values_are_none_and_never_nan(
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
-    [
-        ([0.1, 0.2], [0.1], "2 scores before and 1 after"),
-        ([], [], "no scores before"),
-        ([0.1, math.nan], [0.1, 0.2], "score 1 before is nan"),
-        ([0.1, 0.2], [math.inf, 0.2], "score 0 after is inf"),
-    ],
+    ("before", "after"),
+    [([0.1, 0.2], [0.1]), ([], []), ([0.1, math.nan], [0.1, 0.2]), ([0.1, 0.2], [math.inf, 0.2])],
 )
-def test_invalid_scores(before: list[float], after: list[float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_invalid_scores_are_rejected(before: list[float], after: list[float]) -> None:
+    with pytest.raises(ValueError, match="expected finite scores"):
         paired_comparison(before, after)
-    with pytest.raises(ValueError, match="an interval needs 6"):
+    with pytest.raises(ValueError, match="expected 6 values or more"):
         bootstrap_interval(before)
