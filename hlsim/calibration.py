@@ -18,10 +18,10 @@ POWER_FLOOR = 1e-20
 
 
 def check_full_scale(full_scale_spl: float) -> float:
-    """Return ``full_scale_spl`` as a float.
+    """Validate the level of full scale, and return it as a float.
 
     Args:
-        full_scale_spl: Level in dB SPL of RMS 1.0, from 0 to 200.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, from 0 to 200.
 
     Raises:
         ValueError: The level is not a number, or out of range.
@@ -34,7 +34,7 @@ def check_full_scale(full_scale_spl: float) -> float:
 
 
 def gain_to_pascals(full_scale_spl: float) -> float:
-    """Compute the linear gain that converts samples to pascals.
+    """Compute the factor that converts samples to pascals.
 
     Args:
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
@@ -56,6 +56,7 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     Shape: (..., time) -> (...).
 
     Args:
+        waveform: Samples.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
@@ -78,6 +79,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
     Shape: (..., time) -> (..., time).
 
     Args:
+        waveform: Samples.
         spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
             dimensions.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.

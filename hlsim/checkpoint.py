@@ -1,11 +1,13 @@
-"""Checkpoints: folders with weights (safetensors), a hashed JSON configuration and a model card.
+"""Checkpoints: folders in which trained models are saved, and from which they are loaded.
 
-No pickles are read or written.
+A folder has three files: the weights (``model.safetensors``), the settings of the model with hashes
+(``config.json``) and a model card (``README.md``). No pickles are read or written, so that loading
+runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or ``hearing-aid``,
+says which class of model it holds.
 """
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
@@ -27,11 +29,15 @@ CONFIG = "config.json"
 CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
-"""Kind of a simulator's checkpoint in ``config.json``. All other kinds are compensators."""
+"""Kind of the checkpoints of simulators. All other kinds are compensators."""
 
 
 def list_pretrained() -> dict[str, str]:
-    """List the checkpoints that ship with hlsim, and the name of the function that loads each.
+    """List the checkpoints that ship with hlsim.
+
+    Returns:
+        Name of the function that loads it (``load_pretrained`` for a simulator,
+        ``load_compensator`` for an aid), by name of the checkpoint.
 
     >>> list_pretrained()["neuro-msbg"]
     'load_pretrained'
@@ -50,14 +56,15 @@ def read_checkpoint(
     build: Callable[[Config], Model],
     other_names: Sequence[str] = (),
 ) -> Model:
-    """Build a model from a checkpoint's configuration and load its weights.
+    """Load a model from a checkpoint.
 
     The model is on torch's default device, or on the CPU if that is ``meta``.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, or a checkpoint folder.
-        kinds: Function from settings to a configuration, by accepted kind of checkpoint.
-        build: Function from configuration to model.
+        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
+        kinds: Accepted kinds of checkpoints. The value of each is a function from the settings in
+            ``config.json`` to the object with which the model is built.
+        build: Function from this object to the model, whose weights are then loaded.
         other_names: Names that the caller accepts in addition, for the error message.
 
     Raises:
@@ -112,10 +119,10 @@ def read_checkpoint(
 def find_checkpoint(
     name: str | Path, kinds: Collection[str] | None = None, other_names: Sequence[str] = ()
 ) -> Path:
-    """Find the folder of a checkpoint.
+    """Return the folder of a checkpoint.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, or a checkpoint folder.
+        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
         kinds: Kinds of checkpoints that the error message suggests; all by default.
         other_names: Names that the error message suggests in addition.
 
@@ -125,9 +132,7 @@ def find_checkpoint(
     >>> find_checkpoint("neuro-msbg").name
     'neuro-msbg'
     """
-    if not isinstance(name, str | os.PathLike):
-        raise ValueError(f"expected a checkpoint's name or folder, got {type(name).__name__}")
-    folder = Path(name)
+    folder = Path(str(name))
     if (folder / CONFIG).is_file():
         return folder
     checkpoints = shipped_checkpoints()
@@ -143,7 +148,10 @@ def find_checkpoint(
 
 
 def checkpoint_digest(name: str | Path) -> str:
-    """Return the SHA-256 of a checkpoint's weights, as its ``config.json`` states it.
+    """Return the SHA-256 of a checkpoint's weights, which identifies it.
+
+    Args:
+        name: Name or folder of the checkpoint.
 
     Raises:
         ValueError: There is no such checkpoint.
@@ -155,7 +163,12 @@ def checkpoint_digest(name: str | Path) -> str:
 
 
 def checkpoint_about(name: str | Path) -> dict[str, Any]:
-    """Return a checkpoint's training record: data, seed, command, time, measures and version.
+    """Return how a checkpoint was trained: data, seed, command, time, measures and version.
+
+    Args:
+        name: Name or folder of the checkpoint.
+
+    Returns: Entries by name; an empty dictionary if the checkpoint has no record.
 
     Raises:
         ValueError: There is no such checkpoint.
@@ -168,10 +181,10 @@ def checkpoint_about(name: str | Path) -> dict[str, Any]:
 
 
 def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]:
-    """Return the folders of the checkpoints that ship with hlsim by name.
+    """Return the folders of the checkpoints that ship with hlsim, by name.
 
     Args:
-        kinds: Kinds of checkpoints to include; all by default.
+        kinds: Kinds of checkpoints to include, such as ``hearing-aid``; all by default.
 
     >>> [*shipped_checkpoints(["hearing-aid"])]
     ['hearing-aid']
@@ -183,8 +196,9 @@ def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]
 
 
 def checkpoints_folder() -> Path:
-    """Return the folder of the checkpoints: in an installed package, or next to it in a source
-    tree.
+    """Return the folder of the checkpoints that ship with hlsim.
+
+    It is inside an installed package, and beside the package in a source tree.
 
     >>> checkpoints_folder().name
     'checkpoints'
@@ -202,14 +216,16 @@ def save_checkpoint(
     about: Settings,
     card: str = "",
 ) -> None:
-    """Write a checkpoint folder atomically; an older checkpoint is replaced.
+    """Save a model as a checkpoint, in place of an older one in the same folder.
+
+    If writing fails, the folder stays as it was.
 
     Args:
         folder: Folder to write.
-        kind: Kind of the checkpoint.
-        model: Model whose state dict is written.
-        config: Configuration from which the model can be built.
-        about: Training record: data, seed, command, time, measures and version.
+        kind: Kind of the checkpoint, such as ``hearing-aid``.
+        model: Model whose state dict is saved.
+        config: Settings with which the model can be built again, as JSON values.
+        about: Record of the training: data, seed, command, time, measures and version.
         card: Text of README.md. If it is empty, the card of an older checkpoint is kept.
 
     Raises:
@@ -240,23 +256,26 @@ def save_checkpoint(
 
 
 def check_replaceable(folder: str | Path) -> Path:
-    """Return a folder as a path if saving a checkpoint there deletes no other file.
+    """Check that saving a checkpoint in a folder deletes nothing but an older checkpoint.
+
+    Returns: The folder as a path.
 
     Raises:
-        ValueError: The folder contains files that no checkpoint has, and saving would delete them.
+        ValueError: The folder contains other files, or is a file itself.
 
     >>> check_replaceable("new/checkpoint").name
     'checkpoint'
     """
     target = Path(folder)
-    if target.exists() and not target.is_dir():
-        raise ValueError(f"{target}: expected a folder for the checkpoint, got a file")
-    names = {path.name for path in target.iterdir()} if target.is_dir() else set()
-    other_files = sorted(names - {WEIGHTS, CONFIG, CARD})
+    if target.is_dir():
+        names = {path.name for path in target.iterdir()}
+        other_files = sorted(names - {WEIGHTS, CONFIG, CARD})
+    else:
+        other_files = [target.name] if target.exists() else []
     if other_files:
         raise ValueError(
-            f"{target}: saving would delete {other_files[0]}; choose a new folder, or that of a "
-            "checkpoint"
+            f"{target}: saving would delete the file {other_files[0]}; choose a new folder, or "
+            "that of a checkpoint"
         )
     return target
 

@@ -1,26 +1,27 @@
 """Neuro-MSBG and wearable aids as ``torch.export`` programs and as ONNX files, for inference.
 
-The program of a simulator processes a fixed number of items with a fixed length.
+An *item* is one signal for one ear. The program of a simulator processes a fixed number of items
+with a fixed length.
 
-The program of a wearable aid processes one hop, ``HOP`` = 64 samples (4 ms at 16 kHz), or a fixed
-number of hops of each item, such as the left and the right ear. Its state is an input and an
-output. All tensors are float32.
+The program of a wearable aid (``WDRC`` or ``HearingAid``) processes one *hop* of each item, 64
+samples or 4 ms at 16 kHz, or a fixed number of hops. What the aid remembers from one call to the
+next, its *state*, is passed in and returned as tensors. All tensors are float32.
 
 Inputs by name:
 
 - ``samples`` (items, hops * 64): the input, where RMS 1.0 is ``aid.full_scale_spl`` dB SPL
-- ``fitted`` (items, n): the aid's parameters for the ear
+- ``fitted`` (items, n): the aid's parameters for the ear of each item
 - ``sliders`` (items, sliders): values from 0 to 1 in the order of ``aid.SLIDERS``, if the aid has
     any
-- state, (items, ...) each: for example ``past`` (items, 192), the preceding samples in pascals
+- the state, (items, ...) each: for example ``past`` (items, 192), the preceding samples in pascals
 
 Outputs by name:
 
 - ``output`` (items, hops * 64): the aid's output, delayed by ``aid.latency`` = 64 samples
-- each state with the prefix ``next_``: for example ``next_past``, the input ``past`` of the next
-    call
+- the next state, with the prefix ``next_``: for example ``next_past``, the input ``past`` of the
+    next call
 
-``first_inputs`` returns all inputs of the first hop. On a machine without torch, numpy and
+``first_inputs`` returns all inputs of the first call. On a machine without torch, numpy and
 onnxruntime run the file (``np.savez`` stores the inputs):
 
     export_aid(aid, "aid.onnx")
@@ -41,7 +42,6 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -75,7 +75,7 @@ STATELESS_INPUTS = ("samples", "fitted", "sliders")
 
 
 class _SimulatorCall(nn.Module):
-    """A simulator as a function of two tensors, without the checks that read their values."""
+    """A simulator as a function of two tensors, which does not read their values."""
 
     def __init__(self, simulator: NeuroMSBG) -> None:
         super().__init__()
@@ -118,15 +118,15 @@ class _HopCall(nn.Module):
 def export_program(
     simulator: nn.Module, *, seconds: float = 1.0, items: int = 1
 ) -> torch.export.ExportedProgram:
-    """Export a Neuro-MSBG at 16 kHz as a ``torch.export`` program.
+    """Convert a Neuro-MSBG to a ``torch.export`` program for signals of a fixed length.
 
-    The inputs of the program are a waveform (items, time) and thresholds (items, 8) in dB HL. Its
-    output has the shape of the waveform.
+    ``program.module()`` is a function of a waveform (items, time) and of thresholds (items, 8) in
+    dB HL. It returns what the ears perceive, in the shape of the waveform.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
         seconds: Duration of the waveforms.
-        items: Number of waveforms.
+        items: Number of waveforms per call.
 
     Raises:
         ValueError: The simulator is no Neuro-MSBG at 16 kHz, or there is no sample or no item.
@@ -155,13 +155,16 @@ def export_program(
 def export_onnx(
     simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1
 ) -> None:
-    """Write the program of ``export_program`` as an ONNX file. Mamba blocks take minutes.
+    """Write a Neuro-MSBG as an ONNX file for signals of a fixed length.
+
+    Its inputs are ``waveform`` (items, time) and ``thresholds`` (items, 8) in dB HL, its output is
+    ``perceived`` (items, time). Networks with Mamba blocks take minutes.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
         path: File to write.
         seconds: Duration of the waveforms.
-        items: Number of waveforms.
+        items: Number of waveforms per call.
 
     Raises:
         ValueError: The simulator or the size is unsuitable, see ``export_program``; ONNX lacks an
@@ -187,15 +190,20 @@ def export_onnx(
 def first_inputs(
     aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, hops: int = 1, **sliders: Slider
 ) -> dict[str, Tensor]:
-    """Return the inputs of an aid's program for the first hop: fitted to the ear, with silence.
+    """Return the inputs with which the first call of an aid's program is made.
+
+    Replace ``samples``, which are silence, by those of the signal.
 
     Args:
         aid: Aid at 16 kHz.
         audiogram: One ear for all items, or one per item.
-        items: Number of signals that the program processes.
-        hops: Number of hops that one call of the program processes.
-        sliders: Values from 0 to 1 by name, one for all items or one per item; by default
-            those of the aid.
+        items: Number of signals per call.
+        hops: Number of hops of 64 samples per call.
+        sliders: Values of sliders from 0 to 1 by name, one for all items or one per item; by
+            default those of ``aid.DEFAULT_SLIDERS``.
+
+    Returns:
+        Tensors by the names of inputs that the module's docstring lists.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, it has no such slider, or it rejects the
@@ -226,12 +234,15 @@ def first_inputs(
 
 
 def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export.ExportedProgram:
-    """Export hops of an aid as a program; ``program.module()(**inputs)`` returns the outputs.
+    """Convert a wearable aid to a ``torch.export`` program that processes a few ms per call.
+
+    ``program.module()(**inputs)`` returns the outputs by name. The module's docstring lists inputs
+    and outputs, and ``first_inputs`` returns the inputs of the first call.
 
     Args:
         aid: Aid at 16 kHz.
-        items: Number of signals that the program processes.
-        hops: Number of hops that one call processes.
+        items: Number of signals per call.
+        hops: Number of hops of 64 samples (4 ms) per call.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz.
@@ -250,12 +261,15 @@ def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export
 
 
 def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1) -> None:
-    """Write the program of ``hop_program`` as an ONNX file.
+    """Write a wearable aid as an ONNX file that processes a few ms per call.
+
+    Its inputs and outputs are those of ``hop_program``.
 
     Args:
         aid: Aid at 16 kHz.
         path: File to write.
-        items: Number of signals that the program processes.
+        items: Number of signals per call.
+        hops: Number of hops of 64 samples (4 ms) per call.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
@@ -284,16 +298,15 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
 
 
 def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
-    """Write the computation of an aid's parameters for an ear as an ONNX file.
+    """Write an ONNX file that computes the parameters of a wearable aid from an audiogram.
 
     Its input is ``thresholds`` (items, 8), in dB HL at ``hlsim.audiogram.FREQUENCIES``. Its output
-    ``fitted`` (items, n) contains the n parameters of the aid for each ear, which the program of
-    ``export_aid`` takes as an input.
+    is ``fitted`` (items, n), an input of the file that ``export_aid`` writes.
 
     Args:
         aid: Aid at any sample rate.
         path: File to write.
-        items: Number of ears.
+        items: Number of ears per call.
 
     Raises:
         ValueError: The output of onnxruntime differs from that of torch by more than
@@ -329,7 +342,7 @@ def _write_onnx(
     inputs: dict[str, Tensor],
     expected: dict[str, Tensor],
 ) -> None:
-    """Write a program, unless onnxruntime computes other outputs than expected from the inputs."""
+    """Write a program, and raise ValueError if onnxruntime computes other outputs than expected."""
     with atomic_path(path) as temporary:
         try:
             # The optimiser of onnxscript would turn log(x + 1e-12) into log(x), because it treats
@@ -341,20 +354,18 @@ def _write_onnx(
             raise ValueError(f"{path}: ONNX cannot represent the program: {error}") from error
         assert converted is not None
         converted.save(str(temporary), external_data=False)
-        _check_onnx(temporary, inputs, [*expected.values()])
-
-
-def _check_onnx(path: Path, inputs: dict[str, Tensor], expected: Sequence[Tensor]) -> None:
-    runtime = require("onnxruntime", "dev")
-    options = runtime.SessionOptions()
-    options.log_severity_level = 3  # Only errors are logged.
-    session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    arrays = {name: tensor.cpu().numpy() for name, tensor in inputs.items()}
-    for array, reference in zip(session.run(None, arrays), expected, strict=True):
-        error = (torch.from_numpy(array).to(reference) - reference).abs().max()
-        peak = reference.abs().max().clamp_min(torch.finfo(reference.dtype).tiny)
-        if not error <= TOLERANCE * peak:
-            raise ValueError(
-                f"{path.name}: the output of onnxruntime differs by {float(error / peak):.0e} of "
-                f"its peak, expected {TOLERANCE:g} or less; the file was not written"
-            )
+        runtime = require("onnxruntime", "dev")
+        options = runtime.SessionOptions()
+        options.log_severity_level = 3  # Only errors are logged.
+        session = runtime.InferenceSession(
+            str(temporary), options, providers=["CPUExecutionProvider"]
+        )
+        arrays = {name: tensor.cpu().numpy() for name, tensor in inputs.items()}
+        for array, reference in zip(session.run(None, arrays), expected.values(), strict=True):
+            difference = (torch.from_numpy(array).to(reference) - reference).abs().max()
+            peak = reference.abs().max().clamp_min(torch.finfo(reference.dtype).tiny)
+            if not difference <= TOLERANCE * peak:
+                raise ValueError(
+                    f"{path}: the output of onnxruntime differs by {float(difference / peak):.0e} "
+                    f"of its peak, expected {TOLERANCE:g} or less; the file was not written"
+                )

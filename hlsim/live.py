@@ -1,4 +1,8 @@
-"""Streams from microphone to headphones: the processing of each block, and the loop around it."""
+"""Live processing from microphone to headphones: the function per block, and the loop around it.
+
+A *stream* is a function from a block of samples to its output, which remembers what it needs of
+earlier blocks: a ``compensators.stream.Stream`` or a ``SimulatedStream``.
+"""
 
 from __future__ import annotations
 
@@ -35,14 +39,15 @@ DEVICE_HINT = f"choose one of hlsim live --list-devices that supports {NEURO_RAT
 
 
 class Live:
-    """Callback for sounddevice that processes each block.
+    """Function that sounddevice calls with each block of the microphone, and that plays the output.
 
     Args:
         stream: Function from a block to its output, both with shape (time,) for one ear or
-            (2, time) for two. Its attributes that are named in ``KEYS`` are its sliders.
-        full_scale_spl: Level in dB SPL of RMS 1.0, at microphone and headphones.
-        ears: Number of ears, 1 or 2. Left and right ear have a microphone each if there are two.
-        latency: Delay of the stream's output in samples.
+            (2, time) for two. Its attributes ``noise_reduction`` and ``amplification``, if it has
+            them, are moved by keys.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, at microphone and headphones.
+        ears: Number of ears, 1 or 2. If there are two microphones, each ear has its own.
+        latency: Delay of the stream's output in samples, which is displayed.
 
     Attributes:
         drop_outs: Number of lost blocks.
@@ -93,7 +98,7 @@ class Live:
             self.error = str(error) or type(error).__name__
 
     def press(self, key: str) -> None:
-        """Move the slider of a key by one step."""
+        """Move a slider by one step. ``KEYS`` lists the keys; others have no effect."""
         for name, (down, up) in KEYS.items():
             if key in (down, up) and hasattr(self.stream, name):
                 step = SLIDER_STEP if key == up else -SLIDER_STEP
@@ -101,8 +106,10 @@ class Live:
                 setattr(self.stream, name, round(value, 3))
 
     def status(self) -> str:
-        """Describe the levels since the last call, the sliders, and the drop-outs since the
-        start."""
+        """Return a line of text with levels, sliders and drop-outs.
+
+        The levels are those since the last call, in dB SPL. Drop-outs are counted from the start.
+        """
         blocks = self._blocks
         self._blocks = []
         parts = []
@@ -121,10 +128,10 @@ class Live:
 
 
 class SimulatedStream:
-    """A stream that simulates a hearing loss block by block.
+    """Simulator for a signal that arrives in chunks: a function from a chunk to the next output.
 
-    The output is delayed by the simulator's look-ahead, so that each block depends on past input
-    only.
+    The output has as many samples as the chunk. It is delayed by the simulator's look-ahead, so
+    that it depends on past input only.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz with a finite receptive field, such as ``neuro-msbg``.
@@ -157,7 +164,10 @@ class SimulatedStream:
         self._past = torch.zeros(2 * self.latency)
 
     def __call__(self, chunk: Tensor) -> Tensor:
-        """Simulate a chunk. Shape: (time,), or (2, time) for a listener -> the same."""
+        """Return what is perceived. Shape: (time,), or (2, time) for a listener -> the same.
+
+        The number of samples must be a multiple of ``block``.
+        """
         samples = chunk.shape[-1]
         window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
         self._past = window[..., samples:]
@@ -175,17 +185,17 @@ def play(
     buffer: float = 0.02,
     seconds: float = math.inf,
 ) -> None:
-    """Play the stream with a status line until the time is over or a key stops it.
+    """Process the sound of a microphone until the time is over, or ``q`` or Ctrl-C is pressed.
 
-    The keys are ``q`` and Ctrl-C.
+    A status line shows levels, sliders and drop-outs.
 
     Args:
-        live: Callback that processes the blocks.
+        live: Function that processes the blocks.
         sounddevice: The imported package.
         devices: Microphone and headphones, by number or part of their names. None stands for the
             device of the system.
         block: Number of samples per block at 16 kHz.
-        buffer: Buffer of each device in seconds.
+        buffer: Length of the buffer of each device in seconds. Longer ones prevent drop-outs.
         seconds: Duration after which to stop.
 
     Raises:
@@ -291,6 +301,6 @@ def _key_reader() -> Iterator[Callable[[float], str]]:
 
 
 def _wait(seconds: float) -> str:
-    """Wait in place of a function that reads keys."""
+    """Wait for some seconds, and return that no key was pressed."""
     time.sleep(seconds)
     return ""

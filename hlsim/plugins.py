@@ -27,11 +27,12 @@ _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 
 
 def load_plugin(name: str, kind: str) -> Any:
-    """Load the object that a name refers to. A class is called without arguments.
+    """Import a function, a module or another object of your own code by its name.
 
-    Python searches for modules in the working directory first, and a file can import modules beside
-    it. This holds during the import only, so a plug-in should import its modules at the top of the
-    file, not inside functions.
+    A class is called without arguments, and the object is returned. Python searches for modules in
+    the working directory first, and a file can import modules beside it. This holds during the
+    import only, so a plug-in should import its modules at the top of the file, not inside
+    functions.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -65,18 +66,20 @@ def load_plugin(name: str, kind: str) -> Any:
 
 
 class WaveformPlugin:
-    """A plug-in from waveform to waveform, whose output is validated at every call.
+    """Your own function or ``nn.Module`` from waveform to waveform, with validated outputs.
 
-    Calls compute no gradients. A module is in evaluation mode and moves to the device of its input.
+    Calls compute no gradients. A module is set to evaluation mode and moved to the device of its
+    input.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
         kind: Noun for the plug-in in error messages: ``"teacher"``, ``"enhancer"`` or ``"aid"``.
 
     Attributes:
-        function: Callable that was loaded.
-        fingerprint: Attribute ``fingerprint`` of the callable as text, which its author changes
-            when its outputs change. None if there is no such attribute.
+        function: The function or module that was loaded.
+        fingerprint: Attribute ``fingerprint`` of the function as text, which its author changes
+            when its outputs change, so that stored results are computed again. None if there is no
+            such attribute.
 
     Raises:
         ValueError: The plug-in cannot be loaded or called.
@@ -142,9 +145,9 @@ class WaveformPlugin:
         return output.to(waveform)
 
     def check_aligned(self, waveform: Tensor, sample_rate: int, *arguments: Any) -> None:
-        """Call the plug-in and reject an output that is delayed or advanced by more than 2 ms.
+        """Call the plug-in, and reject an output that is delayed or advanced by more than 2 ms.
 
-        The delay is the maximum of the cross-correlation of the first channels.
+        The delay is that at which the first channels of input and output correlate most.
 
         Args:
             waveform: First argument of the plug-in. Shape: (..., time).

@@ -168,7 +168,7 @@ def listen(
     starts low. The spectrograms need the extra ``eval``; without it there are only sounds.
 
     Args:
-        sample_rate: Sample rate in Hz of all signals.
+        sample_rate: Sample rate in Hz of all signals, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
         signals: Mono signals by the label to show, ``(time,)`` each.
 
@@ -176,7 +176,8 @@ def listen(
         A player that a notebook displays; its ``save`` method writes a page for a browser.
 
     Raises:
-        ValueError: There is no signal, all signals are silent, or one is not mono.
+        ValueError: There is no signal, all signals are silent, one is not mono, or the sample rate
+            is not valid.
 
     Example:
         >>> import hlsim
@@ -197,7 +198,7 @@ def listen(
                 "pass one channel, such as x[0]"
             )
         pascals[label.replace("_", " ")] = tensor * gain
-    return Players(pascals, sample_rate)
+    return Players(pascals, check_rate(sample_rate))
 
 
 class Players:
@@ -218,7 +219,7 @@ class Players:
 
     @property
     def labels(self) -> list[str]:
-        """Labels of the signals, in order."""
+        """Labels of the signals, in the order in which they were passed."""
         return [sound.label for sound in self._player.sounds]
 
     def _repr_html_(self) -> str:
@@ -230,7 +231,11 @@ class Players:
         return f"Players({levels})"
 
     def save(self, path: str | Path) -> None:
-        """Write the player as one HTML file that a browser opens without a network."""
+        """Write the player as one HTML file, which a browser opens without a network.
+
+        Args:
+            path: File to write.
+        """
         from hlsim.report.page import Page, Section
 
         page = Page("Listen", "", [Section("Sounds", player=self._player)])
@@ -273,15 +278,11 @@ def _as_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
     """Return the samples as a tensor; a NumPy array must hold floating-point numbers."""
     if isinstance(audio, Tensor):
         return audio
-    if isinstance(audio, tuple):
+    if isinstance(audio, tuple | str | Path):
+        kind = "a tuple" if isinstance(audio, tuple) else f"the path {str(audio)!r}"
         raise ValueError(
-            "expected samples, got a tuple; load_audio returns samples and their rate, so write: "
-            "speech, rate = hlsim.load_audio(path), and pass sample_rate=rate"
-        )
-    if isinstance(audio, str | Path):
-        raise ValueError(
-            f"expected samples, got the path {str(audio)!r}; load them first: "
-            "speech, rate = hlsim.load_audio(path)"
+            f"expected samples, got {kind}; write: speech, rate = hlsim.load_audio(path), and pass "
+            "speech and sample_rate=rate"
         )
     samples = np.asarray(audio)
     if not np.issubdtype(samples.dtype, np.floating):

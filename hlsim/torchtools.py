@@ -1,4 +1,8 @@
-"""Constants that are computed once, and functions that torch's compiler runs as they are."""
+"""Tools around torch: constants that are computed once, and functions that are not compiled.
+
+A *constant* is a tensor that a function computes from its arguments, such as the taps of a filter.
+It is computed once for each type and device, and then comes from a cache.
+"""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -19,10 +23,10 @@ CACHE_BYTES = 2**28
 
 
 def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
-    """Decorate a function that ``torch.compile`` leaves uncompiled, with a break in the graph.
+    """Decorate a function that ``torch.compile`` must not compile.
 
-    This is ``torch.compiler.disable`` without its price: as a decorator, it would import the
-    compiler, which takes longer than importing hlsim.
+    The compiled graph breaks there. ``torch.compiler.disable`` does the same, but as a decorator it
+    imports the compiler, which takes longer than importing hlsim.
 
     >>> @not_compiled
     ... def square(x):
@@ -43,10 +47,18 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
 def without_modes(
     function: Callable[P, Result], /, *arguments: P.args, **options: P.kwargs
 ) -> Result:
-    """Call a function without the caller's modes, such as inference mode or ``torch.func``.
+    """Call a function as if the caller were not in a mode such as ``torch.inference_mode``.
 
-    These modes belong to a thread, so the function runs in a thread of its own. Tensors that it
-    creates are plain ones, which can be kept and used under any mode.
+    Modes, among them transforms such as ``torch.func.grad``, belong to a thread, so the function
+    runs in another thread. Tensors that it creates are plain ones, which can be kept and used in
+    any mode.
+
+    Args:
+        function: Function to call.
+        arguments: Positional arguments of the function.
+        options: Keyword arguments of the function.
+
+    Returns: Result of the function.
 
     >>> with torch.inference_mode():
     ...     without_modes(torch.ones, 2).is_inference()
@@ -59,11 +71,14 @@ def without_modes(
 def constant(
     function: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Return the values of ``function(*arguments)`` as a cached tensor, which must not be changed.
+    """Return the values of ``function(*arguments)`` as a tensor that is computed only once.
+
+    The tensor comes from a cache, so it must not be changed in place.
 
     Args:
-        function: A module's function that returns an array or numbers.
-        dtype: Type of real values, and of the parts of complex ones.
+        function: Function at the top level of a module, which returns an array or numbers.
+        arguments: Hashable arguments of the function.
+        dtype: Type of real values, and of the real and imaginary parts of complex ones.
         device: Device of the tensor.
 
     >>> constant(np.hanning, 3, dtype=torch.float32, device=torch.device("cpu"))
@@ -74,9 +89,14 @@ def constant(
 
 
 def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any) -> Tensor:
-    """Return an array that a function computes, as a tensor like another one.
+    """Return the values of ``function(*arguments)`` in the precision and on the device of a tensor.
 
-    The result has the precision and the device of ``tensor``, which may be complex.
+    They are computed only once, see ``constant``, and must not be changed in place.
+
+    Args:
+        tensor: Real or complex tensor whose precision and device the result has.
+        function: Function at the top level of a module, which returns an array or numbers.
+        arguments: Hashable arguments of the function.
 
     >>> constant_like(torch.zeros(1).double(), np.hanning, 3)
     tensor([0., 1., 0.], dtype=torch.float64)
@@ -86,11 +106,14 @@ def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any)
 
 
 def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return ``function(*arguments)`` from a cache that drops the least recently used results.
+    """Return ``function(*arguments)``, which is computed once and then comes from a cache.
+
+    The cache drops the least recently used results.
 
     Args:
-        function: A module's function that returns a tensor or another object with ``nbytes``.
-        arguments: Hashable arguments.
+        function: Function at the top level of a module, which returns a tensor or another object
+            with ``nbytes``.
+        arguments: Hashable arguments of the function.
 
     >>> compute_once(np.hanning, 5) is compute_once(np.hanning, 5)
     True
@@ -101,7 +124,12 @@ def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Convert real or complex values to a tensor of ``dtype`` or of its complex counterpart.
+    """Convert real or complex values to a tensor of a precision.
+
+    Args:
+        values: Array, tensor or numbers.
+        dtype: Type of real values, and of the real and imaginary parts of complex ones.
+        device: Device of the tensor.
 
     >>> as_tensor(np.array([1j]), torch.float32, torch.device("cpu")).dtype
     torch.complex64
@@ -135,7 +163,7 @@ class _Cache:
             if key in self._results:
                 self._results.move_to_end(key)
                 return self._results[key]
-        # The lock is open meanwhile, because a function may ask for other constants.
+        # The lock is open meanwhile, because a function may compute other constants.
         result = without_modes(function, *arguments)
         with self._lock:
             self._results[key] = result

@@ -82,6 +82,7 @@ def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
         lambda: hlsim.compensate(SPEECH, "N3", compensator="none"),
         lambda: hlsim.load_audio("missing.wav"),
         lambda: hlsim.listen(),
+        lambda: hlsim.listen(original=SPEECH, sample_rate="16000"),
         lambda: hlsim.listen(stereo=torch.stack([SPEECH, SPEECH])),
     ],
 )
