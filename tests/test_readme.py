@@ -83,6 +83,17 @@ def test_linked_files_exist(page: Path) -> None:
         assert (page.parent / path).is_file(), path
 
 
+def test_links_of_the_listening_page_lead_to_sections() -> None:
+    html = (ROOT / "docs" / "listen" / "index.html").read_text(encoding="utf-8")
+    links = re.findall(r'href="\.\./(guide/[\w-]+)/(?:#([\w-]+))?"', html)
+    assert links
+    for path, section in links:
+        text = (ROOT / "docs" / f"{path}.md").read_text(encoding="utf-8")
+        headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+        anchors = [heading.lower().replace(" ", "-") for heading in headings]
+        assert not section or section in anchors, path
+
+
 @pytest.mark.parametrize("card", sorted((ROOT / "checkpoints").glob("*/README.md")), ids=_named)
 def test_cards_are_short(card: Path) -> None:
     text = card.read_text(encoding="utf-8")

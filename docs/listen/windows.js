@@ -1,4 +1,4 @@
-// The windows in which the simulator processes a signal, as in the guide "ONNX, and windows of a long signal".
+// The windows in which the simulator processes a signal, as in the guide "ONNX and other runtimes".
 
 export const SAMPLE_RATE = 16000;
 export const WINDOW = 20000; // samples that the exported simulator takes
