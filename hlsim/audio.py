@@ -32,17 +32,17 @@ SUBTYPES = {".flac": "PCM_24", ".ogg": "VORBIS"}
 
 
 def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int]:
-    """Read an audio file in any format that libsndfile knows.
+    """Read an audio file in any format that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
 
     A truncated file is read up to its end, with a warning.
 
     Args:
         path: Audio file.
-        any_rate: Accept sample rates up to 384 kHz instead of 48 kHz.
+        any_rate: Whether sample rates up to 384 kHz are accepted instead of 48 kHz.
 
     Returns:
-        The samples at the scale of the file, in float32, with shape (channels, time), and the
-        sample rate in Hz.
+        The samples in float32, (channels, time), where 1.0 is full scale, and the sample rate in
+        Hz.
 
     Raises:
         ValueError: ``path`` is not a path; libsndfile cannot read the file; it is empty, silent, or
@@ -55,10 +55,9 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     """
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"expected the path of an audio file, got {type(path).__name__}")
-    if os.path.isdir(path):
-        raise ValueError(f"{path}: expected an audio file, got a folder")
     if not os.path.isfile(path):
-        raise ValueError(f"{path}: there is no such file")
+        problem = "this is a folder" if os.path.isdir(path) else "there is no such file"
+        raise ValueError(f"{path}: expected an audio file, but {problem}")
     try:
         with soundfile.SoundFile(os.fspath(path)) as file:
             rate = int(file.samplerate)
@@ -89,10 +88,7 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
 
 
 def _read_blocks(file: soundfile.SoundFile) -> NDArray[np.float32]:
-    """Read all samples, even if the header states too many or the codec cannot seek.
-
-    Shape: -> (time, channels).
-    """
+    """Read all samples, (time, channels), even if the header is wrong or the codec cannot seek."""
     blocks = []
     while True:
         block = file.read(SAMPLES_PER_BLOCK, dtype="float32", always_2d=True)
@@ -106,7 +102,7 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
 
     Args:
         path: File to write, whose extension decides the format.
-        waveform: Samples with shape (channels, time) or (time,), where 1.0 is full scale.
+        waveform: Samples, (channels, time) or (time,), where 1.0 is full scale.
         sample_rate: Sample rate in Hz.
 
     Raises:
@@ -149,10 +145,10 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
 
 
 def check_writable(path: str | Path, channels: int, sample_rate: int) -> None:
-    """Raise ValueError unless the format of a file supports its channels and sample rate.
+    """Raise ValueError unless an audio file can have a number of channels and a sample rate.
 
     Args:
-        path: File to write.
+        path: File to write, whose extension decides the format.
         channels: Number of channels.
         sample_rate: Sample rate in Hz.
 
@@ -172,10 +168,10 @@ def check_writable(path: str | Path, channels: int, sample_rate: int) -> None:
 
 
 def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
-    """Encode a signal as a 16-bit flac file, for the players of a page.
+    """Encode a signal as the contents of a 16-bit FLAC file, for audio players on web pages.
 
     Args:
-        waveform: Samples from -1 to 1 with shape (time,).
+        waveform: Samples from -1 to 1, (time,).
         sample_rate: Sample rate in Hz.
 
     Returns:
@@ -203,7 +199,10 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
 
 
 def find_audio(folder: str | Path) -> list[Path]:
-    """Find all audio files below a folder, sorted by path.
+    """Find all audio files in a folder and its subfolders, sorted by path.
+
+    Args:
+        folder: Folder to search.
 
     Raises:
         ValueError: There is no such folder, or no audio in it.
@@ -216,7 +215,13 @@ def find_audio(folder: str | Path) -> list[Path]:
 
 
 def list_files(folder: str | Path) -> tuple[list[Path], list[Path]]:
-    """List the audio files and the other files below a folder, sorted by path, except hidden files.
+    """List the files in a folder and its subfolders, except hidden ones, sorted by path.
+
+    Args:
+        folder: Folder to search.
+
+    Returns:
+        The audio files, and the other files.
 
     Raises:
         ValueError: There is no such folder, or no audio in it.

@@ -1,4 +1,8 @@
-"""Validation of settings, sample rates, waveforms and lengths."""
+"""Validation of settings, sample rates, waveforms and lengths.
+
+Each function raises ValueError with what is wrong, what was expected and, where there is one, the
+fix. Functions that return something return the validated value.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +29,17 @@ MOST_CHANNELS = 8
 """A last dimension of at most this many values behind a longer one holds channels, not time."""
 
 Lengths = Tensor | Sequence[int]
-"""Number of samples of each item, in the shape of the leading dimensions."""
+"""Number of samples of each item of a padded batch, in the shape of the leading dimensions."""
 
 
 def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
-    """Return the shape to which all shapes broadcast.
+    """Return the shape to which tensors of some shapes broadcast.
 
     ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third
     of a second.
+
+    Args:
+        shapes: Shapes of the tensors.
 
     Raises:
         RuntimeError: The shapes do not fit.
@@ -45,7 +52,7 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
 
 
 def check_names(names: Iterable[Any], known: Iterable[str], description: str) -> None:
-    """Raise ValueError unless all names are known.
+    """Raise ValueError unless all names of settings or options are known.
 
     Args:
         names: Names to validate.
@@ -63,12 +70,12 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
 
 
 def check_choice(name: str, value: Any, choice: Any) -> None:
-    """Raise ValueError unless a value is one of the strings of a ``Literal``.
+    """Raise ValueError unless a setting has one of the values of a ``typing.Literal``.
 
     Args:
         name: Name of the setting, for the message.
         value: Value to validate.
-        choice: The ``Literal``.
+        choice: The ``Literal`` with the accepted strings.
 
     >>> from typing import Literal
     >>> check_choice("ears", "better", Literal["mean", "better"])
@@ -81,14 +88,14 @@ def check_choice(name: str, value: Any, choice: Any) -> None:
 def check_number(
     name: str, value: Any, lowest: float, highest: float = math.inf, *, whole: bool = False
 ) -> None:
-    """Raise ValueError unless a value is a finite number in a range that includes both ends.
+    """Raise ValueError unless a setting is a finite number in a range that includes both ends.
 
     Args:
         name: Name of the setting, for the message.
         value: Value to validate.
         lowest: Smallest accepted number.
         highest: Largest accepted number.
-        whole: Accept integers only.
+        whole: Whether only integers are accepted.
 
     >>> check_number("bands", 20, 4, 40, whole=True)
     """
@@ -103,7 +110,7 @@ def check_number(
 
 
 def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[str, float]:
-    """Return weights by name as floats.
+    """Validate weights by name, and return them as floats.
 
     Args:
         weights: Mapping of names to finite numbers of 0 or more, of which one is above 0.
@@ -144,7 +151,7 @@ def is_finite(value: Any) -> bool:
 
 
 def describe(value: Any) -> str:
-    """Return a value as messages show it, with its type unless it is a number.
+    """Return the text of a value for an error message, with its type unless it is a number.
 
     >>> describe(3), describe("3")
     ('3', "'3' (str)")
@@ -153,7 +160,7 @@ def describe(value: Any) -> str:
 
 
 def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHEST_RATE) -> int:
-    """Return a sample rate as an int.
+    """Validate a sample rate, and return it as an int.
 
     Args:
         sample_rate: Sample rate in Hz.
@@ -182,15 +189,13 @@ def check_waveform(
     highest: float = HIGHEST_SAMPLE,
     full_scale_spl: float | None = None,
 ) -> Tensor:
-    """Return a waveform that can be processed.
+    """Validate that a tensor is a waveform, and return it.
 
-    NaN and infinity pass, and make their item's results NaN. The values are not checked on a GPU,
-    because the host would wait for it, nor in a compiled program.
-
-    Shape: (..., time).
+    NaN and infinity pass, and make their item's results NaN. The values are not validated on a GPU,
+    for which the CPU would have to wait, nor in a compiled program.
 
     Args:
-        waveform: Tensor to validate.
+        waveform: Tensor of shape (..., time).
         name: Name of the argument, for messages.
         highest: Largest accepted magnitude of a finite sample.
         full_scale_spl: Level in dB SPL of RMS 1.0. If it is passed, the first waveform of a process
@@ -223,7 +228,9 @@ def check_waveform(
 
 @contextmanager
 def loud_outputs() -> Iterator[None]:
-    """Silence the warning of ``check_waveform`` for outputs of aids, which may be loud on purpose.
+    """Suppress, inside a ``with`` block, the warning of ``check_waveform`` that a signal is loud.
+
+    Outputs of aids may be loud on purpose.
 
     >>> with loud_outputs():
     ...     _ = check_waveform(torch.full((10,), 1000.0), full_scale_spl=94.0)
@@ -256,7 +263,13 @@ def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: floa
 
 
 def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
-    """Raise ValueError unless a value is a floating-point tensor that can have time last.
+    """Raise ValueError unless a value is a floating-point tensor whose last dimension can be time.
+
+    A last dimension of up to eight values behind a longer one holds channels.
+
+    Args:
+        waveform: Value to validate.
+        name: Name of the argument, for messages.
 
     >>> try:
     ...     check_time_last(torch.zeros(16000, 2))
@@ -264,15 +277,11 @@ def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
     ...     print(error)
     expected waveform with time last, got shape (16000, 2); transpose it: x.T
     """
-    if not isinstance(waveform, Tensor):
+    if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
+        kind = getattr(waveform, "dtype", None) or type(waveform).__name__
+        fix = "; divide 16-bit samples by 32768" if kind == torch.int16 else ""
         raise ValueError(
-            f"expected {name} to be a floating-point tensor with time last, "
-            f"got {type(waveform).__name__}"
-        )
-    if not waveform.is_floating_point():
-        fix = "; divide 16-bit samples by 32768" if waveform.dtype == torch.int16 else ""
-        raise ValueError(
-            f"expected {name} to be a floating-point tensor, got {waveform.dtype}{fix}"
+            f"expected {name} to be a floating-point tensor with time last, got {kind}{fix}"
         )
     shape = tuple(waveform.shape)
     if len(shape) > 1 and shape[-1] <= MOST_CHANNELS < shape[-2]:
@@ -281,7 +290,7 @@ def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
 
 
 def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
-    """Return the number of samples of each item as integers on the CPU.
+    """Validate the lengths of the items of a padded batch, and return them in samples on the CPU.
 
     Args:
         lengths: Whole numbers of samples from 1 to ``time``, or shares of ``time`` above 0 and up
@@ -289,7 +298,8 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
             (batch,) also serves a batch of shape (batch, 1, time).
         shape: Shape of the batch, (..., time).
 
-    Returns: (...), int64.
+    Returns:
+        Number of samples of each item, (...), int64.
 
     Raises:
         ValueError: The numbers, their type or their shape are not as described.
@@ -298,21 +308,21 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
     tensor([ 50, 100])
     """
     *items, time = shape
-    expected = f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}"
     try:
         ends = torch.as_tensor(lengths, device="cpu")
     except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"{expected}, got {type(lengths).__name__}") from None
+        ends = torch.empty(0)
     if ends.is_floating_point() and bool(((ends > 0.0) & (ends <= 1.0)).all()):
         ends = (ends.double() * time).round().long().clamp_min(1)
     if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
         ends = ends.unsqueeze(-1)
-    if ends.is_floating_point() or ends.is_complex() or ends.dtype == torch.bool:
-        raise ValueError(f"{expected}, got {ends.dtype}")
-    if ends.shape != shape[:-1]:
-        raise ValueError(f"{expected}, got shape {tuple(ends.shape)}")
-    if not bool(((ends >= 1) & (ends <= time)).all()):
-        raise ValueError(f"{expected}, got {int(ends.min())} to {int(ends.max())}")
+    is_whole = not (ends.is_floating_point() or ends.is_complex() or ends.dtype == torch.bool)
+    has_shape = ends.shape == shape[:-1]
+    if not is_whole or not has_shape or not bool(((ends >= 1) & (ends <= time)).all()):
+        raise ValueError(
+            f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}, or "
+            f"shares from 0 to 1, got {describe(lengths)}"
+        )
     return ends.long()
 
 
@@ -320,6 +330,10 @@ def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
     """Replace the samples after the end of each item by zeros.
 
     Shape: (..., time), (...) -> (..., time).
+
+    Args:
+        waveform: Padded signals.
+        ends: Number of samples of each item.
 
     >>> silence_after(torch.ones(2, 3), torch.tensor([1, 2]))
     tensor([[1., 0., 0.],

@@ -1,4 +1,4 @@
-"""Optional dependencies, and an error that shows the command to install them."""
+"""Optional dependencies of hlsim, its *extras*, and an error that says how to install them."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ class MissingExtraError(ImportError):
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or raise an error that shows how to install it.
+    """Import and return an optional module, or raise an error that says how to install it.
 
     Args:
         module: Dotted module name, e.g. ``"matplotlib.figure"``.
@@ -39,9 +39,10 @@ def require(module: str, extra: str) -> ModuleType:
 
 
 def is_installed(module: str) -> bool:
-    """Return whether a top-level module is installed, without importing it.
+    """Return whether a module is installed, without importing it, which may take seconds.
 
-    An import may take seconds.
+    Args:
+        module: Name of a top-level module.
 
     >>> is_installed("json")
     True
@@ -50,7 +51,10 @@ def is_installed(module: str) -> bool:
 
 
 def install_command(extra: str) -> str:
-    """Build the shell command that installs one of hlsim's extras.
+    """Return the shell command that installs one of hlsim's extras.
+
+    Args:
+        extra: Name of the extra, e.g. ``"eval"``.
 
     >>> install_command("eval")
     "pip install 'hlsim[eval]'"

@@ -1,4 +1,4 @@
-"""Atomic writing and hashing of files, and reading of tables."""
+"""Writing of files all at once, hashes of files, and reading of tables."""
 
 from __future__ import annotations
 
@@ -23,12 +23,16 @@ WRITTEN_EXTENSIONS = (".wav", ".flac", ".ogg")
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path for a file or folder, which replaces ``path`` when the block ends.
+    """Write a file or folder all at once: a ``with`` block writes to a temporary path instead.
 
-    If the block raises, ``path`` stays as it was.
+    When the block ends, the temporary file or folder replaces ``path``. If the block raises,
+    ``path`` stays as it was.
 
     Args:
         path: File or folder to write.
+
+    Yields:
+        The temporary path.
 
     Raises:
         ValueError: The path cannot be written, for example because the disk is full.
@@ -79,7 +83,7 @@ def write_atomically(path: str | Path, data: str | bytes) -> None:
 
 
 def resolve_links(path: str | Path) -> Path:
-    """Return the absolute path without links.
+    """Return a path as an absolute path with all symbolic links replaced by what they point to.
 
     Unlike ``Path.resolve`` before Python 3.13, this raises nothing for a link to itself.
 
@@ -90,7 +94,10 @@ def resolve_links(path: str | Path) -> Path:
 
 
 def check_extension(path: str | Path) -> str:
-    """Return the extension of an audio file to write, in lower case.
+    """Validate the extension of an audio file to write, and return it in lower case.
+
+    Args:
+        path: File to write.
 
     Raises:
         ValueError: The extension is not in ``WRITTEN_EXTENSIONS``.
@@ -105,7 +112,7 @@ def check_extension(path: str | Path) -> str:
 
 
 def sha256(path: Path) -> str:
-    """Compute the SHA-256 of a file, in hexadecimal.
+    """Compute the SHA-256 hash of the contents of a file, in hexadecimal.
 
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_atomically(f"{folder}/empty", "")
@@ -117,15 +124,15 @@ def sha256(path: Path) -> str:
 
 
 def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str]]]:
-    """Read a table with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows' cp1252.
+    """Read a CSV file with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
         path: CSV file, whose first line names the columns.
         contents: Description of the contents for error messages, such as "the manifest".
 
     Returns:
-        The number of its last line, and the values by column without surrounding blanks, for each
-        row. Missing values are empty.
+        A list with two members per row: the number of its last line, and its values by column,
+        without surrounding blanks. Missing values are empty.
 
     Raises:
         ValueError: The file cannot be read, a column appears twice, or a row has too many values.

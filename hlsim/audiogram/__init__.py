@@ -1,4 +1,10 @@
-"""Hearing thresholds of ears: as values, as tensors, in tables and as plots."""
+"""Hearing thresholds of ears: as values, as tensors, in tables and as plots.
+
+A threshold is the level in dB HL (relative to normal hearing) from which an ear hears a tone of a
+frequency; a higher threshold is a greater loss. An *ear* is one audiogram, a *listener* has two.
+Wherever an ear is expected, an ``Audiogram``, a name such as ``"N3"``, eight thresholds or a
+dictionary of frequencies to thresholds will do.
+"""
 
 from hlsim.audiogram.scale import (
     FREQUENCIES,

@@ -17,7 +17,7 @@ EarLike = Audiogram | str | Sequence[float] | NDArray[Any] | Tensor | Mapping[fl
 
 
 def as_audiogram(ear: EarLike) -> Audiogram:
-    """Return the audiogram of one ear.
+    """Convert the description of one ear into an ``Audiogram``.
 
     Args:
         ear: An ``Audiogram`` of hlsim or pyclarity; the name of a standard audiogram, such as
@@ -44,7 +44,10 @@ def as_audiogram(ear: EarLike) -> Audiogram:
 
 
 def find_audiogram(ear: Any) -> Audiogram | None:
-    """Return the audiogram of one ear, or ``None`` if the value does not describe one ear.
+    """Convert a value as ``as_audiogram`` does, or return ``None`` if it does not describe one ear.
+
+    Raises:
+        ValueError: The value describes one ear, but its thresholds are not valid.
 
     >>> find_audiogram("n3"), find_audiogram(3)
     (Audiogram('N3'), None)
@@ -65,7 +68,7 @@ def find_audiogram(ear: Any) -> Audiogram | None:
 
 
 def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
-    """Return the audiogram of a mapping, in any order of the frequencies."""
+    """Convert a mapping of frequencies, in any order, to thresholds."""
     if "levels" in levels:
         return Audiogram.from_dict(levels)
     try:

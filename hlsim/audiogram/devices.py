@@ -1,39 +1,36 @@
-"""Copies of ears on other devices, which are made once so that the host never waits for the device.
+"""Tensors of thresholds on a GPU and on the CPU, copied so that the CPU rarely waits for the GPU.
 
-Moving an ear to a GPU, or reading its values back, would make the host wait until the GPU has done
-everything that was queued before. Both directions are remembered for as long as the ear lives and
-nobody writes into it.
+Copying a tensor to a GPU, or back, makes the CPU (the *host*) wait until the GPU has done
+everything that was queued before. Therefore each copy is made once. It is remembered, in both
+directions, for as long as the original tensor lives and nobody writes into it.
 """
 
 from __future__ import annotations
 
-import weakref
-
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+_HOST = torch.device("cpu")
+
+_COPIES = WeakTensorKeyDictionary()
+"""Copies by original and device, each with the number of changes of the original when it was made.
+
+They are forgotten with their original.
+"""
 
 
-class _Copies:
-    """Copies of tensors, by tensor and device. A copy is forgotten with its tensor."""
+def _find_copy(tensor: Tensor, device: torch.device) -> Tensor | None:
+    """Return the copy on a device, or None if there is none or the original has changed."""
+    if not _is_remembered(tensor):
+        return None
+    version, copy = _COPIES.get(tensor, {}).get(device, (None, None))
+    return copy if version == tensor._version else None
 
-    def __init__(self) -> None:
-        self._entries: dict[tuple[int, torch.device], tuple[weakref.ref[Tensor], int, Tensor]] = {}
 
-    def find(self, tensor: Tensor, device: torch.device) -> Tensor | None:
-        """Return the copy on a device, or None if there is none or the tensor has changed since."""
-        if not _is_remembered(tensor):
-            return None
-        owner, version, copy = self._entries.get((id(tensor), device), (None, 0, None))
-        if owner is None or owner() is not tensor or version != tensor._version:
-            return None
-        return copy
-
-    def add(self, tensor: Tensor, copy: Tensor) -> None:
-        if not _is_remembered(tensor):
-            return
-        key = id(tensor), copy.device
-        owner = weakref.ref(tensor, lambda _: self._entries.pop(key, None))
-        self._entries[key] = owner, tensor._version, copy
+def _add_copy(tensor: Tensor, copy: Tensor) -> None:
+    if _is_remembered(tensor):
+        _COPIES.setdefault(tensor, {})[copy.device] = tensor._version, copy
 
 
 def _is_remembered(tensor: Tensor) -> bool:
@@ -41,36 +38,35 @@ def _is_remembered(tensor: Tensor) -> bool:
     return not (torch.compiler.is_compiling() or tensor.is_inference())
 
 
-_COPIES = _Copies()
-_HOST = torch.device("cpu")
-
-
 def on_device(levels: Tensor, device: torch.device) -> Tensor:
-    """Return thresholds on a device, without making the host wait.
+    """Return thresholds on a device, without making the CPU wait for it.
 
-    The copy of thresholds from the CPU is stored, so that ``on_host`` finds their values.
+    If they come from the CPU, the original is remembered, so that ``on_host`` need not wait either.
 
-    Shape: any -> the same.
+    Args:
+        levels: Thresholds of any shape.
+        device: Device of the result.
 
     >>> on_device(torch.zeros(8), torch.device("cpu")).device
     device(type='cpu')
     """
     if levels.device == device:
         return levels
-    copy = None if levels.requires_grad else _COPIES.find(levels, device)
+    copy = None if levels.requires_grad else _find_copy(levels, device)
     if copy is None:
         copy = levels.to(device, non_blocking=device != _HOST)
         if levels.device == _HOST and not levels.requires_grad:
-            _COPIES.add(levels, copy)
+            _add_copy(levels, copy)
     if levels.device == _HOST:
-        _COPIES.add(copy, levels.detach())
+        _add_copy(copy, levels.detach())
     return copy
 
 
 def on_host(levels: Tensor) -> Tensor:
-    """Return thresholds on the CPU. The host waits for the device unless a copy is stored.
+    """Return thresholds on the CPU, which waits for another device unless it knows their values.
 
-    Shape: any -> the same.
+    Args:
+        levels: Thresholds of any shape, on any device.
 
     >>> on_host(torch.zeros(8)).device
     device(type='cpu')
@@ -80,14 +76,17 @@ def on_host(levels: Tensor) -> Tensor:
     copy = known_on_host(levels)
     if copy is None:
         copy = levels.detach().cpu()
-        _COPIES.add(levels, copy)
+        _add_copy(levels, copy)
     return copy
 
 
 def known_on_host(levels: Tensor) -> Tensor | None:
-    """Return thresholds on the CPU if a copy is stored, else None.
+    """Return thresholds on the CPU if their values are known there, else None.
+
+    Args:
+        levels: Thresholds of any shape, on any device.
 
     >>> known_on_host(torch.zeros(2))
     tensor([0., 0.])
     """
-    return levels.detach() if levels.device == _HOST else _COPIES.find(levels, _HOST)
+    return levels.detach() if levels.device == _HOST else _find_copy(levels, _HOST)

@@ -1,4 +1,4 @@
-"""A listener's two ears, as a value and in files."""
+"""Listeners, people with a left and a right ear."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ EAR_NAMES: dict[str, EarName] = {
 
 @dataclass(frozen=True, repr=False)
 class Listener:
-    """Two audiograms, for waveforms ``(..., 2, time)`` with the left ear first.
+    """The audiograms of both ears of a person, for waveforms (..., 2, time) with the left ear
+    first.
 
-    A listener may be passed wherever an audiogram may. Its thresholds have the shape (2, 8), those
-    of a sequence with one listener per item (items, 2, 8). ``haspi`` and ``hasqi`` return one score
-    per ear; ``.amax(-1)`` is that of the better ear.
+    A listener may be passed wherever an audiogram may, and so may a sequence with one listener per
+    item. ``haspi`` and ``hasqi`` return one score per ear; ``.amax(-1)`` is that of the better ear.
 
     Args:
-        left: Audiogram of the left ear, as ``as_audiogram`` takes it, or ``None`` if it is unknown.
-            Losses and the metrics ``HASPI`` and ``HASQI`` leave an unknown ear out; everything else
-            needs both ears.
+        left: Audiogram of the left ear, in any form in which an ear is accepted (a name such as
+            ``"N3"``, thresholds, a dictionary), or ``None`` if it is unknown. Losses and the
+            metrics ``HASPI`` and ``HASQI`` leave an unknown ear out; everything else needs both
+            ears.
         right: Audiogram of the right ear, likewise.
 
     Raises:
@@ -64,7 +65,7 @@ class Listener:
         return f"Listener({', '.join(ears)})"
 
     def ears(self) -> dict[EarName, Audiogram]:
-        """Return the ears that are known, by name."""
+        """Return the audiograms of the known ears by name, ``"left"`` and ``"right"``."""
         ears = zip(EARS, (self.left, self.right), strict=True)
         return {name: ear for name, ear in ears if ear is not None}
 
@@ -73,13 +74,24 @@ class Listener:
         return draw_png(self.plot)
 
     def plot(self, axes: Any = None, **style: Any) -> Any:
-        """Draw both ears with their pure-tone averages, as ``Audiogram.plot(ear=...)`` does."""
+        """Draw the audiograms of both ears, the left one blue and the right one red.
+
+        Args:
+            axes: Matplotlib axes to draw on; by default new ones.
+            style: Matplotlib's properties of the lines, such as ``linewidth=2``.
+
+        Returns:
+            The axes.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed.
+        """
         for name, ear in self.ears().items():
             axes = ear.plot(axes, ear=name, **style)
         return axes
 
     def to_rows(self, name: str) -> list[dict[str, str]]:
-        """Return one row of a CSV file per ear, as ``read_listeners`` reads them.
+        """Return one row of a CSV file per known ear, in the form that ``read_listeners`` reads.
 
         Args:
             name: Name of the listener in the file.
@@ -89,7 +101,10 @@ class Listener:
 
     @classmethod
     def from_clarity(cls, source: Any) -> Listener:
-        """Return pyclarity's ``Listener``, or an entry of Clarity's ``listeners.json``.
+        """Convert a listener of pyclarity.
+
+        Args:
+            source: pyclarity's ``Listener``, or an entry of Clarity's ``listeners.json``.
 
         Raises:
             ValueError: The source is neither.

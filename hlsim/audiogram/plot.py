@@ -1,4 +1,4 @@
-"""Audiograms drawn as audiologists do."""
+"""Audiograms drawn as audiologists draw them: frequency to the right, hearing loss downwards."""
 
 from __future__ import annotations
 
@@ -33,7 +33,20 @@ def plot_thresholds(
     ear: EarName | None = None,
     **style: Any,
 ) -> Any:
-    """Draw thresholds as ``Audiogram.plot`` does.
+    """Draw an audiogram as audiologists do, with bands for mild, moderate and severe losses.
+
+    Args:
+        frequencies: Frequencies in Hz.
+        levels: Threshold at each frequency in dB HL.
+        axes: Matplotlib axes to draw on, which may show other ears; by default new ones.
+        ear: ``"left"`` draws blue crosses, ``"right"`` red circles, both with a legend.
+        style: Matplotlib's properties of the line, such as ``color="tab:green"``.
+
+    Returns:
+        The axes.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
 
     >>> axes = plot_thresholds([500, 1000], [20, 30], ear="left", label="left")
     >>> axes.get_xscale()
@@ -50,7 +63,10 @@ def plot_thresholds(
 
 
 def draw_png(plot: Callable[[Any], Any]) -> bytes | None:
-    """Return a PNG of what a function draws on axes, or ``None`` if matplotlib is not installed.
+    """Draw a picture, and return it as PNG; return ``None`` if matplotlib is not installed.
+
+    Args:
+        plot: Function that draws on matplotlib's axes.
 
     >>> draw_png(lambda axes: axes.plot([0, 1]))[1:4]
     b'PNG'
@@ -67,7 +83,11 @@ def draw_png(plot: Callable[[Any], Any]) -> bytes | None:
 
 
 def frequency_axis(axes: Any, ticks: Iterable[float]) -> None:
-    """Give axes a logarithmic frequency axis in kHz with ticks at frequencies in Hz.
+    """Make the horizontal axis of a plot a logarithmic axis of frequencies, labelled in kHz.
+
+    Args:
+        axes: Matplotlib axes.
+        ticks: Frequencies to label, in Hz.
 
     >>> from matplotlib.figure import Figure
     >>> frequency_axis(Figure().subplots(), [250, 1000, 4000])
@@ -80,7 +100,7 @@ def frequency_axis(axes: Any, ticks: Iterable[float]) -> None:
 
 
 def _prepare(axes: Any) -> None:
-    """Draw the axes and the bands of the degrees of loss."""
+    """Draw the axes, and bands for the severities of loss."""
     bounds = pairwise((LOWEST_LEVEL, *SEVERITY_LIMITS, HIGHEST_LEVEL))
     label = {"transform": axes.get_yaxis_transform(), "ha": "left", "va": "center"}
     for index, (low, high) in enumerate(bounds):

@@ -1,4 +1,4 @@
-"""Frequencies and ranges of thresholds, degrees of hearing loss, and standard audiograms."""
+"""Frequencies and ranges of thresholds, severities of hearing loss, and standard audiograms."""
 
 from typing import Literal
 
@@ -11,10 +11,10 @@ LOWEST_LEVEL, HIGHEST_LEVEL = -10.0, 120.0
 """Range of the thresholds of an audiogram in dB HL."""
 
 HIGHEST_SIMULATED = 100.0
-"""Highest threshold that a simulator takes, in dB HL. MSBG is singular at 105 dB HL."""
+"""Highest threshold in dB HL that a simulator accepts. MSBG divides by 0 at 105 dB HL."""
 
 SEVERITIES = ("none", "mild", "moderate", "severe")
-"""MSBG's degrees of loss, by the mean threshold from 2 to 8 kHz."""
+"""MSBG's severities of loss, by the mean threshold from 2 to 8 kHz."""
 
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
 """Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""

@@ -16,18 +16,19 @@ from hlsim.files import read_table
 def read_audiograms(
     path: str | Path, *, simulated: bool = False
 ) -> list[tuple[dict[str, str], Audiogram]]:
-    """Read the audiograms of a CSV file.
+    """Read the audiograms of a CSV file with one row per ear.
 
-    The table may have commas, semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
-    ``Audiogram.from_row`` describes its columns.
+    A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``.25k``
+    (``Audiogram.from_row`` describes the details); other columns may have any name. The table may
+    have commas, semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
         path: The file, or ``"standard"`` for Bisgaard's audiograms N1 to N7 and S1 to S3.
-        simulated: Reject levels above 100 dB HL, which simulators do not take, and leave out N7 of
-            the standard audiograms, which has them.
+        simulated: Whether the audiograms are for a simulator. Then thresholds above 100 dB HL are
+            rejected, and N7, which has them, is left out of the standard audiograms.
 
     Returns:
-        For each row, its texts by column and its audiogram.
+        A list with two members per row: the texts of the row by column, and its audiogram.
 
     Raises:
         ValueError: The file cannot be read, has no rows, or a row is not an audiogram. The message
@@ -51,7 +52,16 @@ def read_audiograms(
 
 
 def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
-    """Read the rows of a table of audiograms, with the number of the line of each.
+    """Read the rows of a table of audiograms.
+
+    Args:
+        path: CSV file.
+
+    Returns:
+        A list with two members per row: the number of its line, and its texts by column.
+
+    Raises:
+        ValueError: The file cannot be read or has no rows.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -75,7 +85,7 @@ def read_listeners(path: str | Path, names: Collection[str] | None = None) -> di
 
     Args:
         path: The file. Its name ends in ``.json`` if it is Clarity's.
-        names: Names of the listeners to read, by default all. The others are not validated.
+        names: Names of the listeners to read, by default all. Other listeners are not validated.
 
     Returns:
         Listeners by name.

@@ -1,4 +1,4 @@
-"""Thresholds as tensors: converted, validated, stored, and interpolated between frequencies."""
+"""Thresholds as tensors, at eight frequencies: converted, validated, stored and interpolated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hlsim.torchtools import constant_like
 
 AudiogramLike = EarLike | Listener | Sequence[EarLike] | Sequence[Listener]
 """One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
-item, or a tensor or an array of thresholds in dB HL, ``(..., 8)``."""
+item, or a tensor or an array of thresholds in dB HL at the eight ``FREQUENCIES``, (..., 8)."""
 
 
 def as_thresholds(
@@ -31,25 +31,27 @@ def as_thresholds(
     consumer: str = "a simulator",
     allow_missing: bool = False,
 ) -> Tensor:
-    """Return the thresholds of one or more ears at the eight ``FREQUENCIES``.
+    """Convert any description of one or more ears into a tensor of thresholds in dB HL.
 
-    An ``Audiogram`` with other frequencies is interpolated over log frequency
+    The last dimension holds the thresholds at 250, 500, 1000, 2000, 3000, 4000, 6000 and 8000 Hz,
+    the ``FREQUENCIES``. An ``Audiogram`` with other frequencies is interpolated over log frequency
     (``Audiogram.thresholds``). In a list of tensors, (8,) tensors are one ear each, and eight
     (batch,) tensors are one frequency each, as torch's ``default_collate`` stacks them.
 
-    Reading a tensor on a GPU would make the host wait for the GPU. The values of such a tensor are
-    not validated on the host: an ear with a level out of range becomes NaN, and so do the outputs
-    that are computed with it.
+    A tensor on a GPU is not validated, because the CPU would have to wait for its values: instead,
+    an ear with a level out of range becomes NaN, and so do the outputs that are computed with it.
 
     Args:
-        audiogram: One or more ears.
+        audiogram: One or more ears: an ``Audiogram``, a name such as ``"N3"``, a ``Listener``, a
+            sequence of these, a tensor or an array.
         highest: Highest level allowed, in dB HL.
-        consumer: Name of the model or metric that takes the thresholds, for messages.
-        allow_missing: Accept listeners with one ear. The thresholds of the other ear are NaN.
+        consumer: Name of the model or metric that needs the thresholds, for messages.
+        allow_missing: Whether listeners with one ear are accepted. The thresholds of the other ear
+            are NaN.
 
     Returns:
         Thresholds in dB HL: (8,) for one ear, (2, 8) for a ``Listener``, (batch, 8) and
-        (batch, 2, 8) for sequences of them, and a tensor itself.
+        (batch, 2, 8) for sequences of them. A tensor is returned as it is.
 
     Raises:
         ValueError: The value does not describe ears, an ear is missing, a tensor does not hold
@@ -60,7 +62,7 @@ def as_thresholds(
     """
     if isinstance(audiogram, np.ndarray) and audiogram.ndim > 1:
         audiogram = torch.tensor(audiogram.astype(np.float32))
-    listed = list_ears(audiogram)
+    listed = _list_ears(audiogram)
     if listed is None:
         return _check_tensor(_stack(audiogram), highest, consumer)
     ears, shape = listed
@@ -78,14 +80,11 @@ def as_thresholds(
     return torch.tensor(rows).reshape(*shape, len(FREQUENCIES))
 
 
-def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] | None:
+def _list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] | None:
     """Return the audiograms of a value, and the leading shape of their thresholds.
 
     The missing ear of a listener is ``None``. The result is ``None`` for a tensor, a sequence of
     tensors, and a value that does not describe ears.
-
-    >>> list_ears(["N1", "N3"])
-    ([Audiogram('N1'), Audiogram('N3')], (2,))
     """
     if isinstance(audiogram, Tensor):
         return None
@@ -99,7 +98,7 @@ def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] 
     ears: list[Audiogram | None] = []
     shapes = set()
     for part in audiogram:
-        listed = list_ears(part)
+        listed = _list_ears(part)
         if listed is None:
             return None
         ears += listed[0]
@@ -108,11 +107,16 @@ def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] 
 
 
 def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | None]:
-    """Return the ears that were not measured at the eight ``FREQUENCIES``, for the exact MSBG.
+    """Find the ears that were not measured at the eight ``FREQUENCIES``, for the exact MSBG.
+
+    The exact MSBG interpolates thresholds between the frequencies at which they were measured.
+
+    Args:
+        audiogram: One or more ears, or None.
 
     Returns:
-        One audiogram per ear, in the order of ``as_thresholds``, with ``None`` for an ear at the
-        eight frequencies. The list is empty if all ears are at the eight frequencies.
+        For each ear its audiogram, or ``None`` if it was measured at the eight frequencies. The
+        list is empty if all ears were.
 
     Raises:
         ValueError: A level is above 100 dB HL, at any frequency.
@@ -120,7 +124,7 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
     >>> ears_on_other_grids(["N3", {500: 20}])
     [None, Audiogram({500: 20})]
     """
-    ears, _ = list_ears(audiogram) or ([], ())
+    ears, _ = _list_ears(audiogram) or ([], ())
     grids = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
     for ear in grids:
         if ear is not None:
@@ -129,10 +133,14 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
 
 
 def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor | None:
-    """Return ``as_thresholds`` for a module to store.
+    """Convert ears into thresholds, (..., 8) in dB HL, for a module to store.
 
     The result is a copy, because the caller may write into a tensor later. A tensor that requires a
-    gradient stays itself.
+    gradient is returned as it is, so that it can be trained.
+
+    Args:
+        audiogram: One or more ears; None gives None.
+        options: ``highest``, ``consumer`` and ``allow_missing`` of ``as_thresholds``.
 
     >>> store_thresholds("N3").shape
     torch.Size([8])
@@ -154,18 +162,21 @@ def resolve_thresholds(
     two_ears: bool = False,
     **options: Any,
 ) -> Tensor:
-    """Return the thresholds of a call, or else the stored ones, on the waveform's device.
+    """Return the thresholds with which a module processes a waveform, on its device.
+
+    They are those of the ears that were passed with the call, or else those that the module has
+    stored.
 
     Args:
-        stored: Thresholds of the module, ``(..., 8)``.
-        audiogram: Ears of the call.
-        waveform: Signals, ``(..., time)``.
+        stored: Thresholds that the module has stored, (..., 8), or None.
+        audiogram: Ears that were passed with the call, or None.
+        waveform: Signals, (..., time).
         two_ears: Whether the stored thresholds are those of listeners.
-        options: Keyword arguments of ``as_thresholds``.
+        options: ``highest``, ``consumer`` and ``allow_missing`` of ``as_thresholds``.
 
     Returns:
-        Thresholds that broadcast with the leading dimensions of the waveform, ``(..., 8)``; one ear
-        per item for (batch, 1, time) and (batch, 8).
+        Thresholds in dB HL that broadcast with the leading dimensions of the waveform, (..., 8).
+        For mono items, (batch, 1, time), and one ear per item they are (batch, 1, 8).
 
     Raises:
         ValueError: There are no ears, the shapes do not broadcast, or the waveform of a listener is
@@ -194,7 +205,13 @@ def resolve_thresholds(
 
 
 def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
-    """Add a channel dimension if the items are mono. Shape: (batch, 8) -> (batch, 1, 8).
+    """Add a channel dimension to thresholds if signals have one channel and each item has one ear.
+
+    Shape: (batch, 8) -> (batch, 1, 8) for signals of shape (batch, 1, time), else unchanged.
+
+    Args:
+        thresholds: Thresholds in dB HL.
+        shape: Shape of the signals.
 
     >>> unsqueeze_mono(torch.zeros(2, 8), torch.Size([2, 1, 16000])).shape
     torch.Size([2, 1, 8])
@@ -204,7 +221,7 @@ def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:
-    """Return whether a value is a ``Listener`` or a sequence of listeners.
+    """Return whether ears are those of listeners: a ``Listener`` or a sequence of listeners.
 
     >>> has_listeners(Listener("N1", "N3")), has_listeners("N1")
     (True, False)
@@ -227,9 +244,15 @@ def check_two_channels(waveform: Tensor) -> None:
 
 
 def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
-    """Interpolate levels at the eight frequencies, linearly in Hz and flat beyond them.
+    """Interpolate thresholds at the eight ``FREQUENCIES`` to other ones, linearly in Hz.
+
+    Beyond the lowest and the highest of the eight frequencies, they stay constant.
 
     Shape: (..., 8) -> (..., frequencies).
+
+    Args:
+        levels: Thresholds in dB HL.
+        frequencies: Frequencies of the result in Hz.
 
     >>> interpolate(torch.arange(8.0), (375.0, 9000.0))
     tensor([0.5000, 7.0000])
@@ -242,7 +265,15 @@ def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
 def interpolation_weights(
     frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
 ) -> NDArray[np.float64]:
-    """Return the matrix that interpolates levels on a grid linearly, (grid, frequencies).
+    """Compute the matrix that interpolates levels linearly in Hz, and keeps them constant beyond.
+
+    Args:
+        frequencies: Frequencies of the result in Hz.
+        grid: Frequencies of the levels in Hz.
+
+    Returns:
+        Weights, (grid, frequencies). The product of levels on the grid and this matrix are the
+        levels at the frequencies.
 
     >>> interpolation_weights((375.0,)).T
     array([[0.5, 0.5, 0. , 0. , 0. , 0. , 0. , 0. ]])
@@ -286,7 +317,8 @@ def _check_tensor(levels: Any, highest: float, consumer: str) -> Tensor:
     if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
         raise ValueError(
             f"expected an audiogram tensor of shape (..., 8), at {join_numbers(FREQUENCIES)} Hz, "
-            f"got {tuple(levels.shape)}; pass an Audiogram for other frequencies"
+            f"got {tuple(levels.shape)}; for other frequencies pass a dictionary of each frequency "
+            "in Hz to its threshold, such as {500: 20, 4000: 50}"
         )
     if not levels.is_floating_point():
         levels = levels.float()

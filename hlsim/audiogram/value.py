@@ -1,4 +1,4 @@
-"""Hearing thresholds of one ear: validated, converted, and classified by severity of the loss."""
+"""The audiogram of one ear: validated, converted, and classified by severity of the loss."""
 
 from __future__ import annotations
 
@@ -39,16 +39,18 @@ _UNMEASURED = ("", "na", "n/a", "null", "none", "nan")
 class Audiogram:
     """Hearing thresholds of one ear in dB HL, at any frequencies.
 
+    The exact MSBG interpolates the thresholds linearly in Hz between the frequencies at which they
+    were measured, as pyclarity does. Everything else uses ``thresholds``, the levels at eight
+    frequencies. Simulators accept thresholds up to 100 dB HL.
+
     Checkpoints that hold audiograms, say as hyperparameters, are loaded with ``weights_only=True``
     inside ``torch.serialization.safe_globals([Audiogram])``.
-
-    The frequencies are kept as they are given. The exact MSBG interpolates the thresholds linearly
-    in Hz, as pyclarity does. Everything else takes ``thresholds``, the levels at eight frequencies.
 
     Args:
         levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or
             NaN was not measured, and is left out.
-        frequencies: Ascending frequencies in Hz, by default the eight ``FREQUENCIES``.
+        frequencies: Ascending frequencies in Hz; by default 250, 500, 1000, 2000, 3000, 4000, 6000
+            and 8000, the ``FREQUENCIES``.
 
     Raises:
         ValueError: The numbers of levels and frequencies differ, no level was measured, one is out
@@ -69,20 +71,18 @@ class Audiogram:
         if len(levels) != len(frequencies):
             raise ValueError(
                 f"expected one level per frequency, got {len(levels)} levels for "
-                f"{len(frequencies)} frequencies"
+                f"{len(frequencies)} frequencies; for other frequencies pass a dictionary of each "
+                "frequency in Hz to its threshold, such as {500: 20, 4000: 50}"
             )
         is_measured = ~np.isnan(levels)
         levels, frequencies = levels[is_measured], frequencies[is_measured]
         check_range(levels, HIGHEST_LEVEL, "an audiogram")
-        if not len(levels) or not frequencies[0] > 0 or not (np.diff(frequencies) > 0).all():
+        ascending = len(levels) > 0 and frequencies[0] > 0 and (np.diff(frequencies) > 0).all()
+        if not ascending or frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:
             raise ValueError(
-                "expected measured levels at positive, ascending frequencies in Hz, got levels at "
-                f"{join_numbers(frequencies)} Hz"
-            )
-        if frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:
-            raise ValueError(
-                f"expected frequencies in Hz with one from {FREQUENCIES[0]:g} to "
-                f"{FREQUENCIES[-1]:g}, got {join_numbers(frequencies)}; multiply kHz by 1000"
+                "expected levels at ascending frequencies in Hz that overlap the range from "
+                f"{FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g}, got levels at "
+                f"{join_numbers(frequencies)} Hz; sort the frequencies, or multiply kHz by 1000"
             )
         object.__setattr__(self, "levels", tuple(levels.tolist()))
         object.__setattr__(self, "frequencies", tuple(frequencies.tolist()))
@@ -91,9 +91,14 @@ class Audiogram:
     def standard(cls, name: str) -> Audiogram:
         """Return a standard audiogram.
 
+        N1 to N7 are flat or moderately sloping losses from very mild to profound, S1 to S3 are
+        steep. Simulators do not accept N7, which has thresholds above 100 dB HL.
+
+        Source: Bisgaard, Vlaming and Dahlquist (2010).
+
         Args:
-            name: ``"N1"`` to ``"N7"`` or ``"S1"`` to ``"S3"`` (Bisgaard et al. 2010), or ``"NH"``
-                for 0 dB HL at all frequencies, in upper or lower case.
+            name: ``"N1"`` to ``"N7"``, ``"S1"`` to ``"S3"``, or ``"NH"`` for 0 dB HL at all
+                frequencies, in upper or lower case.
 
         Raises:
             ValueError: There is no standard audiogram of this name.
@@ -106,15 +111,18 @@ class Audiogram:
         key = str(name).upper()
         if key not in STANDARD:
             names = ", ".join(STANDARD)
-            raise ValueError(f"unknown standard audiogram {name!r}; expected one of {names}")
+            raise ValueError(
+                f"unknown standard audiogram {name!r}; expected one of {names} (simulators accept "
+                "all but N7)"
+            )
         return cls(tuple(float(level) for level in STANDARD[key]))
 
     @classmethod
     def from_csv(cls, path: str | Path, name: str | None = None) -> Audiogram:
-        """Read one ear from a CSV file.
+        """Read the audiogram of one ear from a CSV file.
 
         Args:
-            path: A table as for ``read_audiograms``.
+            path: Table with one row per ear, and columns such as ``hl_250`` or ``250 Hz``.
             name: Text in any column of the row to read, such as ``"N3"``. It may be left out if
                 the table has one row. Other rows are not validated.
 
@@ -136,7 +144,7 @@ class Audiogram:
         return f"Audiogram({self.short_text()})"
 
     def short_text(self) -> str:
-        """Return the name of a standard audiogram in quotes, or a dictionary of levels by Hz."""
+        """Return the audiogram as short text: a standard name in quotes, or levels by frequency."""
         for name, levels in STANDARD.items():
             if self.frequencies == FREQUENCIES and self.levels == levels:
                 return repr(name)
@@ -161,7 +169,7 @@ class Audiogram:
 
     @property
     def severity(self) -> str:
-        """MSBG's degree of loss: none, mild, moderate or severe.
+        """Severity of the loss: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
 
         It follows from the mean of the levels that were measured from 2 to 8 kHz, and is none if
         there is no such level, as in pyclarity.
@@ -176,7 +184,7 @@ class Audiogram:
         return (levels[500.0] + levels[1000.0] + levels[2000.0] + levels[4000.0]) / 4.0
 
     def plot(self, axes: Any = None, *, ear: EarName | None = None, **style: Any) -> Any:
-        """Draw the audiogram with MSBG's degrees of loss as bands.
+        """Draw the audiogram as audiologists do, with bands for mild, moderate and severe losses.
 
         Args:
             axes: Matplotlib axes to draw on, which may show other ears; by default new ones.
@@ -195,12 +203,16 @@ class Audiogram:
         return plot_thresholds(self.frequencies, self.levels, axes, ear, **style)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """Return a JSON-serialisable dictionary, the inverse of ``from_dict``."""
+        """Return the lists ``levels`` and ``frequencies`` by name, which can be written as JSON."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Audiogram:
-        """Return the audiogram of a dictionary with ``levels`` and, optionally, ``frequencies``.
+        """Convert a dictionary, the result of ``to_dict``, into an audiogram.
+
+        Args:
+            data: Lists under the keys ``levels``, in dB HL, and, optionally, ``frequencies``, in
+                Hz.
 
         Raises:
             ValueError: The data is not such a dictionary.
@@ -210,13 +222,13 @@ class Audiogram:
         return cls(data["levels"], data.get("frequencies", FREQUENCIES))
 
     def to_row(self) -> dict[str, str]:
-        """Return a row of a CSV file with the columns ``hl_250``, ``hl_500`` and so on."""
+        """Return the thresholds as texts for a CSV file by column: ``hl_250``, ``hl_500``, ..."""
         points = zip(self.frequencies, self.levels, strict=True)
         return {f"hl_{_shortest(hz)}": _shortest(level) for hz, level in points}
 
     @classmethod
     def from_row(cls, row: Mapping[str, str], highest: float = HIGHEST_LEVEL) -> Audiogram:
-        """Return the audiogram of a row of a table.
+        """Convert a row of a table into an audiogram.
 
         A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``1k``, in any order
         and case. Other columns are ignored, and so are remarks on a frequency, such as
@@ -263,7 +275,7 @@ class Audiogram:
 
     @classmethod
     def from_clarity(cls, source: Any, ear: EarName | None = None) -> Audiogram:
-        """Convert pyclarity's ``Audiogram``, or one ear of its ``Listener``.
+        """Convert an audiogram of pyclarity, or one ear of a listener of pyclarity.
 
         Args:
             source: pyclarity's ``Audiogram``; or, with ``ear``, its ``Listener`` or an entry of
@@ -290,13 +302,15 @@ class Audiogram:
 
 
 def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -> Tensor:
-    """Return the index into ``SEVERITIES`` for each ear.
+    """Compute the severity of the loss of each ear: 0 none, 1 mild, 2 moderate, 3 severe.
+
+    It follows from the mean threshold from 2 to 8 kHz, as in pyclarity.
+
+    Shape: (..., frequencies) -> int64 (...), indices into ``SEVERITIES``.
 
     Args:
         levels: Thresholds in dB HL.
         frequencies: Frequencies of the last dimension in Hz.
-
-    Shape: (..., frequencies) -> (...), int64.
 
     >>> SEVERITIES[severity_index(torch.full((8,), 40.0))]
     'moderate'
@@ -312,7 +326,15 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
 
 
 def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
-    """Return ``convert(*arguments)``. The message of its ValueError begins with a place in a file.
+    """Call a function, and put a place in a file before the message of a ValueError that it raises.
+
+    Args:
+        place: Place for the message, such as ``ears.csv, line 2``.
+        convert: Function to call.
+        arguments: Arguments of the function.
+
+    Returns:
+        The result of the function.
 
     >>> convert_at("ears.csv, line 2", Audiogram.from_row, {"hl_500": "20"})
     Audiogram({500: 20})
@@ -323,13 +345,13 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
         raise ValueError(f"{place}: {error}") from error
 
 
-def check_range(levels: Iterable[float], highest: float, user: str) -> None:
-    """Validate levels in dB HL.
+def check_range(levels: Iterable[float], highest: float, consumer: str) -> None:
+    """Validate that thresholds lie between -10 dB HL and a highest level.
 
     Args:
-        levels: Levels to validate.
-        highest: Highest level that is valid.
-        user: Name of the model that uses the levels, for the message.
+        levels: Thresholds in dB HL.
+        highest: Highest level that is valid, in dB HL.
+        consumer: Name of the model or metric that needs the thresholds, for the message.
 
     Raises:
         ValueError: A level is below -10 or above ``highest``, or NaN.
@@ -338,13 +360,13 @@ def check_range(levels: Iterable[float], highest: float, user: str) -> None:
     """
     if not all(LOWEST_LEVEL <= level <= highest for level in levels):
         raise ValueError(
-            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {user}, "
-            f"got {join_numbers(levels)}"
+            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}, "
+            f"got {join_numbers(levels)}; limit them to this range"
         )
 
 
 def join_numbers(values: Iterable[float]) -> str:
-    """Return numbers as text for a message.
+    """Return numbers as text, separated by commas, for a message.
 
     >>> join_numbers([250.0, 707.1])
     '250, 707.1'
@@ -363,7 +385,7 @@ def _column_frequency(column: str) -> float | None:
 
 
 def _parse_level(text: str, column: str, highest: float) -> float:
-    """Return a threshold. Tables with semicolons may have decimal commas."""
+    """Convert the text of a threshold, which may have a decimal comma, into a number."""
     try:
         level = float(text.replace(",", "."))
     except ValueError:
@@ -378,7 +400,7 @@ def _parse_level(text: str, column: str, highest: float) -> float:
 
 
 def _as_array(values: Any) -> NDArray[np.float64]:
-    """Return a sequence of numbers as an array with NaN in place of ``None``."""
+    """Convert a sequence of numbers into an array with NaN in place of ``None``."""
     try:
         numbers = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):

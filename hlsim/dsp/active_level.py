@@ -22,7 +22,7 @@ _THRESHOLDS = 2.0 ** -np.arange(16.0)[::-1]
 
 
 def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
-    """Compute the active speech level in dB relative to RMS 1.0.
+    """Compute the level of speech without its pauses, the active speech level.
 
     The standard's thresholds are fractions of full scale. Here they are fractions of the envelope's
     maximum, so that a gain of the waveform changes the result by exactly this gain.
@@ -30,8 +30,11 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     Source: ITU-T P.56, method B.
 
     Args:
-        waveform: Samples of one channel. Shape: (time,).
+        waveform: Samples of one channel, (time,).
         sample_rate: Sample rate in Hz.
+
+    Returns:
+        Level in dB relative to RMS 1.0.
 
     Raises:
         ValueError: The waveform is silent, empty or not one-dimensional.

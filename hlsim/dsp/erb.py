@@ -1,5 +1,8 @@
 """The scale of equivalent rectangular bandwidths (ERB) of auditory filters.
 
+The ERB at a frequency says how finely a normal ear resolves frequencies there. On the ERB-number
+scale, equal distances are equal numbers of ERBs.
+
 Source: Glasberg and Moore (1990), Hearing Research 47, 103-138.
 """
 
@@ -11,9 +14,12 @@ ERB_AT_0_HZ = 24.7
 
 
 def erb(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Equivalent rectangular bandwidth in Hz of a normal ear at each frequency in Hz.
+    """Compute the equivalent rectangular bandwidth in Hz of a normal auditory filter.
 
     Source: Glasberg and Moore (1990), Equation 3.
+
+    Args:
+        frequency: Centre frequencies in Hz, of any shape.
 
     >>> print(erb(np.array([1000.0])))
     [132.639]
@@ -22,9 +28,12 @@ def erb(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def erb_number(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Number of ERBs between 0 Hz and each frequency in Hz.
+    """Compute the positions of frequencies on the ERB scale: the number of ERBs from 0 Hz.
 
     Source: Glasberg and Moore (1990), Equation 4.
+
+    Args:
+        frequency: Frequencies in Hz, of any shape.
 
     >>> print(erb_number(np.array([1000.0])).round(3))
     [15.621]
@@ -33,7 +42,10 @@ def erb_number(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def erb_frequency(number: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Frequency in Hz at each position on the ERB scale. This is the inverse of ``erb_number``.
+    """Compute the frequencies in Hz at positions on the ERB scale, the inverse of ``erb_number``.
+
+    Args:
+        number: Numbers of ERBs from 0 Hz, of any shape.
 
     >>> print(erb_frequency(erb_number(np.array([250.0, 4000.0]))).round())
     [ 250. 4000.]

@@ -19,13 +19,13 @@ MKL takes up to three times as long for 2^10 * 49 points as for 2^4 * 3125 point
 
 
 def rfft(signals: Tensor, points: int | None = None) -> Tensor:
-    """Compute the Fourier transform of real signals.
-
-    The result equals that of ``torch.fft.rfft``, but its gradient is cheaper.
+    """Compute the Fourier transform of real signals, like ``torch.fft.rfft``, with a faster
+    gradient.
 
     Shape: (..., time) -> complex (..., points // 2 + 1).
 
     Args:
+        signals: Real signals, which are cut or followed by zeros to the length of the transform.
         points: Length of the transform, by default that of the signals.
 
     >>> rfft(torch.tensor([1.0, 0.0, -1.0, 0.0]))
@@ -66,7 +66,7 @@ class _RFFT(torch.autograd.Function):
 
 @lru_cache(maxsize=256)
 def fft_length(minimum: int, multiple: int = 1) -> int:
-    """Smallest length of a fast Fourier transform within limits.
+    """Return the smallest length from ``minimum`` on for which Fourier transforms are fast.
 
     The length has no prime factors above 7, apart from those of ``multiple``.
 
@@ -88,7 +88,9 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
 
 
 def power(spectrum: Tensor) -> Tensor:
-    """Compute the squared modulus of complex values. Shape: complex (...) -> real (...).
+    """Compute the squared magnitude of complex numbers, with a faster gradient than torch's.
+
+    Shape: complex (...) -> real (...).
 
     >>> power(torch.tensor([3.0 + 4.0j]))
     tensor([25.])
@@ -122,17 +124,19 @@ class _Power(torch.autograd.Function):
 
 
 def fade_out_weights(bins: int, spacing: float, end: float) -> NDArray[np.float64]:
-    """Compute weights that fade a spectrum out below the frequency where it is cut off.
+    """Compute weights that fade a spectrum out over the last 80 Hz below a frequency.
 
-    They are 1 up to 80 Hz below this frequency, and then fall to 0. A sharp end would ring for
-    seconds, and the length of the transform would decide how much of the ringing wraps around.
+    They are 1 up to 80 Hz below this frequency, and then fall to 0. If the spectrum were cut off
+    suddenly, signals would ring for seconds, and the length of the transform would decide how much
+    of the ringing wraps around.
 
     Args:
         bins: Number of frequencies of the spectrum.
         spacing: Distance between two frequencies in Hz.
         end: Frequency in Hz at which the weights reach 0.
 
-    Returns: Weights of shape (bins,).
+    Returns:
+        Weights, (bins,).
 
     >>> print(fade_out_weights(5, spacing=40.0, end=160.0).round(2))
     [1.  1.  1.  0.5 0. ]

@@ -34,12 +34,14 @@ def frequency_sampling_fir(
     they are close. MSBG and pyclarity's NAL-R follow ``fir2``.
 
     Args:
-        taps: Number of coefficients, odd and at most 1023. The delay is (taps - 1) / 2 samples.
+        taps: Number of coefficients, odd and at most 1023. The filter delays by (taps - 1) / 2
+            samples.
         frequencies: Ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
         gains: Linear gain at each frequency.
-        window: Window of the coefficients. Shape: (taps,).
+        window: Window by which the coefficients are multiplied, (taps,).
 
-    Returns: Coefficients of shape (taps,).
+    Returns:
+        Coefficients of the filter, (taps,).
 
     >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), np.ones(3))
     >>> print(abs(flat).round(6))
@@ -61,11 +63,12 @@ def frequency_sampling_fir(
 
 
 def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
-    """Filter with impulse responses that are centred on time 0.
+    """Filter signals with impulse responses that begin before time 0, so that nothing is delayed.
 
     Shape: (..., time), (..., 2 half) -> (..., time).
 
     Args:
+        waveform: Signals.
         taps: Impulse responses, from ``half`` samples before time 0 to ``half - 1`` after it.
 
     >>> filter_without_delay(torch.ones(3), torch.tensor([0.0, 0.0, 1.0, 0.0])).round(decimals=3)
@@ -82,12 +85,14 @@ def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
 
 
 def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
-    """Filter causally in overlapping blocks, which take a quarter of the time of one transform.
+    """Filter signals in overlapping blocks, in a quarter of the time of one Fourier transform.
 
     Shape: (..., time), (2049,) -> (..., length).
 
     Args:
-        response: Transform by ``rfft`` of ``BLOCK_POINTS`` points of at most 1025 taps.
+        waveform: Signals.
+        response: Frequency response of the filter: the transform of its coefficients, at most 1025,
+            by ``rfft`` with ``BLOCK_POINTS`` points.
         length: Number of samples to return.
 
     >>> delay_by_one = torch.fft.rfft(torch.tensor([0.0, 1.0]), BLOCK_POINTS)

@@ -1,4 +1,8 @@
-"""Processing of long signals in overlapping blocks, which bounds the memory that they need."""
+"""Division of long signals into overlapping blocks, which bounds the memory for processing them.
+
+Results near the ends of a block lack context and are discarded. The *input* of a block is what is
+processed, and its *output* the shorter part of the result that is used.
+"""
 
 import math
 from typing import NamedTuple
@@ -7,16 +11,13 @@ from torch import Tensor
 
 
 class Block(NamedTuple):
-    """Part of a signal that is processed at once, and the part of the result that is used.
-
-    The input is longer than the used output, because samples near its ends lack the context that
-    the processing needs.
+    """Part of a signal that is processed at once, and the shorter part of the result that is used.
 
     Attributes:
-        input_start: First sample of the input.
-        output_start: First sample of the output that is used.
-        output_stop: Sample after the last one of the output that is used.
-        input_stop: Sample after the last one of the input.
+        input_start: Index of the first sample that is processed.
+        output_start: Index of the first sample of which the result is used.
+        output_stop: Index after the last sample of which the result is used.
+        input_stop: Index after the last sample that is processed.
 
     >>> import torch
     >>> block = Block(input_start=2, output_start=4, output_stop=6, input_stop=8)
@@ -33,14 +34,14 @@ class Block(NamedTuple):
     input_stop: int
 
     def cut_input(self, signals: Tensor) -> Tensor:
-        """Cut the block's input out of whole signals.
+        """Cut the samples to process out of whole signals.
 
         Shape: (..., time) -> (..., input_stop - input_start).
         """
         return signals[..., self.input_start : self.input_stop]
 
     def cut_output(self, output: Tensor) -> Tensor:
-        """Cut the used part out of the result of processing the block's input.
+        """Cut the part that is used out of the result for the samples from ``cut_input``.
 
         Nothing is cut off the end of the last block, whose result may be longer than its input.
 
@@ -55,17 +56,17 @@ class Block(NamedTuple):
 def split_into_blocks(
     samples: int, hop: int, lead: float, lag: float, unit: int = 1
 ) -> list[Block]:
-    """Split a signal into overlapping blocks, whose used outputs together cover it.
+    """Divide a signal into overlapping blocks, whose outputs together are as long as the signal.
 
     A signal of up to one and a half hops is one block, and so is any signal if the hop is 0. The
-    last block covers half a hop to one and a half hops.
+    output of the last block covers half a hop to one and a half hops.
 
     Args:
         samples: Length of the signal.
-        hop: Samples from the start of one used output to the start of the next.
-        lead: Samples of context that a block needs before its used output.
-        lag: Samples of context that a block needs after its used output.
-        unit: Number of samples of which inputs and used outputs start at multiples. The hop is
+        hop: Samples from the start of one output to the start of the next.
+        lead: Samples of context that the processing needs before an output.
+        lag: Samples of context that the processing needs after an output.
+        unit: Number of samples of which all inputs and outputs start at multiples. The hop is
             rounded down to a multiple of it, lead and lag are rounded up.
 
     >>> split_into_blocks(100, hop=50, lead=10, lag=5)[1]

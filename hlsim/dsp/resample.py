@@ -51,7 +51,7 @@ To 16000 Hz, the kernel has 0.13 million values from 44100 Hz and 12 million fro
 
 
 def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
-    """Resample waveforms by a windowed sinc, without delay.
+    """Convert waveforms to another sample rate, without delay.
 
     The gain is flat within 0.023 dB up to 90 % of the lower Nyquist frequency. It is at most -61 dB
     at this frequency and -90 dB from 101 % of it on. On a GPU whose convolutions use TF32, which is
@@ -61,7 +61,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     Shape: (..., time) -> (..., ceil(time * target_rate / source_rate)).
 
     Args:
-        waveform: floating-point samples.
+        waveform: Floating-point samples.
         source_rate: Sample rate of ``waveform`` in Hz.
         target_rate: Sample rate of the result in Hz.
 
@@ -101,16 +101,20 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 
 
 def sinc_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Compute one filter for each of the ``target`` samples that a block of input gives.
+    """Compute the filters with which a convolution resamples signals.
+
+    A block of ``source`` input samples gives ``target`` output samples. There is one filter for
+    each of these output samples.
 
     Args:
         source: Source rate divided by the common factor of both rates.
         target: Target rate divided by the common factor of both rates.
-        dtype: Type of the result. The kernel is computed in float32 at least.
+        dtype: Type of the result. The filters are computed in float32 at least.
         device: Device of the result.
 
-    Returns: Filters of shape (target, 1, 2 * reach + source), for a convolution with a stride of
-        ``source``.
+    Returns:
+        Filters, (target, 1, 2 * reach + source), for a convolution with a stride of ``source``.
+        They cover ``reach`` samples before and after a block.
 
     >>> sinc_kernel(3, 1, torch.float32, torch.device("cpu")).shape
     torch.Size([1, 1, 409])

@@ -14,8 +14,9 @@ from hlsim.torchtools import constant_like
 
 @dataclass(frozen=True)
 class STFT:
-    """A short-time Fourier transform with a Hann window and centred frames.
+    """A short-time Fourier transform (STFT): spectra of short, overlapping frames of a signal.
 
+    Frames are multiplied by a Hann window, and the first one is centred on the first sample.
     Samples before the beginning and after the end of a signal count as zeros.
 
     Args:
@@ -54,7 +55,7 @@ class STFT:
         return self.fft // 2 + 1
 
     def analyse(self, waveform: Tensor) -> Tensor:
-        """Compute the spectrum of waveforms.
+        """Compute the spectrum of each frame of waveforms.
 
         The result equals that of ``torch.stft``, whose gradient takes 1.5 times as long.
 
@@ -69,12 +70,16 @@ class STFT:
         return rfft(functional.pad(windowed, (margin_before, margin_after)))
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
-        """Compute waveforms from their spectra by overlap-add.
+        """Compute waveforms from the spectra of their frames, the inverse of ``analyse``.
 
         The result equals that of ``torch.istft``, which takes longer and exports to an ONNX graph
         with an index that onnxruntime rejects.
 
         Shape: complex (items, frames, frequencies) -> (items, length).
+
+        Args:
+            spectrum: Spectra of the frames.
+            length: Number of samples of the result.
         """
         window = self._hann_window(spectrum.real)
         margin_before = (self.fft - self.window) // 2

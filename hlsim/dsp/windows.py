@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 
 def hamming(taps: int) -> NDArray[np.float64]:
-    """Compute a symmetric Hamming window of shape (taps,).
+    """Compute a symmetric Hamming window, (taps,).
+
+    Args:
+        taps: Number of values.
 
     >>> print(hamming(3).round(2))
     [0.08 1.   0.08]
@@ -20,7 +23,7 @@ def hamming(taps: int) -> NDArray[np.float64]:
 
 
 def kaiser(taps: int, beta: float) -> NDArray[np.float64]:
-    """Compute a symmetric Kaiser window of shape (taps,).
+    """Compute a symmetric Kaiser window, (taps,).
 
     Args:
         taps: Number of values, at least 2.
