@@ -39,13 +39,10 @@ from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
 
-SPEECH_LEVEL = 65.0
+_SPEECH_LEVEL = 65.0
 """Level of the utterances in dB SPL, without an aid and as input of the aids."""
 
-DEMO_STEPS = 3000
-"""Number of training steps: about three minutes on two cores."""
-
-MIN_SCORED = 8
+_MIN_SCORED = 8
 """Smallest number of utterances to score."""
 
 _BUNDLED = Path(__file__).parent / "data" / "speech"
@@ -57,26 +54,29 @@ def demo(
     audiogram: Audiogram,
     *,
     speech: str | Path | None = None,
-    steps: int = DEMO_STEPS,
+    steps: int = 3000,
     seed: int = 0,
     jobs: int | None = 1,
     report: Callable[[str], None] = print,
     progress: Progress | None = None,
 ) -> str:
-    """Train an aid, score it beside others, and write a page and sounds into a folder.
+    """Train a hearing aid for one ear, and compare it with no aid and with NAL-R by HASPI.
+
+    The folder ``out`` receives a page, ``report.html``, the sounds, and the trained checkpoint.
 
     Args:
         out: Folder of the results.
         audiogram: The ear.
         speech: Folder to use instead of the bundled speech; every third file is scored, and the
             others are trained on.
-        steps: Number of training steps.
+        steps: Number of training steps; 3000 take about three minutes on two cores.
         seed: Seed of every random draw.
-        jobs: Number of processes that score.
+        jobs: Number of processes that compute scores.
         report: Function that is called with lines about the current work.
-        progress: Function that is called with the number of scored outputs and their total number.
+        progress: Function that is called with the number of values so far and of all values.
 
-    Returns: verdict, table and address of the page, for a terminal.
+    Returns:
+        Verdict, table and address of the page, for a terminal.
 
     Raises:
         ValueError: Audio that cannot be used, fewer than 22 files in ``speech``, or a file to score
@@ -135,9 +135,9 @@ def _split(speech: str | Path | None) -> tuple[list[Path], list[Path]]:
         return find_audio(_BUNDLED / "train"), find_audio(_BUNDLED / "valid")
     files = find_audio(speech)
     scored = files[::3]
-    if len(scored) < MIN_SCORED:
+    if len(scored) < _MIN_SCORED:
         raise ValueError(
-            f"expected {3 * MIN_SCORED - 2} or more audio files, of which a third is scored, got "
+            f"expected {3 * _MIN_SCORED - 2} or more audio files, of which a third is scored, got "
             f"{len(files)} in {speech}; add files"
         )
     return [path for path in files if path not in scored], scored
@@ -153,7 +153,7 @@ def _read_items(
     for number, (name, path) in enumerate(zip(names, files, strict=True)):
         waveform, rate = read_audio(path)
         clip = resample(waveform[0], rate, NEURO_RATE)[: round(_MAX_SECONDS * NEURO_RATE)]
-        clean = set_level(clip, SPEECH_LEVEL)
+        clean = set_level(clip, _SPEECH_LEVEL)
         try:
             CleanSpeech(clean, None, NEURO_RATE, PASCAL_SPL, False, "HASPI")
         except ValueError as error:
@@ -172,7 +172,11 @@ def _name_files(files: list[Path], root: Path) -> list[str]:
 def _compute_signals(
     items: list[Item], conditions: list[Condition]
 ) -> tuple[dict[str, list[Tensor]], dict[str, list[Tensor]]]:
-    """Return the outputs, and what the ear perceives of them, of all items by condition."""
+    """Compute the outputs of all items, and what the ear perceives of them.
+
+    Returns:
+        Two dictionaries, the outputs and the perceived signals: one signal per item, by condition.
+    """
     with torch.no_grad():
         outputs = {
             condition.name: [condition.output(item) for item in items] for condition in conditions
@@ -187,17 +191,22 @@ def _compute_signals(
 def _write_audio(
     folder: Path, items: list[Item], signals: dict[str, dict[str, list[Tensor]]]
 ) -> None:
-    """Write all signals with one gain per item, so that their loudness can be compared."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for place, item in enumerate(items):
-        of_item = {
-            f"{kind}-{name.replace(', ', '-').replace(' ', '-')}": several[place]
-            for kind, by_condition in signals.items()
-            for name, several in by_condition.items()
-        }
-        peak = max(float(signal.abs().max()) for signal in of_item.values())
-        for name, signal in of_item.items():
-            write_audio(folder / f"{item.name}-{name}.wav", 0.9 * signal / peak, NEURO_RATE)
+    """Write all signals with one gain per item, so that their loudness can be compared.
+
+    Args:
+        folder: Folder for the files.
+        items: The utterances.
+        signals: One signal per item, by condition, by kind of signal (``output``, ``perceived``).
+    """
+    for number, item in enumerate(items):
+        files = {}
+        for kind, signals_by_condition in signals.items():
+            for condition, item_signals in signals_by_condition.items():
+                name = f"{item.name}-{kind}-{condition.replace(',', '').replace(' ', '-')}.wav"
+                files[folder / name] = item_signals[number]
+        peak = max(float(signal.abs().max()) for signal in files.values())
+        for path, signal in files.items():
+            write_audio(path, 0.9 * signal / peak, NEURO_RATE)
 
 
 def _sentence(path: Path) -> str:

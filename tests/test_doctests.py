@@ -108,6 +108,22 @@ MODULES = [
     "hlsim.report.page",
     "hlsim.shortcuts",
     "hlsim.torchtools",
+    "hlsim.training.augment",
+    "hlsim.training.batches",
+    "hlsim.training.callbacks",
+    "hlsim.training.clips",
+    "hlsim.training.compensator",
+    "hlsim.training.corpora.instances",
+    "hlsim.training.corpora.layouts",
+    "hlsim.training.corpora.manifest",
+    "hlsim.training.data_module",
+    "hlsim.training.denoising",
+    "hlsim.training.ears",
+    "hlsim.training.module",
+    "hlsim.training.recipes",
+    "hlsim.training.simulator",
+    "hlsim.training.teacher",
+    "hlsim.training.tones_and_clicks",
 ]
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from hlsim.evaluation.result import Evaluation
     from hlsim.report.page import Page
 
-CHECKPOINTS = "by name or folder; LABEL=FOLDER sets the name in the tables to LABEL"
+_CHECKPOINTS = "by name or folder; LABEL=FOLDER sets the name in the tables to LABEL"
 """End of the help text of arguments that name checkpoints."""
 
 
@@ -43,7 +43,7 @@ def evaluate_simulator(parser: Parser) -> None:
         "mine=runs/simulator/checkpoint --speech speech/valid --audiograms standard --out judged",
     )
     option = parser.option
-    text = f"msbg (exact), or checkpoints {CHECKPOINTS}"
+    text = f"msbg (exact), or checkpoints {_CHECKPOINTS}"
     option("names", str, text, nargs="+", metavar="NAME")
     option("--audiograms", ears_table, EARS_TABLE, required=True)
     parser.teacher("simulator to compare with", "msbg")
@@ -84,7 +84,7 @@ def evaluate_compensator(parser: Parser) -> None:
         "mine=runs/n3/checkpoint --audiogram N3 --speech speech/valid --items 40 --out judged",
     )
     option = parser.option
-    option("names", str, f"compensators, {CHECKPOINTS}", nargs="+", metavar="NAME")
+    option("names", str, f"compensators, {_CHECKPOINTS}", nargs="+", metavar="NAME")
     text = f"{EARS_TABLE}; used in addition to Bisgaard's ears N2 to N6 and S1 to S3"
     option("--audiograms", ears_table, text)
     parser.audiogram(text="; single ear for everything, for a compensator trained for it")
@@ -164,7 +164,7 @@ def clarity(parser: Parser) -> None:
     )
     option("scenes", input_folder, text, metavar="SCENES")
     text = (
-        f"compensators {CHECKPOINTS}; or aids of your own as package.module:name or "
+        f"compensators {_CHECKPOINTS}; or aids of your own as package.module:name or "
         "path/to/file.py:name, a callable (waveform, listener, sample_rate) -> waveform or its "
         "class, for (2, time) at the files' scale"
     )

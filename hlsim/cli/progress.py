@@ -7,12 +7,12 @@ import sys
 import time
 from collections.abc import Callable
 
-LINE_INTERVAL = 30.0
+_LINE_INTERVAL = 30.0
 """Seconds between two lines, if stderr is not a terminal."""
 
 
-def show_progress(unit: str) -> Callable[..., None]:
-    """Return a function that shows the progress of a task.
+def show_progress(unit: str) -> Callable[[int, int], None]:
+    """Return a function that shows the progress of long work and the time when it will end.
 
     In a terminal, it overwrites one line. Elsewhere, it writes a line every 30 seconds. The time of
     the end is estimated from the pace since the first call, without the work of an earlier run.
@@ -21,13 +21,15 @@ def show_progress(unit: str) -> Callable[..., None]:
         unit: Plural noun for what is counted, such as "items".
 
     Returns:
-        A function of the number of finished units, their total number, and optionally a description
-        of the next one.
+        A function to call after each unit, with the number of finished units and their total
+        number.
+
+    >>> show_progress("items")(1, 4)
     """
     first: tuple[int, float] | None = None
     last_line = 0.0
 
-    def show(done: int, total: int, next_unit: str = "") -> None:
+    def show(done: int, total: int) -> None:
         nonlocal first, last_line
         now = time.time()
         first = first or (done, now)
@@ -36,12 +38,11 @@ def show_progress(unit: str) -> Callable[..., None]:
             seconds = (now - first[1]) / (done - first[0]) * (total - done)
             clock = time.strftime("%a %H:%M", time.localtime(now + seconds))
             text += f", {seconds / 60:.1f} min left ({clock})"
-        text += f": {next_unit}" if next_unit else ""
         if sys.stderr.isatty():
             width = shutil.get_terminal_size().columns - 1
             end = "\n" if done == total else ""
             print(f"\r{text[:width]:<{width}}", end=end, file=sys.stderr, flush=True)
-        elif done == total or now - last_line >= LINE_INTERVAL:
+        elif done == total or now - last_line >= _LINE_INTERVAL:
             last_line = now
             print(text, file=sys.stderr, flush=True)
 

@@ -1,7 +1,7 @@
 """Augmentation of training speech: noise, equalisation, amplification, compression and level.
 
-A simulator guides the training of aids, which amplify and compress. It must therefore be accurate
-on amplified and compressed speech.
+A Neuro-MSBG later guides the training of hearing aids, which amplify and compress. It must therefore
+be accurate on amplified and compressed speech, not only on recordings as they are.
 """
 
 import torch
@@ -18,31 +18,47 @@ HIGHEST_LEVEL = 115.0
 EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
 """Frequencies in Hz for which the random equaliser has gains."""
 
-POWER_FLOOR = 1e-20
+_POWER_FLOOR = 1e-20
 """Power in Pa^2 that keeps logarithms and divisors away from 0."""
 
 
 def draw_uniform(
     low: float, high: float, shape: tuple[int, ...], generator: torch.Generator
 ) -> Tensor:
-    """Draw numbers of a uniform distribution from ``low`` to ``high``."""
+    """Draw numbers of a uniform distribution.
+
+    Args:
+        low: Lower limit.
+        high: Upper limit.
+        shape: Shape of the tensor to return.
+        generator: Source of the random numbers.
+
+    >>> draw_uniform(1.0, 2.0, (3,), torch.Generator()).shape
+    torch.Size([3])
+    """
     return low + (high - low) * torch.rand(shape, generator=generator)
 
 
 def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None = None) -> Tensor:
-    """Add noise at a signal-to-noise ratio.
+    """Add noise to speech at a signal-to-noise ratio.
+
+    The speech stays as it is, and the noise is scaled.
 
     Args:
         speech: Speech with shape (items, time).
         noise: Noise with shape (items, time).
         snr_db: Level of the speech minus RMS level of the noise in dB, with shape (items,).
-        sample_rate: Sample rate in Hz. It makes the level of the speech the active level of ITU-T
-            P.56; without it, the RMS level is used.
+        sample_rate: Sample rate in Hz, with which the level of the speech is its active level
+            without pauses (ITU-T P.56). If it is None, the level is that of the RMS.
 
     Returns:
         Noisy speech with shape (items, time).
+
+    >>> speech, noise = torch.ones(1, 100), 5.0 * torch.ones(1, 100)
+    >>> mix(speech, noise, torch.tensor([20.0]))[0, :2]
+    tensor([1.1000, 1.1000])
     """
-    level = 10.0 * speech.square().mean(-1).clamp_min(POWER_FLOOR).log10()
+    level = 10.0 * speech.square().mean(-1).clamp_min(_POWER_FLOOR).log10()
     if sample_rate is not None:
         for item, waveform in enumerate(speech):
             if bool(waveform.any()):
@@ -51,9 +67,10 @@ def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None =
 
 
 def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rate: int) -> Tensor:
-    """Apply a zero-phase filter with gains at some frequencies.
+    """Filter signals with gains that are known at a few frequencies, without a delay.
 
-    The gains in dB are interpolated over log frequency, and constant beyond both ends.
+    The gains in dB are interpolated over log frequency. Below the lowest and above the highest
+    frequency they are constant.
 
     Args:
         waveform: Signals with shape (items, time).
@@ -63,6 +80,10 @@ def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rat
 
     Returns:
         Filtered signals with shape (items, time).
+
+    >>> gains_db, frequencies = torch.tensor([[20.0, 20.0]]), torch.tensor([250.0, 4000.0])
+    >>> equalise(torch.ones(1, 3), gains_db, frequencies, 16000)
+    tensor([[10., 10., 10.]])
     """
     time = waveform.shape[-1]
     points = 2 * time
@@ -77,22 +98,28 @@ def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rat
 
 
 def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
-    """Compress the level of segments of 10 ms around its mean.
+    """Compress the dynamic range of signals, as hearing aids do.
+
+    The level of segments of 10 ms approaches the mean level of the signal: a difference of R dB
+    becomes one of R / ratio dB.
 
     Args:
         waveform: Signals with shape (items, time).
-        ratio: Compression ratios with shape (items,).
+        ratio: Compression ratios with shape (items,), where 1.0 changes nothing.
         sample_rate: Sample rate in Hz.
 
     Returns:
         Compressed signals with shape (items, time).
+
+    >>> compress(torch.ones(1, 1600), torch.tensor([2.0]), 16000).shape
+    torch.Size([1, 1600])
     """
     width = 2 * (sample_rate // 200) + 1
     squared = waveform.square().unsqueeze(1)
     power = functional.avg_pool1d(squared, width, 1, width // 2, count_include_pad=False).squeeze(1)
     mean = power.mean(-1, keepdim=True)
     exponent = ((1.0 / ratio - 1.0) / 2.0).unsqueeze(-1)
-    return waveform * ((power + 1e-3 * mean + POWER_FLOOR) / (mean + POWER_FLOOR)) ** exponent
+    return waveform * ((power + 1e-3 * mean + _POWER_FLOOR) / (mean + _POWER_FLOOR)) ** exponent
 
 
 def augment_speech(
@@ -105,7 +132,7 @@ def augment_speech(
     levels: tuple[float, float] = (40.0, 95.0),
     treated: bool = True,
 ) -> Tensor:
-    """Make random training signals of speech.
+    """Make random inputs, on which a simulator is trained, from clean speech.
 
     40 % of the items are noisy, with -5 to 20 dB SNR. If ``treated``, 20 % are compressed with
     ratios of 1.5 to 4, 40 % are equalised by up to 15 dB, and 40 % are amplified by 0.2 to 0.8
@@ -113,15 +140,19 @@ def augment_speech(
 
     Args:
         speech: Clean speech with shape (items, time).
-        noise: Noise with shape (items, time), if there is any.
-        ears: Thresholds in dB HL with shape (items, 8).
+        noise: Noise with shape (items, time); None for speech without noise.
+        ears: Hearing thresholds in dB HL at ``FREQUENCIES``, with shape (items, 8).
         sample_rate: Sample rate in Hz.
         generator: Source of the random numbers.
         levels: Lowest and highest level in dB SPL before equalisation and amplification.
         treated: Whether to compress, equalise and amplify.
 
     Returns:
-        Signals in pascals with shape (items, time).
+        Signals in pascals with shape (items, time), of at most 115 dB SPL.
+
+    >>> speech, ears = torch.randn(2, 1600), torch.full((2, 8), 40.0)
+    >>> augment_speech(speech, None, ears, 16000, torch.Generator()).shape
+    torch.Size([2, 1600])
     """
     items = len(speech)
     chance = torch.rand(items, 5, generator=generator)

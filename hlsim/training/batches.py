@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,49 +24,47 @@ from hlsim.training.augment import (
     equalise,
     mix,
 )
-from hlsim.training.clips import Clips, NoiseOfPairs
+from hlsim.training.clips import Clips, Source
 from hlsim.training.corpora.manifest import SPLITS, read_manifest
 from hlsim.training.data_module import Batch, BatchData, Step
 from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
-from hlsim.training.teacher import Reference, Teacher
+from hlsim.training.teacher import PluginTeacher, Teacher
 from hlsim.training.tones_and_clicks import draw_sounds
 
-VALIDATION_SECONDS = 2.0
+_VALIDATION_SECONDS = 2.0
 """Duration of the clips for validation."""
 
-MAX_BABBLE_VOICES = 4
+_MAX_BABBLE_VOICES = 4
 """Largest number of voices in babble."""
-
-Files = Path | Sequence[Path]
-"""A folder, or a list of files."""
-
-Pairs = Sequence[tuple[Path, Path]]
-"""Pairs of files: clean speech and its noisy version."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Speech, noise and ears for training and validation. Only speech is required.
+    """Files of speech, noise and ears for training and validation. Only speech is required.
 
-    Validation uses the training data where it has no data of its own. Without ``valid_speech``, its
-    scores are those of known speakers.
+    What is missing for validation is taken from training. Without ``valid_speech``, validation
+    scores are therefore those of speakers that the network knows.
 
     Attributes:
-        speech: Clean speech for training.
-        noise: Noise that is mixed in, or pairs of clean and noisy speech whose difference is noise.
+        speech: Folder or files of clean speech, see ``Source``.
+        noise: Folder or files of noise that is mixed in, or pairs of clean and noisy speech.
         audiograms: CSV file of measured ears, which are used in addition to random ones.
-        valid_speech: Clean speech for validation.
-        valid_noise: Noise for validation, or pairs of clean and noisy speech.
+        valid_speech: Clean speech for validation, like ``speech``.
+        valid_noise: Noise for validation, like ``noise``.
         valid_audiograms: CSV file of measured ears for validation.
         workers: Number of processes that draw batches, in addition to the one that trains.
+
+    >>> data = TrainingData([Path("a.wav")], valid_speech=[Path("b.wav")])
+    >>> [path.name for path in data.validation().speech]
+    ['b.wav']
     """
 
-    speech: Files
-    noise: Files | Pairs | None = None
+    speech: Source
+    noise: Source | None = None
     audiograms: Path | None = None
-    valid_speech: Files | None = None
-    valid_noise: Files | Pairs | None = None
+    valid_speech: Source | None = None
+    valid_noise: Source | None = None
     valid_audiograms: Path | None = None
     workers: int = field(default=0, compare=False)
 
@@ -77,12 +74,14 @@ class TrainingData:
     ) -> TrainingData:
         """Use the splits ``train`` and ``valid`` of a manifest.
 
-        Without other noise, the difference between noisy and clean speech is the noise.
+        The difference between the manifest's noisy and clean speech is the noise, unless there is
+        an attribute ``noise``.
 
         Args:
             manifest: CSV file, see ``read_manifest``.
             root: Folder to which its paths are relative; by default the folder of the manifest.
-            attributes: Other attributes by name.
+            attributes: Attributes other than ``speech`` by name. They replace what the manifest
+                has.
 
         Raises:
             ValueError: The manifest is invalid, or has no training speech.
@@ -114,7 +113,7 @@ class TrainingData:
         return cls(speech["train"], **attributes)
 
     def validation(self) -> TrainingData:
-        """Return the validation data, as training data of another object.
+        """Return what validation uses, in the attributes ``speech``, ``noise`` and ``audiograms``.
 
         Raises:
             ValueError: Training and validation share files of speech or noise.
@@ -138,7 +137,11 @@ class TrainingData:
         )
 
     def identity(self) -> dict[str, str]:
-        """Describe the data, with a hash of each list of files, to tell it from other data."""
+        """Describe the data in order to recognise a training that should resume.
+
+        Returns:
+            Paths, or hashes of lists of files, by the name of the attribute.
+        """
         return {
             entry.name: _describe(getattr(self, entry.name))
             for entry in fields(self)
@@ -146,8 +149,8 @@ class TrainingData:
         }
 
 
-def _resolved_files(source: Files | Pairs) -> set[Path]:
-    """Return the absolute paths of the files, or of the noisy file of each pair."""
+def _resolved_files(source: Source) -> set[Path]:
+    """Return the absolute paths of files, or of the noisy file of each pair."""
     files = find_audio(source) if isinstance(source, str | Path) else source
     paths = [file[-1] if isinstance(file, tuple) else file for file in files]
     return {path.resolve() for path in paths}
@@ -160,45 +163,40 @@ def _describe(source: Any) -> str:
     return f"{len(source)} files, sha256 {hashlib.sha256(names.encode()).hexdigest()}"
 
 
-def _noise_clips(source: Files | Pairs, seconds: float) -> Clips:
-    """Return a source of noise clips: recordings, or the noise of pairs."""
-    options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
-    if not isinstance(source, str | Path) and isinstance(source[0], tuple):
-        return NoiseOfPairs(source, **options)  # type: ignore[arg-type]
-    return Clips(source, repeat=True, **options)  # type: ignore[arg-type]
-
-
-class DrawnBatches(Dataset[Batch]):
+class _RandomBatches(Dataset[Batch]):
     """Batches of random speech, noise and ears, which depend on seed, step and rank alone."""
 
     recipe: TrainingRecipe
 
     def __init__(self, recipe: TrainingRecipe, data: TrainingData) -> None:
         self.recipe = recipe
-        self.batch = recipe.batch
-        self.seed = recipe.seed
-        self.speech = Clips(data.speech, sample_rate=NEURO_RATE, seconds=recipe.seconds)
-        self.noise = _noise_clips(data.noise, recipe.seconds) if data.noise else None
+        settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
+        self.speech = Clips(data.speech, **settings)
+        self.noise = Clips(data.noise, repeat=True, **settings) if data.noise else None
         self.measured_ears: Tensor | None = None  # (ears, 8) dB HL
         if data.audiograms is not None:
             measured = read_audiograms(data.audiograms, simulated=True)
             self.measured_ears = torch.tensor([ear.thresholds for _, ear in measured])
 
     def __getitem__(self, step: Step) -> Batch:
-        seed = (self.seed * 1_000_003 + step.number) * 64 + step.rank
+        seed = (self.recipe.seed * 1_000_003 + step.number) * 64 + step.rank
         generator = torch.Generator().manual_seed(seed % 2**63)  # Larger seeds are rejected.
-        return self.draw(self.batch, generator)
+        return self.draw(self.recipe.batch, generator)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """Draw a batch.
 
+        Args:
+            count: Number of items.
+            generator: Source of the random numbers.
+
         Returns:
             ``clean`` and ``signal`` in pascals with shape (count, time), and ``thresholds`` in dB
-            HL with shape (count, 8).
+            HL with shape (count, 8); see ``Batch``.
         """
         raise NotImplementedError
 
-    def join_measured_ears(
+    def _join_measured_ears(
         self, ears: Tensor, share: float, shift_db: float, generator: torch.Generator
     ) -> Tensor:
         """Replace a share of random ears by measured ones, if there are any.
@@ -218,7 +216,7 @@ class DrawnBatches(Dataset[Batch]):
             measured = (measured + shift_db * shift).clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
         return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
 
-    def join_sounds(
+    def _join_sounds(
         self, clips: Tensor, generator: torch.Generator, early_share: float = 0.0
     ) -> Tensor:
         """Replace the recipe's share of clips by tones and clicks, see ``draw_sounds``."""
@@ -229,16 +227,16 @@ class DrawnBatches(Dataset[Batch]):
         return torch.where(torch.rand(len(clips), 1, generator=generator) < share, sounds, clips)
 
 
-class SimulatorBatches(DrawnBatches):
+class _SimulatorBatches(_RandomBatches):
     """Batches for a simulator: speech, noise, tones and clicks, like the outputs of aids."""
 
     recipe: SimulatorRecipe
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         ears = draw_thresholds(count, generator)
-        ears = self.join_measured_ears(ears, 0.4, 5.0, generator)
+        ears = self._join_measured_ears(ears, 0.4, 5.0, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
-        clips = self.join_sounds(self.speech.draw(count, generator), generator)
+        clips = self._join_sounds(self.speech.draw(count, generator), generator)
         signal = augment_speech(
             clips,
             noise,
@@ -251,8 +249,19 @@ class SimulatorBatches(DrawnBatches):
         return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
 
 
-class CompensatorBatches(DrawnBatches):
-    """Batches for a compensator: clean or noisy speech, for one ear or for random ears."""
+class CompensatorBatches(_RandomBatches):
+    """Data set of random batches for a compensator: clean or noisy speech, tones and clicks.
+
+    Args:
+        recipe: Settings of the training.
+        data: Speech, noise and ears.
+        ear: Ear of all items; None draws random ears.
+
+    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
+    >>> batches = CompensatorBatches(CompensatorRecipe(), TrainingData(speech), ear=None)
+    >>> {name: tensor.shape[0] for name, tensor in batches[Step(0)].items()}
+    {'clean': 2, 'signal': 2, 'thresholds': 2}
+    """
 
     recipe: CompensatorRecipe
 
@@ -276,7 +285,7 @@ class CompensatorBatches(DrawnBatches):
         voices = equalise_some(self.speech.draw(count, generator))
         # Some tones begin before the clip. Otherwise a hearing aid would learn that a tone always
         # follows silence.
-        clips = self.join_sounds(voices, generator, early_share=1.0)
+        clips = self._join_sounds(voices, generator, early_share=1.0)
         clean = set_level(clips, uniform(*recipe.levels))
         signal = clean
         if self.noise is not None:
@@ -291,7 +300,7 @@ class CompensatorBatches(DrawnBatches):
             ears = self.ear.expand(count, -1)
         else:
             ears = draw_thresholds(count, generator)
-            ears = self.join_measured_ears(ears, 0.5, 0.0, generator)
+            ears = self._join_measured_ears(ears, 0.5, 0.0, generator)
         batch = {"clean": clean, "signal": signal, "thresholds": ears}
         if recipe.unreduced:
             is_reduced = uniform(0.0, 1.0) >= recipe.unreduced
@@ -301,28 +310,33 @@ class CompensatorBatches(DrawnBatches):
 
 def _babble(voices: Tensor) -> Tensor:
     """Add up to four other items at equal levels, for each item."""
-    count = min(len(voices), MAX_BABBLE_VOICES + 1)
+    count = min(len(voices), _MAX_BABBLE_VOICES + 1)
     shifted = [set_level(voices.roll(shift, 0), 65.0) for shift in range(1, count)]
     return torch.stack(shifted).sum(0)
 
 
 def simulator_data(
-    data: TrainingData, recipe: SimulatorRecipe, reference: Reference | None = None
+    data: TrainingData, recipe: SimulatorRecipe, plugin: PluginTeacher | None = None
 ) -> BatchData:
-    """Make the batches for training and validation of a simulator.
+    """Make the data module from which a simulator learns.
 
     Args:
         data: Speech, noise and ears.
         recipe: Settings of the training.
-        reference: Simulator that serves as the teacher; by default the exact MSBG.
+        plugin: Teacher that replaces the exact MSBG.
 
     Raises:
-        ValueError: Files are missing or invalid.
+        ValueError: Source are missing or invalid.
+
+    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
+    >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe())
+    >>> list(batches.training[Step(0)])
+    ['clean', 'signal', 'thresholds']
     """
     return BatchData(
-        SimulatorBatches(recipe, data),
+        _SimulatorBatches(recipe, data),
         simulator_validation(data, recipe),
-        teacher=Teacher(NEURO_RATE, reference),
+        teacher=Teacher(NEURO_RATE, plugin),
         workers=data.workers,
     )
 
@@ -330,7 +344,7 @@ def simulator_data(
 def compensator_data(
     data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
 ) -> BatchData:
-    """Make the batches for training and validation of a compensator.
+    """Make the data module from which a compensator learns.
 
     Args:
         data: Speech, noise and ears.
@@ -338,7 +352,12 @@ def compensator_data(
         ear: Ear of a personal compensator; None for a general one.
 
     Raises:
-        ValueError: Files are missing or invalid, or the recipe requires noise and there is none.
+        ValueError: Source are missing or invalid, or the recipe requires noise and there is none.
+
+    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
+    >>> batches = compensator_data(TrainingData(speech), CompensatorRecipe(), ear=None)
+    >>> len(batches.validation)  # of 4 items each
+    2
     """
     needs_noise = [name for name in ("denoising", "intelligibility") if recipe.weights.get(name)]
     if recipe.babble:
@@ -348,7 +367,7 @@ def compensator_data(
             f"{needs_noise[0]} in the recipe requires noise, but the data has none; "
             "add a folder of noise (--noise)"
         )
-    plain = replace(recipe, equalised=0.0, seconds=VALIDATION_SECONDS)
+    plain = replace(recipe, equalised=0.0, seconds=_VALIDATION_SECONDS)
     batches = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     validation = [batches.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
@@ -361,15 +380,26 @@ def simulator_validation(data: TrainingData, recipe: SimulatorRecipe) -> list[Ba
     They are drawn as for training, but not equalised, amplified or compressed. If the recipe trains
     on tones and clicks, one item of them, marked with ``sounds``, is added per three items of
     speech.
+
+    Args:
+        data: Speech, noise and ears for training and validation.
+        recipe: Settings of the training.
+
+    Raises:
+        ValueError: Source are missing or invalid, or used for both training and validation.
+
+    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
+    >>> len(simulator_validation(TrainingData(speech), SimulatorRecipe()))  # of 8 items each
+    6
     """
     data = data.validation()
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
     levels = (50.0, 80.0) if recipe.treated else recipe.levels
-    plain = replace(recipe, seconds=VALIDATION_SECONDS, levels=levels, treated=False, sounds=0.0)
-    speech = SimulatorBatches(plain, data)
+    plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False, sounds=0.0)
+    speech = _SimulatorBatches(plain, data)
     batches = [speech.draw(8, generator) for _ in range(0, recipe.validation_items, 8)]
     if recipe.sounds:
-        sounds = SimulatorBatches(replace(plain, sounds=1.0), replace(data, noise=None))
+        sounds = _SimulatorBatches(replace(plain, sounds=1.0), replace(data, noise=None))
         marked = {"sounds": torch.ones(8, dtype=torch.bool)}
         for _ in range(0, recipe.validation_items, 24):
             batches.append(sounds.draw(8, generator) | marked)

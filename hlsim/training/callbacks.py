@@ -1,17 +1,16 @@
-"""Callbacks of a training: average weights, the best network as a checkpoint, and a progress
-bar."""
+"""Callbacks of a training: the average of the weights, and the checkpoint of the best network."""
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar, WeightAveraging
+from lightning.pytorch.callbacks import ModelCheckpoint, WeightAveraging
 from torch import Tensor
 
 from hlsim.checkpoint import save_checkpoint
@@ -23,45 +22,53 @@ CHECKPOINT = "checkpoint"
 class WeightAverage(WeightAveraging):
     """Exponential moving average of the weights, which replaces them in validation and checkpoints.
 
+    Unlike Lightning's ``EMAWeightAveraging``, it forgets faster at first: the decay is at most
+    (1 + n) / (10 + n) after n steps. The random initial weights would otherwise dominate the
+    average of a short training.
+
     Args:
-        decay: Weight of the past, from 0 to below 1.
+        decay: Weight of the previous average in the new one, from 0 to below 1.
+
+    >>> average, weights = [torch.tensor([0.0])], [torch.tensor([10.0])]
+    >>> WeightAverage(0.99).update_averages(average, weights, steps=8)
+    >>> average  # 0.5 * 0.0 + 0.5 * 10.0
+    [tensor([5.])]
     """
 
     def __init__(self, decay: float) -> None:
-        super().__init__(use_buffers=False, multi_avg_fn=make_average_update(decay))
+        self.decay = decay
+        super().__init__(use_buffers=False, multi_avg_fn=self.update_averages)
 
+    def update_averages(
+        self, averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Any
+    ) -> None:
+        """Update averages in place, as ``torch.optim.swa_utils.AveragedModel`` requires.
 
-def make_average_update(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Any], None]:
-    """Make the function with which ``AveragedModel`` updates its weights.
-
-    Unlike Lightning's ``EMAWeightAveraging``, it has a lower decay at first: (1 + n) / (10 + n)
-    after n steps. The random initial weights would otherwise dominate the average of a short
-    training.
-
-    Args:
-        decay: Weight of the past, from 0 to below 1.
-    """
-
-    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Any) -> None:
-        present = 1.0 - min(decay, (1.0 + float(steps)) / (10.0 + float(steps)))
+        Args:
+            averages: Average of each parameter.
+            weights: Each parameter after the last step.
+            steps: Number of updates so far.
+        """
+        decay = min(self.decay, (1.0 + float(steps)) / (10.0 + float(steps)))
         for average, weight in zip(averages, weights, strict=True):
-            average.lerp_(weight.to(average), present)
-
-    return update
+            average.lerp_(weight.to(average), 1.0 - decay)
 
 
 class BestCheckpoint(ModelCheckpoint):
     """Callback that saves the network with the highest validation score.
 
-    It saves Lightning's state, and a checkpoint folder that hlsim loads.
+    It writes Lightning's state, ``best.ckpt``, and a folder ``checkpoint`` that hlsim loads.
 
     Args:
-        folder: Folder of the training, where ``best.ckpt`` and ``checkpoint`` are written.
-        kind: Kind of the network's checkpoint.
-        record: Training record for the checkpoint's ``config.json``.
+        folder: Folder of the training.
+        kind: Kind of the network's checkpoint, such as ``"hearing-aid"``.
+        record: Entries about the training for the checkpoint's ``config.json``.
 
     Attributes:
-        score_to_beat: Score above which a checkpoint is written.
+        score_to_beat: Validation score above which a checkpoint is written.
+
+    >>> BestCheckpoint(Path("runs"), "hearing-aid", record={"seed": 0}).monitor
+    'score'
     """
 
     def __init__(self, folder: Path, kind: str, record: Mapping[str, Any]) -> None:
@@ -73,7 +80,7 @@ class BestCheckpoint(ModelCheckpoint):
             save_on_train_epoch_end=False,
             enable_version_counter=False,
         )
-        self.released = folder / CHECKPOINT
+        self.folder = folder / CHECKPOINT
         self.kind = kind
         self.record = record
         self.score_to_beat = -math.inf
@@ -87,17 +94,17 @@ class BestCheckpoint(ModelCheckpoint):
         if float(score) > self.score_to_beat:
             state = torch.load(self.best_model_path, map_location="cpu", weights_only=True)
             seconds = state["callbacks"]["Timer"]["time_elapsed"]["train"]
-            self.release(module, state["state_dict"], state["global_step"], seconds)
+            self.write_checkpoint(module, state["state_dict"], state["global_step"], seconds)
 
-    def release(
+    def write_checkpoint(
         self, module: Any, weights: Mapping[str, Tensor], step: int, seconds: float
     ) -> None:
-        """Write the network of a module as a checkpoint.
+        """Write a checkpoint of the network in training, with weights of an earlier step.
 
         Args:
-            module: Module in training.
-            weights: State dict of the module at the step.
-            step: Number of steps.
+            module: The ``TrainingModule``.
+            weights: State dict of the module after the step.
+            step: Number of the step.
             seconds: Duration of the training up to the step.
         """
         network = copy.deepcopy(module.network)
@@ -111,22 +118,13 @@ class BestCheckpoint(ModelCheckpoint):
             "minutes": round(seconds / 60.0, 1),
             "validation": remove_score(module.validation),
         }
-        save_checkpoint(self.released, self.kind, network, network.config.to_dict(), record)
+        save_checkpoint(self.folder, self.kind, network, network.config.to_dict(), record)
 
 
 def remove_score(validation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the measures of a validation without the score that is computed from them."""
+    """Return the measures of a validation without the score that is computed from them.
+
+    >>> remove_score({"score": -0.5, "valid_loss": 0.5})
+    {'valid_loss': 0.5}
+    """
     return {name: value for name, value in validation.items() if name != "score"}
-
-
-class ProgressBar(TQDMProgressBar):
-    """Lightning's progress bar without epoch and version, because a training is one epoch."""
-
-    def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, Any]:
-        metrics: dict[str, Any] = super().get_metrics(trainer, module)
-        metrics.pop("v_num", None)
-        return remove_score(metrics)
-
-    def on_train_epoch_start(self, trainer: L.Trainer, *arguments: Any) -> None:
-        super().on_train_epoch_start(trainer, *arguments)
-        self.train_progress_bar.set_description("Training")

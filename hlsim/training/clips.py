@@ -12,13 +12,19 @@ from hlsim.audio import find_audio, read_audio
 from hlsim.dsp.resample import resample
 
 MAX_FAILURES = 10_000
-"""Number of useless draws in a row that is an error. One second per hour of a recording may be
-loud."""
+"""Number of draws in a row without a clip that is an error. It allows for recordings that are silent
+except for one second per hour."""
 
 MAX_SAMPLES_IN_MEMORY = 2**30
 """Number of samples of all recordings in memory: 2 GB, 18 hours at 16 kHz."""
 
-SILENT_POWER = 1e-7
+Source = str | Path | Sequence[Path | tuple[Path, Path]]
+"""A folder that is searched for audio, with its subfolders; or a list of files.
+
+In a list, a pair of files, clean speech and its noisy version, stands for the noise between them.
+"""
+
+_SILENT_POWER = 1e-7
 """Mean square up to which a clip counts as silent, if the peak of its recording is 1.0."""
 
 
@@ -30,7 +36,7 @@ class Clips:
     drawn, another file is drawn instead.
 
     Args:
-        source: Folder that is searched for audio, with its subfolders; or a list of files.
+        source: Folder or files, see ``Source``.
         sample_rate: Sample rate of the clips in Hz.
         seconds: Duration of a clip.
         repeat: Whether recordings that are shorter than a clip are repeated; otherwise silence
@@ -38,17 +44,25 @@ class Clips:
 
     Raises:
         ValueError: The folder does not exist or has no audio in it, or the clips have no samples.
+
+    >>> folder = Path(__file__).parents[1] / "data" / "speech" / "train"
+    >>> clips = Clips(folder, sample_rate=16000, seconds=0.5)
+    >>> clips.draw(3, torch.Generator()).shape
+    torch.Size([3, 8000])
     """
 
     def __init__(
         self,
-        source: str | Path | Sequence[Path],
+        source: Source,
         *,
         sample_rate: int,
         seconds: float,
         repeat: bool = False,
     ) -> None:
-        self.files = find_audio(source) if isinstance(source, str | Path) else list(source)
+        files = find_audio(source) if isinstance(source, str | Path) else source
+        pairs = [file if isinstance(file, tuple) else (None, file) for file in files]
+        self.files = [file for _, file in pairs]
+        self._clean_files = [clean for clean, _ in pairs]
         self.sample_rate = sample_rate
         self.repeat = repeat
         self.samples = round(seconds * sample_rate)
@@ -63,7 +77,17 @@ class Clips:
         return len(self.files)
 
     def read_recording(self, index: int) -> Tensor:
-        """Return a whole recording, scaled to a peak of 1.0. Shape: -> (time,)."""
+        """Return a whole recording, scaled to a peak of 1.0.
+
+        Args:
+            index: Index of the file in ``files``.
+
+        Returns:
+            Samples with shape (time,).
+
+        Raises:
+            ValueError: The file cannot be read, or its first channel is silent.
+        """
         if index not in self._recordings:
             waveform = self._decode(index)
             peak = float(waveform.abs().max())
@@ -77,7 +101,7 @@ class Clips:
         """Cut a clip out of a recording.
 
         Args:
-            index: Index of the file.
+            index: Index of the file in ``files``.
             position: Position of the clip, from 0 at the start of the recording to 1 at its end.
 
         Returns:
@@ -101,7 +125,7 @@ class Clips:
             Clips with shape (count, time).
 
         Raises:
-            ValueError: Too many draws in a row give no clip.
+            ValueError: 10,000 draws in a row gave no clip.
         """
         clips: list[Tensor] = []
         failures = 0
@@ -112,7 +136,7 @@ class Clips:
             position = float(torch.rand((), generator=generator))
             if self._is_usable(index):
                 clip = self.cut_clip(index, position)
-                if float(clip.square().mean()) > SILENT_POWER:
+                if float(clip.square().mean()) > _SILENT_POWER:
                     clips.append(clip)
                     failures = 0
                     continue
@@ -127,7 +151,10 @@ class Clips:
 
     def _decode(self, index: int) -> Tensor:
         """Decode the first channel of a file at the clips' sample rate. Shape: -> (time,)."""
-        waveform, rate = read_audio(self.files[index])
+        file, clean_file = self.files[index], self._clean_files[index]
+        waveform, rate = read_audio(clean_file or file)
+        if clean_file is not None:
+            waveform = read_noisy(file, waveform, rate) - waveform
         return resample(waveform[:1], rate, self.sample_rate).squeeze(0)
 
     def _limit_memory(self) -> None:
@@ -149,30 +176,8 @@ class Clips:
         return True
 
 
-class NoiseOfPairs(Clips):
-    """Clips of the noise in pairs of clean and noisy speech, which is their difference.
-
-    Args:
-        pairs: Pairs of files, clean speech and its noisy version, aligned and equally long.
-        sample_rate: Sample rate of the clips in Hz.
-        seconds: Duration of a clip. Shorter noise is repeated.
-    """
-
-    def __init__(
-        self, pairs: Sequence[tuple[Path, Path]], *, sample_rate: int, seconds: float
-    ) -> None:
-        noisy_files = [noisy for _, noisy in pairs]
-        super().__init__(noisy_files, sample_rate=sample_rate, seconds=seconds, repeat=True)
-        self.clean_files = [clean for clean, _ in pairs]
-
-    def _decode(self, index: int) -> Tensor:
-        clean, rate = read_audio(self.clean_files[index])
-        noise = read_noisy(self.files[index], clean, rate) - clean
-        return resample(noise[:1], rate, self.sample_rate).squeeze(0)
-
-
 def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
-    """Read the noisy version of clean speech.
+    """Read noisy speech, and check that it has the shape and the rate of its clean version.
 
     Args:
         path: File of noisy speech.
@@ -185,6 +190,10 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
     Raises:
         ValueError: The file cannot be read, or differs in length, channels or sample rate from the
             clean speech.
+
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> read_noisy(EXAMPLE_FILE, clean=torch.zeros(1, 64320), clean_rate=16000).shape
+    torch.Size([1, 64320])
     """
     noisy, rate = read_audio(path)
     if (noisy.shape, rate) != (clean.shape, clean_rate):

@@ -22,17 +22,28 @@ from hlsim.training.trainer import TrainerOptions, train_network
 
 Simulator = str | Path | nn.Module
 
-NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
+_NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
 """Criteria that train a hearing aid's noise reduction. ``HearingLossLoss`` has the others."""
 
 
 class CompensatorTraining(TrainingModule):
-    """Training of a compensator in front of a frozen simulator.
+    """Lightning module that trains a compensator in front of a frozen simulator.
 
-    A hearing aid has two parts, and only the parts to which the recipe's criteria belong are
-    trained. Otherwise the criteria of noise reduction would change the amplification, because HASPI
-    rewards gain. The criteria of amplification would weaken the noise reduction, because it lowers
-    the level.
+    A ``HearingAid`` has two parts, noise reduction and amplification. Each part is trained only by
+    its own criteria, and frozen if the recipe has none. Otherwise the criteria of noise reduction
+    would change the amplification, because HASPI rewards gain. The criteria of amplification would
+    weaken the noise reduction, because it lowers the level.
+
+    Args:
+        recipe: Settings of the network and of the training.
+        simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
+
+    >>> import torch
+    >>> module = CompensatorTraining(CompensatorRecipe(model={"channels": 8, "blocks": 1}))
+    >>> speech, ears = 0.02 * torch.randn(1, 8000), torch.full((1, 8), 40.0)
+    >>> batch = {"signal": speech, "clean": speech, "thresholds": ears}
+    >>> bool(module.training_loss(batch) > 0.0)
+    True
     """
 
     recipe: CompensatorRecipe
@@ -43,7 +54,7 @@ class CompensatorTraining(TrainingModule):
         super().__init__(network, recipe)
         used = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.noise_weights = {
-            name: used.pop(name) for name in NOISE_REDUCTION_CRITERIA if name in used
+            name: used.pop(name) for name in _NOISE_REDUCTION_CRITERIA if name in used
         }
         self.trains_amplification = bool(used)
         self.loss = HearingLossLoss(
@@ -83,11 +94,11 @@ class CompensatorTraining(TrainingModule):
         return self.loss(self.network(signal, ears, slider), reference, ears)
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the loss of a validation batch, by the name ``valid_loss``."""
+        """Compute the loss of a validation batch, ``valid_loss`` with shape (1,)."""
         return {"valid_loss": self.training_loss(batch)[None]}
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Compute the mean loss over the validation batches."""
+        """Compute the mean loss over the validation batches. The score is its negative."""
         mean = float(values["valid_loss"].double().mean())
         return {"score": -mean, "valid_loss": mean}
 
@@ -104,9 +115,9 @@ def train_compensator(
     """Train a compensator, or resume its training, and save the one with the best validation.
 
     Args:
-        data: Speech, noise and ears.
+        data: Speech, noise and ears for training and validation.
         recipe: Network, criteria and number of steps.
-        out: Folder for the results.
+        out: Folder for the results. A training that was interrupted resumes from it.
         audiogram: Ear of a personal compensator; None trains a general one on random ears.
         simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
         options: Device, time limit and progress, see ``TrainerOptions``.
@@ -116,6 +127,11 @@ def train_compensator(
 
     Raises:
         ValueError: The data, the recipe or the simulator is invalid.
+
+    >>> def train_and_load(speech: str, out: str) -> nn.Module:
+    ...     data, recipe = TrainingData(Path(speech)), CompensatorRecipe(steps=1000)
+    ...     ear = Audiogram.standard("N4")
+    ...     return load_compensator(train_compensator(data, recipe, out=out, audiogram=ear))
     """
     module = CompensatorTraining(recipe, simulator=simulator)
     batches = compensator_data(data, recipe, audiogram)

@@ -1,4 +1,4 @@
-"""Batches for Lightning, which depend on the number of the training step alone."""
+"""Loading of batches with Lightning. A batch depends on the number of the training step alone."""
 
 from __future__ import annotations
 
@@ -16,42 +16,49 @@ Batch = dict[str, Tensor]
 """Tensors by name.
 
 - ``clean``: clean speech in pascals with shape (items, time)
-- ``signal``: input in pascals with shape (items, time)
+- ``signal``: input of the network in pascals with shape (items, time)
 - ``thresholds``: ears in dB HL with shape (items, 8)
 - ``impaired``: output of the teacher in pascals with shape (items, time), computed on the device
-- ``sounds``: a mark of validation batches of tones and clicks
+- ``noise_reduction``: strength of an aid's noise reduction, 0 or 1, with shape (items,)
+- ``sounds``: present in validation batches of tones and clicks only
 """
 
-MANY_STEPS = 10_000_000
-"""Number of training batches if the Trainer has no number of steps."""
+_MANY_STEPS = 10_000_000
+"""Number of training batches without a Trainer."""
 
 
 class Step(NamedTuple):
-    """Number of a training step, rank of its process, and number of processes."""
+    """Index of a training batch.
+
+    Attributes:
+        number: Number of the step, from 0.
+        rank: Number of the process among those that train together.
+
+    >>> Step(3)
+    Step(number=3, rank=0)
+    """
 
     number: int
     rank: int = 0
-    processes: int = 1
 
 
 @dataclass(eq=False)
-class Steps(Sampler[Step]):
-    """Steps of one process from ``first`` to ``end``, which is not included."""
+class _Steps(Sampler[Step]):
+    """Steps that one process takes, from ``first`` to ``end``, which is not included."""
 
-    first: int = 0
-    rank: int = 0
-    processes: int = 1
-    end: int = MANY_STEPS
+    first: int
+    end: int
+    rank: int
 
     def __len__(self) -> int:
         return self.end  # Lightning also counts the steps before a resumption.
 
     def __iter__(self) -> Iterator[Step]:
-        return (Step(number, self.rank, self.processes) for number in range(self.first, self.end))
+        return (Step(number, self.rank) for number in range(self.first, self.end))
 
 
-class ReturnedErrors(Dataset[Any]):
-    """Data set that returns an error instead of raising it, if a batch cannot be drawn.
+class _ReturnedErrors(Dataset[Any]):
+    """Data set that returns a ValueError instead of raising it.
 
     A DataLoader would add the traceback of its worker to the message.
     """
@@ -67,7 +74,7 @@ class ReturnedErrors(Dataset[Any]):
 
 
 class BatchData(L.LightningDataModule):
-    """Training batches by step, and fixed validation batches.
+    """Lightning's data module of both trainings: batches by step, and fixed validation batches.
 
     A resumed training continues with the batch after the last one. Each device draws its own
     batches, for which the Trainer requires ``use_distributed_sampler=False``.
@@ -75,8 +82,13 @@ class BatchData(L.LightningDataModule):
     Args:
         training: Data set that returns the batch of a ``Step``.
         validation: Batches for validation.
-        teacher: Module that computes ``impaired`` for batches without it, on the training device.
+        teacher: Simulator that computes ``impaired`` for batches without it, on the training
+            device; None leaves batches as they are.
         workers: Number of processes that draw batches, in addition to the one that trains.
+
+    >>> batches = {Step(0): {"clean": Tensor([1.0])}}
+    >>> next(iter(BatchData(batches).train_dataloader()))
+    {'clean': tensor([1.])}
     """
 
     def __init__(
@@ -95,12 +107,12 @@ class BatchData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         trainer = self.trainer
-        steps = Steps()
-        if trainer is not None:
-            end = MANY_STEPS if trainer.max_steps < 0 else trainer.max_steps
-            steps = Steps(trainer.global_step, trainer.global_rank, trainer.world_size, end)
+        if trainer is None:
+            steps = _Steps(0, _MANY_STEPS, rank=0)
+        else:
+            steps = _Steps(trainer.global_step, trainer.max_steps, trainer.global_rank)
         return DataLoader(
-            ReturnedErrors(self.training),
+            _ReturnedErrors(self.training),
             batch_size=None,
             sampler=steps,
             num_workers=self.workers,

@@ -1,4 +1,4 @@
-"""Criteria of a hearing aid's noise reduction: the error of its gains, and HASPI at equal level."""
+"""Training criteria for a hearing aid's noise reduction: the error of its gains, and HASPI."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.metrics.score_loss import score_loss
 from hlsim.neuro.config import NEURO_RATE
 
-POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
+_POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
 """Power in Pa^2 (0 dB SPL) that is added to speech and noise, so that silence is not attenuated."""
 
-WIENER_EXPONENT = 0.6
+_WIENER_EXPONENT = 0.6
 """Target gain in dB divided by Wiener's gain in dB."""
 
-GAIN_DELAY = 1
+_GAIN_DELAY = 1
 """Number of frames between the frame from which a gain is estimated and that to which it
 applies."""
 
@@ -37,10 +37,14 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
     Args:
         aid: Hearing aid at 16 kHz.
         signal: Noisy speech in pascals with shape (items, time).
-        clean: Clean speech in pascals with shape (items, time).
+        clean: The same speech without noise, in pascals with shape (items, time).
 
     Returns:
-        The error of each item, with shape (items,).
+        The error of each item, with shape (items,), from 0 to 1.
+
+    >>> clean = 0.02 * torch.randn(2, 8000)
+    >>> attenuation_error(HearingAid(), clean + 0.01 * torch.randn(2, 8000), clean).shape
+    torch.Size([2])
     """
     samples = signal.shape[-1] // HOP * HOP
     signal, clean = signal[:, :samples], clean[:, :samples]
@@ -49,27 +53,32 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
         parts = torch.stack((clean, signal - clean))
         frames = frame_power(functional.pad(parts, (HISTORY, 0)).flatten(0, 1))
         speech, noise = band_powers(frames, aid.bands).chunk(2)
-        wiener = ((speech + POWER_FLOOR) / (speech + noise + POWER_FLOOR)).sqrt()
+        wiener = ((speech + _POWER_FLOOR) / (speech + noise + _POWER_FLOOR)).sqrt()
         lowest_gain = 10.0 ** (-aid.config.reduction_db / 20.0)
-        target = (wiener**WIENER_EXPONENT).clamp_min(lowest_gain)[:, GAIN_DELAY:]
-    return (gains[:, :-GAIN_DELAY].sqrt() - target.sqrt()).square().mean((-2, -1))
+        target = (wiener**_WIENER_EXPONENT).clamp_min(lowest_gain)[:, _GAIN_DELAY:]
+    return (gains[:, :-_GAIN_DELAY].sqrt() - target.sqrt()).square().mean((-2, -1))
 
 
 def missing_intelligibility(aid: HearingAid, signal: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
-    """Compute 1 - HASPI of an aid's output at the level of its output for clean speech.
+    """Compute how much intelligibility an aid with noise reduction leaves missing: 1 - HASPI.
 
-    HASPI rewards gain, and noise reduction lowers the level. At equal level, noise reduction
-    improves HASPI only by removing noise. Unlike Wiener's gains, this criterion accounts for the
-    onsets of syllables, at which a causal estimate of the gains is late.
+    HASPI (0 to 1) rewards gain, and noise reduction lowers the level. The output is therefore
+    scored at the level that the aid gives to the clean speech, so that noise reduction improves the
+    score only by removing noise. Unlike Wiener's gains, this criterion accounts for the onsets of
+    syllables, at which a causal estimate of the gains is late.
 
     Args:
         aid: Hearing aid at 16 kHz.
         signal: Noisy speech in pascals with shape (items, time).
-        clean: Clean speech in pascals with shape (items, time).
-        ears: Thresholds in dB HL with shape (items, 8).
+        clean: The same speech without noise, in pascals with shape (items, time).
+        ears: Hearing thresholds in dB HL at ``FREQUENCIES``, with shape (items, 8).
 
     Returns:
-        The criterion of each item, with shape (items,).
+        1 - HASPI of each item, with shape (items,).
+
+    >>> clean, ears = 0.02 * torch.randn(1, 16000), torch.full((1, 8), 40.0)
+    >>> missing_intelligibility(HearingAid(), clean, clean, ears).shape
+    torch.Size([1])
     """
     output = aid(signal, ears, noise_reduction=1.0)
     with torch.no_grad():

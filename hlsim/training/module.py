@@ -21,12 +21,12 @@ from hlsim.training.recipes import TrainingRecipe
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config", bound=ModelConfig)
 
-WARM_UP_STEPS = 50
+_WARM_UP_STEPS = 50
 """Number of steps over which the learning rate rises."""
 
 
 class TrainingModule(L.LightningModule):
-    """A network in training.
+    """Lightning module of both trainings: a network with its loss and its validation.
 
     The learning rate depends on the step alone, and the training ends with a validation after the
     recipe's last step. Subclasses implement ``training_loss``, ``evaluate`` and ``summarise``.
@@ -36,10 +36,15 @@ class TrainingModule(L.LightningModule):
         recipe: Learning rate, number of steps, and settings of the subclass.
 
     Attributes:
-        validation: Measures of the last validation by name. The best network has the highest
+        validation: Results of the last validation by name. The best network has the highest
             ``score``.
-        start_validation: Measures of the validation before the first step.
-        description: Settings and data, by which a resumed training is recognised.
+        start_validation: Results of the validation before the first step.
+        description: Recipe and data. A training resumes only with the same description.
+
+    >>> from hlsim.training.recipes import CompensatorRecipe
+    >>> module = TrainingModule(nn.Linear(2, 1), CompensatorRecipe())
+    >>> [parameter.numel() for parameter in module.trained_parameters()]
+    [2, 1]
     """
 
     def __init__(self, network: nn.Module, recipe: TrainingRecipe) -> None:
@@ -52,16 +57,26 @@ class TrainingModule(L.LightningModule):
         self._evaluations: list[dict[str, Tensor]] = []
 
     def training_loss(self, batch: Batch) -> Tensor:
-        """Compute the loss of a batch. Shape: -> ()."""
+        """Compute the loss of a batch, a scalar."""
         raise NotImplementedError
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the measures of a validation batch by name, with one value per item or batch."""
+        """Measure the network on a validation batch.
+
+        Returns:
+            Measured values by name, each with shape (items,) or, for a mean over items, (1,).
+        """
         raise NotImplementedError
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Compute means or quantiles of the measures of all validation batches, and the
-        ``score``."""
+        """Summarise the measured values of all validation batches.
+
+        Args:
+            values: Values of all items by name, see ``evaluate``.
+
+        Returns:
+            Means or quantiles by name, and ``score``, which is highest for the best network.
+        """
         raise NotImplementedError
 
     def trained_parameters(self) -> list[nn.Parameter]:
@@ -119,16 +134,23 @@ def relative_learning_rate(step: int, steps: int) -> float:
     It rises over the first 50 steps, and falls along half a period of a cosine to 1 % at the end.
 
     Args:
-        step: Number of the step.
+        step: Number of the step, from 0.
         steps: Number of steps of the training.
+
+    >>> relative_learning_rate(25, 1000) < relative_learning_rate(50, 1000)
+    True
     """
-    rise = min(1.0, (step + 1) / WARM_UP_STEPS)
+    rise = min(1.0, (step + 1) / _WARM_UP_STEPS)
     fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / steps)))
     return rise * max(0.01, fall)
 
 
 def concatenate(evaluations: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Concatenate the values of several batches by name. A batch may lack names."""
+    """Concatenate the measured values of several batches by name. A batch may lack names.
+
+    >>> concatenate([{"snr": torch.ones(1)}, {"snr": torch.zeros(1)}, {}])
+    {'snr': tensor([1., 0.])}
+    """
     lists: dict[str, list[Tensor]] = {}
     for evaluation in evaluations:
         for name, values in evaluation.items():
@@ -147,13 +169,19 @@ def initial_network(
     Args:
         recipe: Recipe with the name of the checkpoint (``start``), the settings of the network
             (``model``) and the seed of random weights.
-        config_kind: Class of the network's settings.
-        build: Function from settings to network.
-        load: Function from the name of a checkpoint to its network.
+        config_kind: Class of the network's settings, such as ``NeuroConfig``.
+        build: Function that builds a network with such settings.
+        load: Function that loads the network of a checkpoint by its name.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind, or its settings differ from
             those of the recipe.
+
+    >>> from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
+    >>> from hlsim.training.recipes import SimulatorRecipe
+    >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
+    >>> initial_network(recipe, NeuroConfig, NeuroMSBG, load_pretrained).config.channels
+    4
     """
     config = config_kind.from_dict(recipe.model)
     if not recipe.start:

@@ -11,16 +11,18 @@ from typing import Any, ClassVar, Literal
 
 Kind = Literal["mapping-compensator", "hearing-aid"]
 Precision = Literal["float32", "bfloat16"]
-UnitPower = Literal["truth", "input"]
+_UnitPower = Literal["truth", "input"]
 ReferenceName = Literal["clean", "normal-hearing"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingRecipe:
-    """Settings of both trainings, with the defaults of a simulator.
+    """Settings that the trainings of simulators and compensators share.
+
+    The defaults are those of a simulator. The subclasses have further settings.
 
     Attributes:
-        model: Settings of the network, such as ``channels``.
+        model: Settings of the network by name, such as ``channels``.
         start: Name or folder of a checkpoint to start from, instead of random weights. The network
             has its settings. It remains the best network until training finds a better one.
         steps: Number of training steps. The learning rate falls over them.
@@ -34,6 +36,13 @@ class TrainingRecipe:
         validation_items: Number of validation items, rounded up to batches of 4 (compensators) or 8
             (simulators).
         seed: Seed of every random draw.
+
+    Raises:
+        ValueError: A setting is out of range, or the settings contradict each other.
+
+    >>> CompensatorRecipe(batch=0)
+    Traceback (most recent call last):
+    ValueError: recipe: batch is 0, expected 1 or more
     """
 
     model: dict[str, Any] = field(default_factory=dict)
@@ -98,10 +107,13 @@ class SimulatorRecipe(TrainingRecipe):
             hardware. Transforms, prior, scans and criteria remain in float32.
         average: Weight of the past in the moving average of the weights; 0 for none. The average is
             validated and saved.
+
+    >>> SimulatorRecipe(steps=1000).learning_rate
+    0.001
     """
 
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
-    unit_power: UnitPower = "truth"
+    unit_power: _UnitPower = "truth"
     treated: bool = True
     precision: Precision = "float32"
     average: float = 0.99
@@ -140,6 +152,9 @@ class CompensatorRecipe(TrainingRecipe):
         babble: Share of noisy clips whose noise is up to four other voices.
         snr: Lowest and highest signal-to-noise ratio in dB.
         unreduced: Share of items for which a hearing aid's noise reduction is off.
+
+    >>> CompensatorRecipe(kind="hearing-aid", weights={"denoising": 1.0}).steps
+    3000
     """
 
     kind: Kind = "mapping-compensator"

@@ -19,15 +19,27 @@ from hlsim.training.callbacks import WeightAverage
 from hlsim.training.data_module import Batch
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
-from hlsim.training.teacher import find_teacher, teacher_name
+from hlsim.training.teacher import find_teacher
 from hlsim.training.trainer import TrainerOptions, train_network
 
-POWER_FLOOR = 1e-18
+_POWER_FLOOR = 1e-18
 """Power in Pa^2 that is added to the power of a signal before dividing by it."""
 
 
 class SimulatorTraining(TrainingModule):
-    """Training of a network on the output of a teacher, which batches contain as ``impaired``."""
+    """Lightning module that trains a Neuro-MSBG on the output of a teacher.
+
+    Batches contain that output as ``impaired``.
+
+    Args:
+        recipe: Settings of the network and of the training.
+
+    >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
+    >>> signal, ears = 0.02 * torch.randn(1, 4000), torch.full((1, 8), 40.0)
+    >>> batch = {"signal": signal, "thresholds": ears, "impaired": 0.1 * signal}
+    >>> SimulatorTraining(recipe).evaluate(batch)["valid_snr"].shape
+    torch.Size([1])
+    """
 
     recipe: SimulatorRecipe
 
@@ -40,7 +52,7 @@ class SimulatorTraining(TrainingModule):
         signal, target = batch["signal"], batch["impaired"]
         perceived = self.network(signal, batch["thresholds"])
         unit = target if self.recipe.unit_power == "truth" else signal
-        scale = unit.square().mean(-1, keepdim=True).add(POWER_FLOOR).rsqrt()
+        scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
         target = target * scale
         perceived = perceived * scale
         weights = self.recipe.weights
@@ -53,14 +65,18 @@ class SimulatorTraining(TrainingModule):
         return weighted_sum(parts, weights).mean()
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the SNR of each item in dB, by one name for speech and one for tones and
-        clicks."""
+        """Compute the ratio of the teacher's output to the network's error for each item.
+
+        Returns:
+            The ratios in dB with shape (items,), as ``valid_snr`` for speech and as
+            ``valid_sounds_snr`` for tones and clicks.
+        """
         perceived = self.network(batch["signal"], batch["thresholds"])
         name = "valid_sounds_snr" if "sounds" in batch else "valid_snr"
         return {name: -noise_to_signal_db(perceived, batch["impaired"])}
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Compute the median and the lowest tenth of each SNR, and the score.
+        """Compute the median and the 10th percentile of the ratios, and a score for the network.
 
         The score weights speech and sounds by their shares in training.
         """
@@ -88,9 +104,9 @@ def train_simulator(
     """Train a simulator, or resume its training, and save the one with the best validation.
 
     Args:
-        data: Speech, noise and ears.
+        data: Speech, noise and ears for training and validation.
         recipe: Network, criteria and number of steps.
-        out: Folder for the results.
+        out: Folder for the results. A training that was interrupted resumes from it.
         teacher: ``"msbg"``, the exact MSBG, or the name of a plug-in, see ``PluginTeacher``.
         options: Device, time limit and progress, see ``TrainerOptions``.
 
@@ -99,11 +115,16 @@ def train_simulator(
 
     Raises:
         ValueError: The data, the recipe or the teacher is invalid.
+
+    >>> from hlsim import load_pretrained
+    >>> def train_and_load(speech: str, out: str) -> NeuroMSBG:
+    ...     recipe = SimulatorRecipe(steps=1000)
+    ...     return load_pretrained(train_simulator(TrainingData(Path(speech)), recipe, out=out))
     """
     module = SimulatorTraining(recipe)
-    reference = find_teacher(teacher)
-    about = {} if reference is None else {"teacher": teacher_name(reference)}
-    batches = simulator_data(data, recipe, reference)
+    plugin = find_teacher(teacher)
+    about = {} if plugin is None else {"teacher": str(plugin)}
+    batches = simulator_data(data, recipe, plugin)
     return train_network(
         module,
         batches,

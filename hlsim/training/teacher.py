@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -18,27 +16,25 @@ from hlsim.plugins import WaveformPlugin
 TEACHERS = ("msbg",)
 """Names of the teachers that are no plug-ins."""
 
-Reference = Callable[[Tensor, Tensor, int], Tensor]
-"""Simulator that replaces the exact MSBG as the teacher.
-
-It receives signals in pascals with shape (items, time), thresholds in dB HL with shape (items, 8)
-and the sample rate in Hz, and returns the perceived signals with shape (items, time).
-"""
-
 
 class PluginTeacher:
-    """Teacher that calls a user's simulator ``(waveform, audiogram) -> waveform``.
+    """Teacher that calls a user's simulator of hearing loss.
 
-    The simulator receives signals in pascals with shape (items, time) and thresholds in dB HL with
-    shape (items, 8). It returns the perceived signals, time-aligned with its input. The sample rate
-    is its attribute ``sample_rate`` or else 16000 Hz.
+    The simulator is a function ``(waveform, audiogram) -> waveform`` or a class of such functions.
+    It receives signals in pascals with shape (items, time) and thresholds in dB HL with shape
+    (items, 8), and returns the perceived signals, time-aligned with its input. Its sample rate is
+    its attribute ``sample_rate`` or else 16000 Hz.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``, see ``load_plugin``.
 
     Raises:
         ValueError: There is no such simulator, its sample rate is out of range, or its output for
-            half a second of noise has another shape or is not finite.
+            half a second of noise has another shape, is delayed or is not finite.
+
+    >>> teacher = PluginTeacher("hlsim:MSBG")
+    >>> teacher(0.02 * torch.randn(1, 16000), torch.zeros(1, 8), 16000).shape
+    torch.Size([1, 16000])
     """
 
     def __init__(self, name: str) -> None:
@@ -55,7 +51,7 @@ class PluginTeacher:
         return str(self.plugin)
 
     def __call__(self, signals: Tensor, thresholds: Tensor, sample_rate: int) -> Tensor:
-        """Simulate the hearing losses at another sample rate than that of the simulator.
+        """Simulate hearing losses. Signals are resampled to the simulator's rate and back.
 
         Args:
             signals: Signals in pascals with shape (items, time).
@@ -70,27 +66,35 @@ class PluginTeacher:
 
 
 class Teacher(nn.Module):
-    """Exact MSBG or another simulator, time-aligned with its input.
+    """Simulator whose output a network learns: the exact MSBG, or a user's simulator.
 
     Args:
         sample_rate: Sample rate of the signals in Hz.
-        reference: Simulator that replaces the exact MSBG.
+        plugin: Simulator that replaces the exact MSBG.
+
+    >>> Teacher(16000)(0.02 * torch.randn(2, 8000), torch.full((2, 8), 40.0)).shape
+    torch.Size([2, 8000])
     """
 
-    def __init__(self, sample_rate: int, reference: Reference | None = None) -> None:
+    def __init__(self, sample_rate: int, plugin: PluginTeacher | None = None) -> None:
         super().__init__()
         self.sample_rate = sample_rate
-        self.reference = reference
+        self.plugin = plugin
         self.msbg = MSBG(sample_rate=sample_rate)
 
     @torch.no_grad()
     def forward(self, signals: Tensor, thresholds: Tensor) -> Tensor:
-        """Simulate the hearing losses.
+        """Simulate hearing losses.
 
-        Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time) in pascals.
+        Args:
+            signals: Signals in pascals with shape (items, time).
+            thresholds: Ears in dB HL with shape (items, 8).
+
+        Returns:
+            Perceived signals in pascals with shape (items, time), time-aligned with ``signals``.
         """
-        if self.reference is not None:
-            return self.reference(signals, thresholds, self.sample_rate)
+        if self.plugin is not None:
+            return self.plugin(signals, thresholds, self.sample_rate)
         perceived: Tensor = self.msbg(signals, thresholds)
         return perceived
 
@@ -106,13 +110,11 @@ def find_teacher(name: str) -> PluginTeacher | None:
 
     Raises:
         ValueError: There is no such teacher.
+
+    >>> find_teacher("msbg") is None
+    True
     """
     if ":" in name:
         return PluginTeacher(name)
     check_names([name], (*TEACHERS, "package.module:name"), "teachers")
     return None
-
-
-def teacher_name(reference: Reference | None) -> str:
-    """Return the name of a teacher, with the fingerprint of a plug-in."""
-    return "msbg" if reference is None else str(getattr(reference, "__name__", reference))

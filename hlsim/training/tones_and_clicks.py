@@ -9,20 +9,12 @@ import math
 import torch
 from torch import Tensor
 
-LOWEST_TONE = 100.0
-"""Lowest frequency of a tone in Hz."""
+from hlsim.training.augment import draw_uniform
 
-HIGHEST_TONE = 7500.0
-"""Highest frequency of a tone in Hz."""
-
-MAX_TONES = 4
-"""Largest number of tones in an item."""
-
-MAX_CLICKS = 8
-"""Largest number of clicks in an item."""
-
-RISE_SECONDS = 0.01
-"""Duration over which a tone rises to its level."""
+_LOWEST_TONE, _HIGHEST_TONE = 100.0, 7500.0  # in Hz
+_MAX_TONES = 4
+_MAX_CLICKS = 8
+_RISE_SECONDS = 0.01
 
 
 def draw_sounds(
@@ -32,48 +24,53 @@ def draw_sounds(
     generator: torch.Generator,
     early_share: float = 0.0,
 ) -> Tensor:
-    """Draw steady tones and clicks at random, without a calibrated level.
+    """Draw sounds that are not speech, without a calibrated level.
 
-    Every second item has one to four tones, which begin at a random time in its first half. The
-    other items have one to eight clicks.
+    The first and every second item after it has one to four steady tones, which rise over 10 ms at
+    a random time in the first half of the item. The other items have one to eight clicks of one
+    sample.
 
     Half of the tones have multiples of 250 Hz, like those of audiometry. Such a tone has the same
-    phase in every frame, which does not happen at random frequencies.
+    phase in every frame of a Fourier transform whose frames are 4 or 8 ms apart. At random
+    frequencies, that does not happen.
 
     Args:
         items: Number of sounds.
-        samples: Length in samples.
+        samples: Length of each sound in samples.
         sample_rate: Sample rate in Hz.
         generator: Source of the random numbers.
-        early_share: Longest time by which tones may begin before the item, relative to half the
-            item.
+        early_share: Longest time before the start of an item at which its tones may begin,
+            relative to half the item. With 1.0, half of the tones sound from the first sample on.
 
     Returns:
-        Sounds with shape (items, time).
+        Sounds with shape (items, samples).
+
+    >>> draw_sounds(4, 16000, 16000, torch.Generator()).shape
+    torch.Size([4, 16000])
     """
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(items, *shape, generator=generator)
+        return draw_uniform(low, high, (items, *shape), generator)
 
-    hertz = uniform(math.log(LOWEST_TONE), math.log(HIGHEST_TONE), MAX_TONES).exp()
-    is_multiple = uniform(0.0, 1.0, MAX_TONES) < 0.5
+    hertz = uniform(math.log(_LOWEST_TONE), math.log(_HIGHEST_TONE), _MAX_TONES).exp()
+    is_multiple = uniform(0.0, 1.0, _MAX_TONES) < 0.5
     hertz = torch.where(is_multiple, 250.0 * (hertz / 250.0).ceil(), hertz)
-    levels_db = uniform(-40.0, 0.0, MAX_TONES)
-    is_absent = uniform(0.0, 1.0, MAX_TONES - 1) < 0.5
+    levels_db = uniform(-40.0, 0.0, _MAX_TONES)
+    is_absent = uniform(0.0, 1.0, _MAX_TONES - 1) < 0.5
     levels_db[:, 1:][is_absent] = -math.inf
     amplitudes = 10.0 ** (levels_db / 20.0)
     time = torch.arange(samples)
     # In single precision, the rounding errors of the phase would be noise 50 dB below the tone.
-    start_periods = uniform(0.0, 1.0, MAX_TONES).unsqueeze(-1)
+    start_periods = uniform(0.0, 1.0, _MAX_TONES).unsqueeze(-1)
     periods = start_periods + hertz.double().unsqueeze(-1) * time / sample_rate
     tones = amplitudes.unsqueeze(-1) * torch.sin(2.0 * math.pi * periods).float()
     starts = uniform(-early_share * 0.5 * samples, 0.5 * samples, 1)
-    rise = ((time - starts) / (RISE_SECONDS * sample_rate)).clamp(0.0, 1.0)
+    rise = ((time - starts) / (_RISE_SECONDS * sample_rate)).clamp(0.0, 1.0)
 
-    positions = (uniform(0.0, 1.0, MAX_CLICKS) * samples).long().clamp_max(samples - 1)
-    heights = uniform(-1.0, 1.0, MAX_CLICKS)
+    positions = (uniform(0.0, 1.0, _MAX_CLICKS) * samples).long().clamp_max(samples - 1)
+    heights = uniform(-1.0, 1.0, _MAX_CLICKS)
     heights[:, 0] = 1.0
-    is_absent = uniform(0.0, 1.0, MAX_CLICKS - 1) < 0.5
+    is_absent = uniform(0.0, 1.0, _MAX_CLICKS - 1) < 0.5
     heights[:, 1:][is_absent] = 0.0
     clicks = torch.zeros(items, samples).scatter_add_(1, positions, heights)
     has_tones = (torch.arange(items) % 2 == 0).unsqueeze(-1)

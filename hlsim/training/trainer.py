@@ -19,23 +19,23 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from hlsim.checkpoint import checkpoint_digest
-from hlsim.training.callbacks import CHECKPOINT, BestCheckpoint, ProgressBar
+from hlsim.training.callbacks import CHECKPOINT, BestCheckpoint
 from hlsim.training.data_module import BatchData
 from hlsim.training.module import TrainingModule
 from hlsim.training.recipes import TrainingRecipe
 from hlsim.version import __version__
 
-LAST_STATE = "last.ckpt"
+_LAST_STATE = "last.ckpt"
 """Name of the file from which a training resumes."""
 
-EXPECTED_WARNINGS = (
+_EXPECTED_WARNINGS = (
     "many workers|directory .* exists|not used|before the epoch ended|logging interval|LeafSpec"
 )
 """Pattern of Lightning's warnings about choices that hlsim makes on purpose."""
 
 
 class TrainerOptions(TypedDict, total=False):
-    """Options of a training that do not change its result.
+    """Options of a training that do not change the trained weights.
 
     Attributes:
         max_minutes: Time limit in minutes, including the time before a resumption. By default, the
@@ -43,6 +43,9 @@ class TrainerOptions(TypedDict, total=False):
         accelerator: Type of device, "auto" (default), "cpu" or "gpu", see Lightning's ``Trainer``.
         devices: Number of devices, 1 by default. Each draws a batch of its own at every step.
         progress: Whether a terminal shows a progress bar, which it does by default.
+
+    >>> TrainerOptions(max_minutes=5.0)
+    {'max_minutes': 5.0}
     """
 
     max_minutes: float | None
@@ -62,22 +65,22 @@ def train_network(
     callbacks: Sequence[Callback] = (),
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a network, or resume its training, and save the one with the best validation.
+    """Train a network, or resume its training, and save the weights with the best validation score.
 
     Args:
-        module: Network in training.
+        module: Network, loss and recipe.
         data: Batches for training and validation.
-        kind: Kind of the checkpoint.
-        out: Folder for the checkpoint, the states and TensorBoard's events. If it contains a state,
-            the training resumes from it.
+        kind: Kind of the checkpoint, such as ``"hearing-aid"``.
+        out: Folder for the checkpoint, Lightning's states and TensorBoard's events. If it contains
+            a state, the training resumes from it.
         identity: Description of data and teacher. A training resumes only with the same description
             and recipe.
-        about: Entries of the checkpoint's training record, besides recipe, steps and validation.
+        about: Further entries for the checkpoint's ``config.json``.
         callbacks: Additional callbacks of Lightning.
-        options: Device, time limit and progress.
+        options: Device, time limit and progress, see ``TrainerOptions``.
 
     Returns:
-        The folder of the checkpoint.
+        The folder ``checkpoint`` below ``out``.
 
     Raises:
         ValueError: The folder contains another training or a broken state, there is no such device,
@@ -90,15 +93,15 @@ def train_network(
     record = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about}
     module.description = asdict(recipe) | start | dict(identity)
 
-    last_path = folder / LAST_STATE
-    last_state = read_state(last_path) if last_path.exists() else None
+    last_path = folder / _LAST_STATE
+    last_state = _read_state(last_path) if last_path.exists() else None
     if last_state is not None:
-        check_description(last_path, last_state["description"], module.description)
+        _check_description(last_path, last_state["description"], module.description)
         module.start_validation = last_state["start_validation"]
 
     best = BestCheckpoint(folder, kind, record)
-    with quiet_lightning():
-        trainer = make_trainer(folder, recipe, [*callbacks, best], options)
+    with _quiet_lightning():
+        trainer = _make_trainer(folder, recipe, [*callbacks, best], options)
         try:
             if last_state is None:
                 trainer.validate(module, datamodule=data, verbose=False)
@@ -107,7 +110,7 @@ def train_network(
                 # The start is the best network until training finds a better one.
                 best.score_to_beat = module.start_validation["score"]
                 if last_state is None and trainer.is_global_zero:
-                    best.release(module, module.state_dict(), step=0, seconds=0.0)
+                    best.write_checkpoint(module, module.state_dict(), step=0, seconds=0.0)
             ckpt_path = None if last_state is None else last_path
             trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
         except SystemExit:
@@ -117,16 +120,10 @@ def train_network(
     return folder / CHECKPOINT
 
 
-def make_trainer(
+def _make_trainer(
     folder: Path, recipe: TrainingRecipe, callbacks: Sequence[Callback], options: TrainerOptions
 ) -> L.Trainer:
-    """Make a Trainer for the steps of a recipe.
-
-    Args:
-        folder: Folder for states and events.
-        recipe: Number of steps, and interval of validations.
-        callbacks: Additional callbacks.
-        options: Device, time limit and progress.
+    """Make a Trainer of Lightning that takes the steps of a recipe and saves its state.
 
     Raises:
         ValueError: There is no such device.
@@ -135,15 +132,12 @@ def make_trainer(
     duration = None if max_minutes is None else timedelta(minutes=max_minutes)
     last = ModelCheckpoint(
         dirpath=folder,
-        filename=Path(LAST_STATE).stem,
+        filename=Path(_LAST_STATE).stem,
         save_on_train_epoch_end=False,
         enable_version_counter=False,
     )
     # The state includes those of all callbacks, if it is saved after they have run.
     all_callbacks = [Timer(duration, verbose=False), *callbacks, last]
-    show_progress = options.get("progress", True) and sys.stdout.isatty()
-    if show_progress:
-        all_callbacks.append(ProgressBar())
     accelerator = options.get("accelerator", "auto")
     devices = options.get("devices", 1)
     try:
@@ -158,7 +152,7 @@ def make_trainer(
             num_sanity_val_steps=0,
             gradient_clip_val=1.0,
             callbacks=all_callbacks,
-            enable_progress_bar=show_progress,
+            enable_progress_bar=options.get("progress", True) and sys.stdout.isatty(),
             enable_model_summary=False,
             logger=TensorBoardLogger(str(folder), name="", version="events"),
             log_every_n_steps=10,
@@ -170,12 +164,8 @@ def make_trainer(
         ) from error
 
 
-def read_state(path: Path) -> dict[str, Any]:
-    """Read the state of a training.
-
-    Raises:
-        ValueError: The file is broken.
-    """
+def _read_state(path: Path) -> dict[str, Any]:
+    """Read the state of a training. A broken file raises ValueError."""
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         state["description"]
@@ -187,13 +177,13 @@ def read_state(path: Path) -> dict[str, Any]:
     return state
 
 
-def check_description(path: Path, actual: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+def _check_description(path: Path, actual: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """Raise ValueError unless a state belongs to the training that should resume.
 
     Args:
         path: File of the state, for the error message.
-        actual: Description in the state.
-        expected: Description of the training.
+        actual: Description of the training that wrote the state.
+        expected: Description of the training that should resume.
     """
     names = sorted({*actual, *expected})
     differences = [name for name in names if actual.get(name) != expected.get(name)]
@@ -205,14 +195,14 @@ def check_description(path: Path, actual: Mapping[str, Any], expected: Mapping[s
 
 
 @contextmanager
-def quiet_lightning() -> Iterator[None]:
-    """Silence Lightning's messages about devices, and its warnings in ``EXPECTED_WARNINGS``."""
+def _quiet_lightning() -> Iterator[None]:
+    """Silence Lightning's messages about devices, and the warnings in ``_EXPECTED_WARNINGS``."""
     logger = logging.getLogger("lightning.pytorch")
     level = logger.level
     logger.setLevel(logging.WARNING)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", f".*({EXPECTED_WARNINGS})")
+            warnings.filterwarnings("ignore", f".*({_EXPECTED_WARNINGS})")
             yield
     finally:
         logger.setLevel(level)

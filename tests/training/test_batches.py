@@ -14,7 +14,7 @@ pytest.importorskip("lightning")
 
 from hlsim.training.batches import TrainingData, compensator_data, simulator_data
 from hlsim.training.corpora.manifest import Utterance, write_manifest
-from hlsim.training.data_module import BatchData, Step, Steps
+from hlsim.training.data_module import BatchData, Step
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 from hlsim.training.simulator import train_simulator
 
@@ -82,7 +82,7 @@ def test_a_batch_depends_on_seed_step_and_rank_alone(manifest: Path) -> None:
     data = TrainingData.from_manifest(manifest)
     training = simulator_data(data, SMALL_RECIPE).training
     again = simulator_data(data, SMALL_RECIPE).training
-    order = [Step(3), Step(0), Step(3, 1, 2), Step(1)]
+    order = [Step(3), Step(0), Step(3, rank=1), Step(1)]
     signals = {step: training[step]["signal"] for step in order}
     for step in reversed(order):
         assert torch.equal(signals[step], again[step]["signal"])
@@ -105,10 +105,6 @@ def test_an_error_of_a_worker_is_raised_as_it_is(manifest: Path, workers: int) -
     batch = next(iter(data.train_dataloader()))
     with pytest.raises(ValueError, match=r"^[^\n]*missing\.wav[^\n]*$"):
         data.on_before_batch_transfer(batch, 0)
-
-
-def test_steps_of_a_process_are_its_own() -> None:
-    assert list(Steps(5, 1, 2, end=7)) == [(5, 1, 2), (6, 1, 2)]
 
 
 def test_the_teacher_fills_in_what_is_missing(manifest: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import read_audio, write_audio
-from hlsim.training.clips import Clips, NoiseOfPairs
+from hlsim.training.clips import Clips
 
 
 def folder_with(tmp_path: Path, **waves: Tensor) -> Path:
@@ -116,7 +116,7 @@ def test_noise_of_pairs_is_noisy_minus_clean(tmp_path: Path) -> None:
         write_audio(tmp_path / f"{name} noisy.wav", clean + noise, 16000)
     write_audio(tmp_path / "c.wav", ramp(3999), 16000)
     pairs = [(tmp_path / f"{a}.wav", tmp_path / f"{b} noisy.wav") for a, b in ("aa", "bb", "cb")]
-    clips = NoiseOfPairs(pairs, sample_rate=16000, seconds=0.25)
+    clips = Clips(pairs, sample_rate=16000, seconds=0.25, repeat=True)
     with pytest.warns(UserWarning, match=r"b noisy.wav"):
         drawn = clips.draw(20, torch.Generator().manual_seed(0))
     for clip in drawn:

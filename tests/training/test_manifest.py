@@ -76,7 +76,7 @@ def test_invalid_manifests_are_rejected(tmp_path: Path, text: str) -> None:
 )
 def test_contradictions_and_noise_are_rejected(rows: list[Utterance]) -> None:
     with pytest.raises(ValueError):
-        check_utterances(rows)
+        check_utterances(rows, Path())
 
 
 def test_similar_utterances_are_accepted() -> None:
@@ -86,5 +86,6 @@ def test_similar_utterances_are_accepted() -> None:
             Utterance("1.wav", "noisy/1 louder.wav"),  # one clean file in several noises
             Utterance("2.wav", split="test"),  # unknown speakers in several splits
             Utterance("Noisette/3.wav", speaker="Noisette"),
-        ]
+        ],
+        Path(),
     )

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 pytest.importorskip("lightning")
 
-from hlsim.training.callbacks import WeightAverage, make_average_update
+from hlsim.training.callbacks import WeightAverage
 from hlsim.training.data_module import Batch, BatchData, Step
 from hlsim.training.module import TrainingModule, relative_learning_rate
 from hlsim.training.recipes import SimulatorRecipe
@@ -247,7 +247,7 @@ def test_the_average_forgets_the_initial_weights() -> None:
         decay = 0.0 if step == 0 else min(0.2, (1.0 + step) / (10.0 + step))
         expected = decay * expected + (1.0 - decay) * value
     for decay, limit in ((0.2, expected), (0.0, 8.0)):
-        average = AveragedModel(Vector(), multi_avg_fn=make_average_update(decay))
+        average = AveragedModel(Vector(), multi_avg_fn=WeightAverage(decay).update_averages)
         for value in values:
             network = Vector()
             nn.init.constant_(network.values, value)

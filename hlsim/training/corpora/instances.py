@@ -25,25 +25,25 @@ from hlsim.training.corpora.manifest import Utterance
 from hlsim.training.ears import draw_thresholds
 from hlsim.training.teacher import Teacher
 
-Input = Literal["clean", "noisy"]
+_Input = Literal["clean", "noisy"]
 """Version of an utterance that an instance processes."""
 
-SEVERITIES = ("mild", "moderate", "severe")
+_SEVERITIES = ("mild", "moderate", "severe")
 """Severities of the ears, which range "from mild to severe" in the paper."""
 
-EARS_PER_UTTERANCE = 2
+_EARS_PER_UTTERANCE = 2
 """Number of ears per utterance."""
 
 
 class Instances(Dataset[dict[str, Tensor]]):
-    """Instances at 16 kHz, computed on access.
+    """Data set of the paper's training instances at 16 kHz, computed on access.
 
     Each utterance has two ears. For each ear, there is one instance of the clean and one of the
     noisy version. An instance is a dictionary of four tensors:
 
-    - ``impaired``: output of the exact MSBG in pascals with shape (time,)
-    - ``clean``: reference, aligned with it
-    - ``signal``: normal-hearing input, aligned with it
+    - ``signal``: clean or noisy speech in pascals with shape (time,), the input of the simulators
+    - ``impaired``: output of the exact MSBG for it, time-aligned and in pascals
+    - ``clean``: the same utterance without noise, time-aligned and in pascals
     - ``thresholds``: ear in dB HL with shape (8,)
 
     Args:
@@ -51,6 +51,12 @@ class Instances(Dataset[dict[str, Tensor]]):
         root: Folder to which their paths are relative.
         ears: Ears, which are assigned to the utterances in turn, such as those of ``draw_ears``.
         level: Active level of the clean speech in dB SPL (ITU-T P.56).
+
+    >>> speech = Path(__file__).parents[2] / "data" / "speech"
+    >>> rows = [Utterance("train/flite-slt-01.flac")]
+    >>> instances = Instances(rows, speech, draw_ears(2, "train"))
+    >>> len(instances), list(instances[0])
+    (2, ['clean', 'signal', 'impaired', 'thresholds'])
     """
 
     def __init__(
@@ -64,11 +70,11 @@ class Instances(Dataset[dict[str, Tensor]]):
         self.root = Path(root)
         self.level = level
         self.teacher = Teacher(NEURO_RATE)
-        self.items: list[tuple[Utterance, Audiogram, Input]] = []
+        self.items: list[tuple[Utterance, Audiogram, _Input]] = []
         turns = cycle(ears)
         for utterance in utterances:
-            inputs: Sequence[Input] = ("clean", "noisy") if utterance.noisy else ("clean",)
-            for ear in islice(turns, EARS_PER_UTTERANCE):
+            inputs: Sequence[_Input] = ("clean", "noisy") if utterance.noisy else ("clean",)
+            for ear in islice(turns, _EARS_PER_UTTERANCE):
                 self.items += [(utterance, ear, name) for name in inputs]
 
     def __len__(self) -> int:
@@ -86,7 +92,12 @@ class Instances(Dataset[dict[str, Tensor]]):
         return {"clean": clean, "signal": signal, "impaired": impaired, "thresholds": thresholds}
 
     def read(self, utterance: Utterance) -> tuple[Tensor, Tensor]:
-        """Read clean and noisy speech at the level of the instances. Shape: -> (time,), (time,)."""
+        """Read clean and noisy speech at the level of the instances.
+
+        Returns:
+            Clean speech and its noisy version (or the clean speech again), in pascals at 16 kHz
+            with shape (time,).
+        """
         clean, rate = read_audio(self.root / utterance.path)
         noisy = clean
         if utterance.noisy:
@@ -106,12 +117,15 @@ def draw_ears(count: int, split: str, seed: int = 0) -> list[Audiogram]:
         count: Number of ears.
         split: ``train``, ``valid`` or ``test``.
         seed: Seed of the random numbers.
+
+    >>> [ear.severity for ear in draw_ears(3, "train")]
+    ['mild', 'moderate', 'severe']
     """
     generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(split.encode()))
-    unused: dict[str, list[Audiogram]] = {severity: [] for severity in SEVERITIES}
+    unused: dict[str, list[Audiogram]] = {severity: [] for severity in _SEVERITIES}
     ears: list[Audiogram] = []
     while len(ears) < count:
-        severity = SEVERITIES[len(ears) % len(SEVERITIES)]
+        severity = _SEVERITIES[len(ears) % len(_SEVERITIES)]
         if unused[severity]:
             ears.append(unused[severity].pop())
             continue

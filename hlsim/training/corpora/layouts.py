@@ -17,21 +17,21 @@ from hlsim.audio import list_files
 from hlsim.training.corpora.manifest import (
     SPLITS,
     Utterance,
-    check_paths,
     check_utterances,
     read_manifest,
     write_manifest,
 )
 
-SPLIT_NAMES = {
+_SPLIT_NAMES = {
     "train": ("train", "training", "tr"),
     "valid": ("valid", "validation", "val", "dev", "cv", "eval"),
     "test": ("test", "testing", "tt"),
 }
 """Names of the folder of each split."""
 
-_SPLIT_OF = {name: split for split, names in SPLIT_NAMES.items() for name in names}
-LEVELS = {
+_SPLIT_OF = {name: split for split, names in _SPLIT_NAMES.items() for name in names}
+
+_LEVELS = {
     "split": rf"(?P<split>{'|'.join(_SPLIT_OF)})",
     "speaker": r"(?P<speaker>[^/]+)",
     "condition": r"(?P<condition>clean|noisy|noises?)",
@@ -39,7 +39,7 @@ LEVELS = {
 }
 """Meanings that a level of folders can have, with the pattern of its names."""
 
-LAYOUTS = {
+_LAYOUTS = {
     "VoiceBank-DEMAND": (
         r"(?P<condition>clean|noisy)"
         r"(?P<set>_(?P<split>train|test)set(_28spk|_56spk)?_wav(?P<version>_16k|_48k)?)/"
@@ -50,9 +50,9 @@ LAYOUTS = {
     ),
     "TIMIT": r"(?P<split>train|test)/dr\d/(?P<speaker>\w+)/[^/]+",
     "folders clean and noisy in train, valid, test": (
-        rf"{LEVELS['split']}/{LEVELS['condition']}/({LEVELS['speaker']}/(.*/)?)?[^/]+"
+        rf"{_LEVELS['split']}/{_LEVELS['condition']}/({_LEVELS['speaker']}/(.*/)?)?[^/]+"
     ),
-    "folders train, valid, test": rf"{LEVELS['split']}/({LEVELS['speaker']}/(.*/)?)?[^/]+",
+    "folders train, valid, test": rf"{_LEVELS['split']}/({_LEVELS['speaker']}/(.*/)?)?[^/]+",
 }
 """Patterns of the paths of audio files by layout, ignoring case.
 
@@ -60,35 +60,26 @@ The two files of a pair differ in the group ``condition``. The group ``version``
 all.
 """
 
-ADVICE = (
+_ADVICE = (
     "correct the corpus, or use a CSV file with the columns path, noisy, speaker and split "
     "instead, or name the levels of folders, such as --folders split/speaker, or --folders split "
     "if the speakers are unknown"
 )
 """Advice on corpora that are rejected."""
 
-_UNSUPPORTED = {
-    re.compile(r"(^|/)mix_(clean|both|single)/"): (
-        "LibriMix is not supported; write a CSV file with the files of s1 in the column path and "
-        "those of mix_single in the column noisy"
-    ),
-    re.compile(r"(^|/)clean_fileid_\d+\."): (
-        "the layout of the DNS challenge is not supported; write a CSV file with clean_fileid_N "
-        "in the column path and the noisy file of the same number in the column noisy"
-    ),
-}
-"""Advice on unsupported layouts, by a pattern that recognises their paths."""
-
 
 @dataclass(frozen=True)
 class Corpus:
-    """Utterances of a corpus, and counts of its unused files.
+    """Utterances of a corpus, and counts of the files in its folder that are no utterances.
 
     Attributes:
-        layout: Name of the layout.
+        layout: Name of the layout that was recognised.
         utterances: Rows of the manifest.
-        unused_audio: Number of unused audio files by folder.
-        other_files: Number of files that are not audio by extension.
+        unused_audio: Number of audio files that are no utterances, by folder.
+        other_files: Number of files that are not audio, by extension.
+
+    >>> Corpus("folders", [Utterance("train/1.wav")], Counter(), Counter()).layout
+    'folders'
     """
 
     layout: str
@@ -120,7 +111,7 @@ def prepare(
     folders: Sequence[str] | None = None,
     valid_share: float = 0.0,
 ) -> Corpus:
-    """Recognise a corpus and write its manifest.
+    """Recognise a corpus and write its manifest, the CSV file from which trainings read.
 
     Args:
         source: Folder of a known layout, or a CSV file, see ``read_manifest``.
@@ -133,17 +124,20 @@ def prepare(
 
     Raises:
         ValueError: The layout is unknown or contradictory, or the manifest cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     for name in ("ann", "bob"):
+    ...         Path(folder, "train", name).mkdir(parents=True)
+    ...         Path(folder, "train", name, "1.wav").touch()
+    ...     corpus = prepare(folder, f"{folder}/manifest.csv", valid_share=0.5)
+    >>> [(row.speaker, row.split) for row in corpus.utterances]
+    [('ann', 'train'), ('bob', 'valid')]
     """
     path = Path(source)
-    if Path(out).suffix != ".csv":
-        raise ValueError(
-            f"{out}: expected a name that ends in .csv, because the manifest is a CSV file"
-        )
     if path.is_dir():
         corpus = find_corpus(path, folders)
     else:
-        if Path(out).exists() and path.samefile(out):
-            raise ValueError(f"{out}: refusing to overwrite the input; choose another name")
         corpus = Corpus("CSV file", read_manifest(path), Counter(), Counter())
     utterances = corpus.utterances
     if valid_share:
@@ -153,7 +147,7 @@ def prepare(
 
 
 def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
-    """Recognise the layout of a folder, and check the utterances in it.
+    """Recognise the layout of a folder, and validate the utterances in it.
 
     Args:
         root: Folder of the corpus.
@@ -161,14 +155,20 @@ def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
 
     Raises:
         ValueError: The layout is unknown or contradictory.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     Path(folder, "train").mkdir()
+    ...     Path(folder, "train", "1.wav").touch()
+    ...     find_corpus(Path(folder)).layout
+    'folders train, valid, test'
     """
     audio, other_files = _list_files(root)
     try:
         layout, utterances = recognise(audio, folders)
-        check_utterances(utterances)
-        check_paths(utterances, root)
+        check_utterances(utterances, root)
     except ValueError as error:
-        raise ValueError(f"{root}: {error}; {ADVICE}") from error
+        raise ValueError(f"{root}: {error}; {_ADVICE}") from error
     used = {row.path for row in utterances} | {row.noisy for row in utterances}
     unused = Counter(
         os.path.dirname(name) or "the top folder" for name in audio if name not in used
@@ -180,7 +180,7 @@ def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
 def recognise(
     files: Sequence[str], folders: Sequence[str] | None = None
 ) -> tuple[str, list[Utterance]]:
-    """Recognise the layout of files.
+    """Recognise the layout of a corpus by the paths of its files, without reading them.
 
     Args:
         files: Paths of audio files relative to the corpus, with forward slashes.
@@ -191,27 +191,28 @@ def recognise(
 
     Raises:
         ValueError: The layout is unknown or contradictory.
+
+    >>> layout, utterances = recognise(["ann/1.wav", "bob/1.wav"], folders=["speaker"])
+    >>> [row.speaker for row in utterances]
+    ['ann', 'bob']
     """
     if folders is not None:
         layout = f"folders {'/'.join(folders)}"
         meanings = [level for level in folders if level != "other"]
-        if not set(folders) <= set(LEVELS) or len(set(meanings)) < len(meanings):
+        if not set(folders) <= set(_LEVELS) or len(set(meanings)) < len(meanings):
             raise ValueError(
-                f"{layout}: expected some of {', '.join(LEVELS)}, separated by /, each at most "
+                f"{layout}: expected some of {', '.join(_LEVELS)}, separated by /, each at most "
                 "once except 'other', such as --folders split/speaker"
             )
-        pattern = "/".join(LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
+        pattern = "/".join(_LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
         return layout, _read_utterances(files, pattern, layout)
-    for unsupported, advice in _UNSUPPORTED.items():
-        if any(unsupported.search(file) for file in files):
-            raise ValueError(advice)
     top = {file.split("/")[0] for file in files}
     only_folder = f"({re.escape(top.pop())}/)?" if len(top) == 1 else ""
-    for layout, pattern in LAYOUTS.items():
+    for layout, pattern in _LAYOUTS.items():
         pattern = only_folder + pattern
         if any(re.fullmatch(pattern, file, re.IGNORECASE) for file in files):
             return layout, _read_utterances(files, pattern, layout)
-    raise ValueError(f"unknown layout, expected one of {', '.join(LAYOUTS)}")
+    raise ValueError(f"unknown layout, expected one of {', '.join(_LAYOUTS)}")
 
 
 def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utterance]:
@@ -226,17 +227,21 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
     Raises:
         ValueError: There is a validation split already, a speaker is unknown, or no training
             speaker would remain.
+
+    >>> rows = [Utterance("ann/1.wav", speaker="ann"), Utterance("bob/1.wav", speaker="bob")]
+    >>> [row.split for row in hold_out_speakers(rows, 0.5)]
+    ['train', 'valid']
     """
-    speakers = sorted({row.speaker for row in utterances if row.split == "train"})
     if any(row.split == "valid" for row in utterances):
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
-    if "" in speakers:
-        raise ValueError(f"--valid-share requires the speakers, but some are unknown; {ADVICE}")
+    speakers = sorted({row.speaker for row in utterances if row.split == "train"})
     count = max(1, round(share * len(speakers)))
-    if count >= len(speakers):
+    if "" in speakers or count >= len(speakers):
+        names = ", ".join(name or "unknown" for name in speakers[:5])
         raise ValueError(
-            f"cannot move {count} of {len(speakers)} speakers to the validation split, because "
-            "none would remain for training; lower --valid-share"
+            f"cannot move {count} of {len(speakers)} training speakers to the validation split, "
+            f"because others must remain and all must be known, got {names}; lower --valid-share, "
+            f"or leave it out, or {_ADVICE}"
         )
     valid_speakers = set(Random(0).sample(speakers, count))
     rows = []

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path, PurePosixPath
 
@@ -18,19 +18,22 @@ SPLITS = ("train", "valid", "test")
 COLUMNS = ("path", "noisy", "speaker", "split")
 """Columns of a manifest."""
 
-NON_SPEECH_WORDS = {"noise", "noises", "noisy", "mix", "mixture", "mixtures", "rir", "rirs"}
+_NON_SPEECH_WORDS = {"noise", "noises", "noisy", "mix", "mixture", "mixtures", "rir", "rirs"}
 """Words in the names of folders that contain no clean speech."""
 
 
 @dataclass(frozen=True)
 class Utterance:
-    """Row of a manifest.
+    """Row of a manifest: one file of clean speech, usually one sentence.
 
     Attributes:
-        path: Path of the clean speech relative to the root, with forward slashes.
-        noisy: Path of the noisy version, aligned and equally long; empty if there is none.
+        path: Path of the clean speech, relative to the folder of the corpus, with forward slashes.
+        noisy: Path of its noisy version, time-aligned and equally long; empty if there is none.
         speaker: Name of the speaker; empty if unknown.
         split: ``train``, ``valid`` or ``test``.
+
+    >>> Utterance("clean/p226_001.wav", speaker="p226").split
+    'train'
     """
 
     path: str
@@ -51,29 +54,32 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     Raises:
         ValueError: The file is not such a table, a path is listed twice or is outside the root, or
             a speaker or a file is in two splits.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     Path(folder, "1.wav").touch()
+    ...     _ = Path(folder, "manifest.csv").write_text("path,speaker\\n1.wav,ann\\n")
+    ...     read_manifest(f"{folder}/manifest.csv")
+    [Utterance(path='1.wav', noisy='', speaker='ann', split='train')]
     """
-    table = read_table(path, "the manifest")
     utterances = []
-    for line, row in table:
-        if not row.get("path"):
-            raise ValueError(
-                f"{path}, line {line}: the path is missing; expected a CSV file with a column "
-                "'path' and optional columns 'noisy', 'speaker' and 'split'"
-            )
-        split = row.get("split", "train")
-        if split not in SPLITS:
-            raise ValueError(
-                f"{path}, line {line}: expected the split train, valid or test, got {split!r}"
-            )
-        utterances.append(
-            Utterance(row["path"], row.get("noisy", ""), row.get("speaker", ""), split)
+    for line, row in read_table(path, "the manifest"):
+        utterance = Utterance(
+            row.get("path", ""),
+            row.get("noisy", ""),
+            row.get("speaker", ""),
+            row.get("split", "train"),
         )
-    if not utterances:
-        raise ValueError(f"{path}: the manifest is empty, expected one row per utterance")
+        if not utterance.path or utterance.split not in SPLITS:
+            raise ValueError(
+                f"{path}, line {line}: expected a file in the column 'path' and, if there is a "
+                f"column 'split', train, valid or test in it, got {utterance.path!r} and "
+                f"{utterance.split!r}"
+            )
+        utterances.append(utterance)
     folder = Path(path).parent if root is None else Path(root)
     try:
-        check_utterances(utterances)
-        check_paths(utterances, folder)
+        check_utterances(utterances, folder)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if not (folder / utterances[0].path).is_file():
@@ -87,16 +93,28 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
 def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     """Write a manifest atomically; an older manifest is replaced.
 
+    Args:
+        path: CSV file to write.
+        utterances: Its rows.
+
     Raises:
         ValueError: The file cannot be written, or exists and is not a manifest.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_manifest(f"{folder}/manifest.csv", [Utterance("1.wav")])
+    ...     print(Path(folder, "manifest.csv").read_text(), end="")
+    path,noisy,speaker,split
+    1.wav,,,train
     """
-    header = ",".join(COLUMNS)
-    if Path(path).exists():
-        with open(path, encoding="utf-8", errors="replace") as file:
-            if file.readline().strip() != header:
-                raise ValueError(
-                    f"{path}: refusing to overwrite a file that is no manifest; choose another name"
-                )
+    path = Path(path)
+    is_file = path.is_file()
+    header = path.read_bytes().partition(b"\n")[0].strip() if is_file else b""
+    if path.exists() and header != ",".join(COLUMNS).encode():
+        raise ValueError(
+            f"{path}: refusing to overwrite what is no manifest; choose another name that ends in "
+            ".csv"
+        )
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -104,36 +122,51 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     write_atomically(path, text.getvalue())
 
 
-def check_utterances(utterances: Sequence[Utterance]) -> None:
-    """Raise ValueError if utterances contradict each other, or noise is listed as speech."""
+def check_utterances(utterances: Sequence[Utterance], root: Path) -> None:
+    """Validate the rows of a manifest.
+
+    Args:
+        utterances: The rows.
+        root: Folder to which their paths are relative.
+
+    Raises:
+        ValueError: There are none, they contradict each other, noise is listed as speech, or a path
+            leads out of the root.
+
+    >>> check_utterances([Utterance("noise/1.wav")], Path("corpus"))
+    Traceback (most recent call last):
+    ValueError: noise/1.wav is listed as clean speech, but is in a folder 'noise'
+    """
+    problem = next(_find_problems(utterances, root), None)
+    if problem is not None:
+        raise ValueError(problem)
+
+
+def _find_problems(utterances: Sequence[Utterance], root: Path) -> Iterator[str]:
+    """Yield a description of each problem for which the rows of a manifest are rejected."""
+    if not utterances:
+        yield "there are no utterances, expected one per row"
+    inside = resolve_links(root)
     clean = {utterance.path for utterance in utterances}
     splits: dict[str, dict[str, str]] = {"file": {}, "speaker": {}}
     pairs = Counter((utterance.path, utterance.noisy) for utterance in utterances)
     for utterance in utterances:
         if utterance.noisy in clean:
-            raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
+            yield f"{utterance.noisy} is listed both as clean and as noisy speech"
         if pairs[utterance.path, utterance.noisy] > 1:
-            raise ValueError(f"{utterance.path} is listed twice")
+            yield f"{utterance.path} is listed twice"
         for folder in utterance.path.split("/")[:-1]:
-            if NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):
-                raise ValueError(
-                    f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
-                )
+            if _NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):
+                yield f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
         for kind, name in (("file", utterance.path), ("speaker", utterance.speaker)):
-            other = splits[kind].setdefault(name, utterance.split)
-            if name and other != utterance.split:
-                raise ValueError(f"{kind} {name} is in the splits {other} and {utterance.split}")
-
-
-def check_paths(utterances: Sequence[Utterance], root: Path) -> None:
-    """Raise ValueError if a path leads out of the root, through ``..`` or a link."""
-    inside = resolve_links(root)
-    for utterance in utterances:
+            split = splits[kind].setdefault(name, utterance.split)
+            if name and split != utterance.split:
+                yield f"{kind} {name} is in the splits {split} and {utterance.split}"
         for name in (utterance.path, utterance.noisy):
             path = PurePosixPath(name)
             leads_out = path.is_absolute() or ".." in path.parts
             if leads_out or not resolve_links(root / path).is_relative_to(inside):
-                raise ValueError(
-                    f"{name} is outside {root}; expected a path relative to that folder, "
-                    "without '..'"
+                yield (
+                    f"{name} is outside {root}; expected a path relative to that folder, without "
+                    "'..'"
                 )
