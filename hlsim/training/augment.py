@@ -1,7 +1,7 @@
 """Augmentation of training speech: noise, equalisation, amplification, compression and level.
 
-A Neuro-MSBG later guides the training of hearing aids, which amplify and compress. It must therefore
-be accurate on amplified and compressed speech, not only on recordings as they are.
+A Neuro-MSBG later guides the training of hearing aids, which amplify and compress. It must
+therefore be accurate on amplified and compressed speech, not only on recordings as they are.
 """
 
 import torch

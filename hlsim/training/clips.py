@@ -12,8 +12,8 @@ from hlsim.audio import find_audio, read_audio
 from hlsim.dsp.resample import resample
 
 MAX_FAILURES = 10_000
-"""Number of draws in a row without a clip that is an error. It allows for recordings that are silent
-except for one second per hour."""
+"""Number of draws in a row without a clip that is an error. It allows for recordings that are
+silent except for one second per hour."""
 
 MAX_SAMPLES_IN_MEMORY = 2**30
 """Number of samples of all recordings in memory: 2 GB, 18 hours at 16 kHz."""

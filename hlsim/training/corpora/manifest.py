@@ -95,7 +95,7 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
 
     Args:
         path: CSV file to write.
-        utterances: Its rows.
+        utterances: Rows of the manifest.
 
     Raises:
         ValueError: The file cannot be written, or exists and is not a manifest.
@@ -126,7 +126,7 @@ def check_utterances(utterances: Sequence[Utterance], root: Path) -> None:
     """Validate the rows of a manifest.
 
     Args:
-        utterances: The rows.
+        utterances: Rows of the manifest.
         root: Folder to which their paths are relative.
 
     Raises:
