@@ -17,7 +17,7 @@ from hlsim import MSBG, Audiogram, list_pretrained, load_pretrained
 from hlsim.audio import read_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.report.sounds import spectrogram_levels
+from hlsim.report.players import spectrogram_levels
 
 ROOT = Path(__file__).parents[1]
 RATE = 16000

@@ -213,7 +213,7 @@ class Players:
     """
 
     def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:
-        from hlsim.report.sounds import make_player
+        from hlsim.report.players import make_player
 
         self._player = make_player({"": signals}, sample_rate)
 

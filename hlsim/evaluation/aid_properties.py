@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.parallel import describe_error, one_thread
-from hlsim.losses.band_levels import band_centres, band_levels
+from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
 from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.clips import Clips
@@ -167,6 +168,24 @@ def gain_curves(aids: Aids, ears: Ears, utterances: Tensor, levels: Sequence[flo
         return {**axes, "gain_db": insertion_gain(aid, ear, utterances, levels)}
 
     return measure_aids(aids, ears, measure)
+
+
+def mean_band_levels(signals: Sequence[Tensor], *, hearing_level: bool = False) -> list[float]:
+    """Compute the mean level of several signals in each of 24 ERB-wide bands.
+
+    Args:
+        signals: Signals at 16 kHz in pascals. Shape of each: (time,).
+        hearing_level: Return levels in dB HL, relative to the threshold of a normal ear, instead
+            of dB SPL.
+
+    Returns: One level per band, for the frequencies of ``gain_curves``.
+
+    >>> len(mean_band_levels([torch.ones(16000)]))
+    24
+    """
+    frames = torch.cat([band_levels(signal, NEURO_RATE) for signal in signals])
+    levels = 10.0 * np.log10((10.0 ** (frames / 10.0)).mean(0).numpy())
+    return (levels - threshold_in_quiet() if hearing_level else levels).tolist()
 
 
 def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:

@@ -339,17 +339,15 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     >>> better["name"].tolist(), better["ear"].tolist(), better["haspi"].tolist()
     (['L1 s01 5 dB'], ['right'], [0.7])
     """
-    conditions = list(dict.fromkeys(table["condition"]))
     numbers = table.groupby(_UTTERANCE_COLUMNS, sort=False, dropna=False).ngroup()
     table = table.assign(source=table["item"], item=numbers)
+    row = ["item", "condition"]
+    rows = table.set_index(row).index.unique()
     # The left ear counts if both ears have the same score.
     order = table.sort_values([measures[0], "ear"], ascending=[False, True], kind="stable")
-    row = ["item", "condition"]
-    rows = [(item, condition) for item in range(numbers.max() + 1) for condition in conditions]
     best = order.drop_duplicates(row).set_index(row).loc[rows]
-    for measure in measures:
-        best[measure] = table.groupby(row)[measure].max()
-    last = best.xs(conditions[-1], level="condition")
+    best = best.assign(**table.groupby(row)[list(measures)].max())
+    last = best.xs(table["condition"].iloc[-1], level="condition")
     best = best.reset_index()
     for fact in set(_EAR_FACTS) & set(best):
         best[fact] = best["item"].map(last[fact])

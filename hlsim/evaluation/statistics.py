@@ -182,11 +182,9 @@ def holm(p_values: Iterable[float | None]) -> list[float | None]:
     >>> holm([0.03, 0.01, None])
     [0.06, 0.03, None]
     """
-    values = list(p_values)
-    order = sorted((p, i) for i, p in enumerate(values) if p is not None)
-    adjusted: list[float | None] = [None] * len(values)
-    largest = 0.0
-    for rank, (p, i) in enumerate(order):
-        largest = max(largest, min(1.0, (len(values) - rank) * p))
-        adjusted[i] = largest
-    return adjusted
+    values = np.array(list(p_values), dtype=np.float64)  # None becomes NaN
+    order = np.argsort(values)
+    products = np.arange(len(values), 0, -1) * values[order]
+    adjusted = np.empty(len(values))
+    adjusted[order] = np.maximum.accumulate(products.clip(None, 1.0))
+    return [None if math.isnan(p) else p for p in adjusted.tolist()]

@@ -1,4 +1,4 @@
-"""The page and the table of scores of Clarity's scenes."""
+"""The page of ``clarity``, which presents what ``hlsim.evaluation.clarity`` computes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
 from hlsim.evaluation.result import Evaluation
 from hlsim.files import write_atomically
 from hlsim.report.page import Page, Section, Table
+from hlsim.report.players import listening_sections
 from hlsim.report.plots import pictures_sections
-from hlsim.report.recordings import score_details
-from hlsim.report.results import LEVEL, number, split_rows, statistic, summary_table
-from hlsim.report.sounds import listening_sections
+from hlsim.report.results import (
+    LEVEL,
+    number,
+    score_details,
+    split_rows,
+    statistic,
+    summary_table,
+)
 
 _ABOUT = (
     "Scores are those of the better ear, by each measure, and combined is the mean of HASPI and "
@@ -22,7 +28,12 @@ _ABOUT = (
 
 
 def write_scores(evaluation: Evaluation, out: str | Path) -> None:
-    """Write ``scores.csv``: a row for each scene, listener and condition."""
+    """Write ``scores.csv`` with one row per scene, listener and condition.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_scenes``.
+        out: Folder of the file.
+    """
     columns = ["utterance", "listener", "condition", "combined", "haspi", "hasqi", "level"]
     combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
     scores = evaluation.table.assign(combined=combined)[columns]
@@ -31,12 +42,17 @@ def write_scores(evaluation: Evaluation, out: str | Path) -> None:
 
 
 def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
-    """Return the page of scenes: verdict, conditions, sounds, pictures, details."""
+    """Return the page about scenes: verdict, conditions, sounds, pictures, details.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_scenes``.
+        listen: Number of scenes with a player.
+    """
     planned = [c.verdict() for c in evaluation.comparisons if c.planned]
     verdict, *further_verdicts = planned or [f"No pair of aids could be compared with {NAL_R}."]
     played = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
     sections = [
-        Section("Conditions", [*further_verdicts, _ABOUT], [conditions_table(evaluation)]),
+        Section("Conditions", [*further_verdicts, _ABOUT], [_conditions_table(evaluation)]),
         *listening_sections(evaluation, listen, played),
         *pictures_sections(evaluation),
         score_details(evaluation),
@@ -45,10 +61,11 @@ def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
     return Page(title, verdict, sections)
 
 
-def conditions_table(evaluation: Evaluation) -> Table:
-    """Return means of the pairs that all conditions have scores of, and the look-ahead.
+def _conditions_table(evaluation: Evaluation) -> Table:
+    """Return a table with mean scores and look-ahead of each condition.
 
-    A condition without any score takes none from the others.
+    Only pairs of scene and listener count for which all conditions have scores. A condition without
+    any score is ignored in this respect.
     """
     combined = 0.5 * (evaluation.wide("haspi") + evaluation.wide("hasqi"))
     scored = combined.dropna(axis=1, how="all").notna().all(axis=1)

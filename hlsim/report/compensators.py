@@ -1,8 +1,7 @@
-"""The page of ``evaluate-compensator``."""
+"""The page of ``evaluate-compensator``: it presents what ``evaluation.compensators`` computes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from hlsim.evaluation.aid_properties import QUIET_LEVELS, UTTERANCES
 from hlsim.evaluation.compensators import COMPRESSION, HARD, NAL_R, UNAIDED
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
+from hlsim.report.players import listening_sections
 from hlsim.report.plots import (
     condition_colours,
     curves_picture,
@@ -24,23 +24,21 @@ from hlsim.report.results import (
     Columns,
     comparison_table,
     detail_section,
-    lower_first,
     paired_table,
-    score_cells,
+    score_columns,
     scored_by,
     split_rows,
     statistic,
     summary_table,
 )
-from hlsim.report.sounds import listening_sections
 
-GROUPS = {
+_GROUPS = {
     "clean": "Clean speech",
     "noisy": "Speech in noise",
     "hard": f"Items with unaided HASPI below {HARD:g}",
 }
 
-COLUMNS: Columns = {
+_COLUMNS: Columns = {
     "Output level (dB SPL)": (statistic("level"), ".1f"),
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
     "Peaks beyond the limit": (statistic("beyond_limit", "sum"), "g"),
@@ -49,15 +47,17 @@ COLUMNS: Columns = {
     "against speech alone": (statistic("loudness_error_clean"), "+.1f"),
     "Band error (dB)": (statistic("band_error"), ".1f"),
 }
-"""Columns of the tables by title."""
+"""Columns beside the scores, by title."""
 
-_LOWEST_ERROR_DB = -60.0  # of a tone in a picture; below, it is inaudible anyway
+_LOWEST_ERROR_DB = -60.0
+"""Loudness error of a tone in dB below which it is drawn as this value, because it is inaudible."""
 
 _GAP_COLUMNS: Columns = {
     "Neuro-MSBG (dB)": (statistic("loss_neuro"), ".2f"),
     "Exact MSBG (dB)": (statistic("loss_msbg"), ".2f"),
     "Relative difference, median item": (statistic("gap", "median absolute"), ".1%"),
 }
+"""Columns of the training loss through the network and through the exact MSBG, by title."""
 
 _COLUMN_NOTES = (
     "The loudness error is the level that the impaired ear perceives after the exact MSBG minus "
@@ -102,14 +102,22 @@ _WEARING = (
 
 
 def compensators_page(evaluation: Evaluation, listen: int = 3) -> Page:
-    """Return the page of compensators: verdicts, scores, sounds, gains, details."""
+    """Return the page about compensators: verdicts, scores, sounds, gains, details.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_compensators``.
+        listen: Number of items with a player.
+    """
     main = {name: group for name, group in evaluation.groups.items() if name != "hard"}
     verdict, *further_verdicts = [
-        text for name, group in main.items() for text in _verdicts(name, group)
+        f"On {_GROUPS[name].lower()}, {c.verdict(c.after, 'NAL-R at the same level')}"
+        for name, group in main.items()
+        for c in group.comparisons
+        if c.planned
     ]
     aids = [condition for condition in evaluation.conditions if condition.kind == "aid"]
     names = [aid.name for aid in aids]
-    tables = [summary_table(GROUPS[name], *_rows(group)) for name, group in main.items()]
+    tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in main.items()]
     about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE]
     played = [UNAIDED, *aids[0].rivals[:1], *names]
     sections = [
@@ -122,15 +130,8 @@ def compensators_page(evaluation: Evaluation, listen: int = 3) -> Page:
     return Page(f"Hearing aids compared: {', '.join(names)}", verdict, sections)
 
 
-def _verdicts(name: str, group: Evaluation) -> Iterator[str]:
-    """Yield for each compensator a sentence about it and NAL-R at its level."""
-    for c in group.comparisons:
-        if c.planned:
-            verdict = c.verdict(c.after, "NAL-R at the same level")
-            yield f"On {lower_first(GROUPS[name])}, {verdict}"
-
-
 def _about(evaluation: Evaluation) -> str:
+    """Return sentences about the items and the scores."""
     settings = evaluation.settings
     levels = ", ".join(f"{level:g}" for level in settings["levels"])
     ears = evaluation.table["ear"].nunique()
@@ -143,12 +144,12 @@ def _about(evaluation: Evaluation) -> str:
 
 
 def _rows(group: Evaluation, fact: str = "") -> tuple[Any, Columns]:
-    """Return the rows of a table and its columns."""
-    return split_rows(group.table, fact), {**score_cells(group), **COLUMNS}
+    """Return the rows and the columns of a table of scores, see ``split_rows``."""
+    return split_rows(group.table, fact), {**score_columns(group), **_COLUMNS}
 
 
 def _details(evaluation: Evaluation) -> Section:
-    """Return further tables, pictures and tests of each group, tones and notes, folded."""
+    """Return the folded section with tables, pictures and tests of each group, and tones."""
     gap = _GAP.format(simulator=evaluation.settings["simulator"])
     sections = []
     for name, group in evaluation.groups.items():
@@ -169,14 +170,14 @@ def _details(evaluation: Evaluation) -> Section:
             Section("Paired tests", tables=_test_tables(group)),
             Section("Surrogate gap", [gap], [gaps]),
         ]
-        sections.append(Section(GROUPS[name], tables=tables, sections=inner_sections))
+        sections.append(Section(_GROUPS[name], tables=tables, sections=inner_sections))
     sections.append(Section("Steady tones", [_TONES], pictures=_tone_pictures(evaluation)))
     enhancers = [f"Enhancer: {name}." for name in evaluation.settings["enhancers"]]
     return detail_section(evaluation, sections, [*_COLUMN_NOTES, STATISTICS_NOTE, *enhancers])
 
 
 def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw the gains of aids and prescriptions for each ear, and output over input level."""
+    """Draw the gain of each aid beside NAL-R's for each ear, and output level over input level."""
     colours = condition_colours(evaluation.conditions)
     curves = evaluation.details["gain_curves"]
     pictures = []
@@ -192,7 +193,7 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
 
 
 def _tone_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw the loudness error of tones at the middle level for each ear."""
+    """Draw the loudness error of tones at the middle level over frequency, for each ear."""
     colours = condition_colours(evaluation.conditions)
     curves: dict[str, dict[str, Any]] = {}
     for row in evaluation.details["steady_tones"]:
@@ -207,7 +208,7 @@ def _tone_pictures(evaluation: Evaluation) -> list[Picture]:
 
 
 def _wearing_table(evaluation: Evaluation) -> Table:
-    """Return one row for each ear and aid."""
+    """Return a table of look-ahead, quiet noise, sidebands and cost for each ear and aid."""
     sidebands = {
         (row["ear"], row["aid"]): max(map(max, row["sidebands_db"]))
         for row in evaluation.details["steady_tones"]
@@ -225,7 +226,7 @@ def _wearing_table(evaluation: Evaluation) -> Table:
 
 
 def _test_tables(group: Evaluation) -> list[Table]:
-    """Return comparisons of each condition with its rivals, over items and over means of ears."""
+    """Return tables that compare each condition with its rivals, by items and by means of ears."""
     rivals = {condition.name: condition.rivals for condition in group.conditions}
     chosen = [c for c in group.comparisons if c.before in rivals[c.after]]
     means = {

@@ -1,21 +1,18 @@
-"""The demo's page: the effect of training an aid, to be read, heard and seen."""
+"""The page of the demo: how training changes an aid, in numbers, sounds and pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
+from hlsim.evaluation.aid_properties import mean_band_levels
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation
-from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
-from hlsim.metrics.words import words_change
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Card, Page, Picture, Section, Table
+from hlsim.report.players import NORMAL_EAR, make_player
 from hlsim.report.plots import (
     INK,
     Curve,
@@ -23,12 +20,7 @@ from hlsim.report.plots import (
     curves_picture,
     gain_picture,
 )
-from hlsim.report.recordings import score_details
-from hlsim.report.results import Columns, split_rows, statistic, summary_table
-from hlsim.report.sounds import NORMAL_EAR, make_player
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from hlsim.report.results import Columns, score_details, split_rows, statistic, summary_table
 
 UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED = "unaided", "NAL-R", "NAL-R, same level", "trained aid"
 """Names of the demo's conditions."""
@@ -58,25 +50,27 @@ def demo_page(
     perceived: Mapping[str, Sequence[Tensor]],
     sentence: str = "",
 ) -> Page:
-    """Return the page: three numbers, verdict, sounds, pictures, details.
+    """Return the page of the demo: three numbers, verdict, sounds, pictures, details.
 
     Args:
         evaluation: Study of the demo's conditions, with the detail ``gain_curves``.
         ear_name: Name of the ear, for the title.
-        outputs: Outputs of the aid for each item, by condition.
-        perceived: Perceived signals of each item, by condition.
+        outputs: Outputs of the aid for each item in pascals, by condition. Shape of each: (time,).
+        perceived: The same outputs as the ear perceives them, by condition.
         sentence: Words of the last item, which is played.
     """
     headline = evaluation.headline
     assert headline is not None
     colours = condition_colours(evaluation.conditions)
     items = [source.load() for source in evaluation.items]
-    normal = [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]
+    rate = items[0].sample_rate
+    normal = [perceive(item.clean, NORMAL, rate) for item in items]
     level = float(evaluation.table["clean_level"].iloc[0])
     gains = evaluation.details["gain_curves"]
+    frequencies = gains[0]["frequencies"]
     pictures = [
-        _perceived_picture({NORMAL_EAR: normal, **perceived}, colours),
-        _ear_picture(items[0].ear, level, outputs, colours),
+        _perceived_picture({NORMAL_EAR: normal, **perceived}, colours, frequencies),
+        _ear_picture(items[0].ear, level, outputs, colours, frequencies),
         gain_picture("Gain by input level", gains, colours),
     ]
     groups = {
@@ -89,7 +83,7 @@ def demo_page(
             **{name: outputs[name][-1] for name in (NAL_R, TRAINED)},
         },
     }
-    player = make_player(groups, NEURO_RATE, sentence)
+    player = make_player(groups, rate, sentence)
     details = score_details(evaluation, [_COMPARISON], [result_table(evaluation)])
     sections = [
         Section("Listen", [_LISTEN], player=player),
@@ -103,10 +97,13 @@ def demo_page(
 
 
 def result_table(evaluation: Evaluation) -> Table:
-    """Return means of the utterances, one row per condition."""
+    """Return the table of the demo, with mean scores and levels of each condition."""
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),
-        "Words understood": (_predict_words, ".0%"),
+        "Words understood": (
+            lambda rows: _predict_words(evaluation, rows["condition"].iloc[0]),
+            ".0%",
+        ),
         "Output level (dB SPL)": (statistic("level"), ".1f"),
         "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     }
@@ -114,19 +111,16 @@ def result_table(evaluation: Evaluation) -> Table:
     return summary_table(f"Means of {count} utterances", split_rows(evaluation.table), columns)
 
 
-def _predict_words(rows: DataFrame) -> float:
+def _predict_words(evaluation: Evaluation, condition: str) -> float:
     """Return the proportion of words that a listener understands, predicted from HASPI."""
-    scores = rows["haspi"].dropna().to_numpy().clip(0.0, 1.0)
-    return words_change(scores, scores).before
+    return evaluation.words(condition, condition).before
 
 
 def _cards(evaluation: Evaluation) -> list[Card]:
-    """Return HASPI, words and loudness error of all conditions."""
-    rows = split_rows(evaluation.table)
-    errors = {name: float(part["loudness_error"].mean()) for name, part in rows.items()}
-    largest_error = max(map(abs, errors.values()))
-    haspi = {name: float(part["haspi"].mean()) for name, part in rows.items()}
-    words = {name: _predict_words(part) for name, part in rows.items()}
+    """Return the cards with HASPI, words understood and loudness error of all conditions."""
+    means = evaluation.table.groupby("condition", sort=False)[["haspi", "loudness_error"]].mean()
+    haspi, errors = means["haspi"], means["loudness_error"]
+    words = {name: _predict_words(evaluation, name) for name in means.index}
     return [
         Card(
             "HASPI",
@@ -144,12 +138,13 @@ def _cards(evaluation: Evaluation) -> list[Card]:
             "Loudness error",
             _decibels(errors[TRAINED]),
             "Perceived level minus that of a normal ear. At 0 dB, speech is as loud as normal.",
-            [(name, _decibels(e), abs(e) / largest_error) for name, e in errors.items()],
+            [(name, _decibels(e), abs(e) / errors.abs().max()) for name, e in errors.items()],
         ),
     ]
 
 
 def _decibels(value: float) -> str:
+    """Format a level difference with its sign, as a typeset minus."""
     return f"{value:+.1f} dB".replace("-", "\N{MINUS SIGN}")
 
 
@@ -158,12 +153,21 @@ def _ear_picture(
     level: float,
     outputs: Mapping[str, Sequence[Tensor]],
     colours: Mapping[str, Any],
+    frequencies: Sequence[float],
 ) -> Picture:
-    """Draw the audiogram with the speech as it is and as the trained aid amplifies it."""
+    """Draw the audiogram, and the levels of speech without an aid and after the trained one.
+
+    Args:
+        ear: The audiogram.
+        level: Level of the speech in dB SPL.
+        outputs: Outputs for each item, by condition.
+        colours: Colour of each condition.
+        frequencies: Centres of the 24 bands in Hz.
+    """
     curves: dict[str, Curve] = {}
     for name in (UNAIDED, TRAINED):
-        levels = _mean_levels(outputs[name]) - threshold_in_quiet()
-        curves[f"speech, {name}"] = (band_centres(), levels, {"color": colours[name]})
+        levels = mean_band_levels(outputs[name], hearing_level=True)
+        curves[f"speech, {name}"] = (frequencies, levels, {"color": colours[name]})
     style = {"color": INK, "marker": "o"}
     curves["threshold of this ear"] = (ear.frequencies, ear.levels, style)
     note = (
@@ -171,26 +175,29 @@ def _ear_picture(
         "threshold, it is inaudible on average."
     )
     title = "The ear, and the speech that reaches it"
-    return curves_picture(curves, title, "level (dB HL)", ends=(120.0, -10.0), note=note)
+    return curves_picture(curves, title, "level (dB HL)", axis_range=(120.0, -10.0), note=note)
 
 
 def _perceived_picture(
-    perceived: Mapping[str, Sequence[Tensor]], colours: Mapping[str, Any]
+    perceived: Mapping[str, Sequence[Tensor]],
+    colours: Mapping[str, Any],
+    frequencies: Sequence[float],
 ) -> Picture:
-    """Draw the mean level that the ear perceives in each band, beside a normal ear's."""
+    """Draw the mean level that the ear perceives in each band, beside a normal ear's.
+
+    Args:
+        perceived: Perceived signals of each item, by condition.
+        colours: Colour of each condition.
+        frequencies: Centres of the 24 bands in Hz.
+    """
     styles = {name: {"color": colours[name]} for name in _PLAYED}
     styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
     curves = {
-        name: (band_centres(), _mean_levels(perceived[name]), style)
+        name: (frequencies, mean_band_levels(perceived[name]), style)
         for name, style in styles.items()
     }
     note = "The closer to the dashed line, the better."
     title = "Speech as this ear perceives it"
-    return curves_picture(curves, title, "level (dB SPL per band)", ends=(0.0, None), note=note)
-
-
-def _mean_levels(signals: Sequence[Tensor]) -> np.ndarray:
-    """Return the mean level of all frames in dB SPL. Shape: (bands,)."""
-    frames = torch.cat([band_levels(signal, NEURO_RATE) for signal in signals])
-    powers: np.ndarray = (10.0 ** (frames / 10.0)).mean(0).numpy()
-    return 10.0 * np.log10(powers)
+    return curves_picture(
+        curves, title, "level (dB SPL per band)", axis_range=(0.0, None), note=note
+    )

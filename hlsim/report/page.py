@@ -20,12 +20,24 @@ from typing import Any
 from hlsim.extras import require
 from hlsim.files import write_atomically
 
+SPECTROGRAM_LEVELS = (0.0, 90.0)
+"""Lowest and highest level of all spectrograms in dB SPL, for a bin of 50 Hz."""
+
+SPECTROGRAM_COLOURS = ("#000004", "#3b0f70", "#8c2981", "#de4968", "#fe9f6d", "#fcfdbf")
+"""Colours from the lowest level of a spectrogram to the highest, those of matplotlib's magma."""
+
 _TEMPLATES = Path(__file__).with_name("templates")
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of text; the first column names the rows. A folded table is shown when it is opened.
+    """A table of texts.
+
+    Attributes:
+        caption: Caption.
+        header: Titles of the columns.
+        rows: Texts of each row. The first one is the name of the row.
+        folded: Whether a page shows only the caption until a reader opens the table.
 
     >>> Table("Scores", ("Aid", "HASPI"), [("NAL-R", "0.93")]).markdown()
     '| Aid | HASPI |\\n| --- | --- |\\n| NAL-R | 0.93 |'
@@ -40,9 +52,16 @@ class Table:
     def from_rows(
         cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False
     ) -> Table:
-        """Make a table of rows by column title; all rows have the same titles."""
-        header = list(rows[0]) if rows else []
-        return cls(caption, header, [list(row.values()) for row in rows], folded)
+        """Return the table of rows by title, without columns that are "n/a" in all rows.
+
+        Args:
+            caption: Caption.
+            rows: Texts by the title of their column, the same titles in each row.
+            folded: Whether a page shows only the caption until a reader opens the table.
+        """
+        titles = rows[0] if rows else ()
+        header = [title for title in titles if any(row[title] != "n/a" for row in rows)]
+        return cls(caption, header, [[row[title] for title in header] for row in rows], folded)
 
     def markdown(self) -> str:
         """Return the table in Markdown, without the caption."""
@@ -51,7 +70,7 @@ class Table:
         return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
 
     def text(self) -> str:
-        """Return the table for a terminal, without the caption and the title of the names.
+        """Return the table for a terminal, without the caption and the title of the first column.
 
         >>> print(Table("Scores", ("Aid", "HASPI"), [("none", "0.27"), ("NAL-R", "0.9")]).text())
               HASPI
@@ -65,11 +84,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """Contents of an SVG or PNG file, with a text for readers who do not see it.
+    """A picture of a page.
 
     Attributes:
-        data: Contents of the file.
-        alt: Text in place of the picture.
+        data: Contents of an SVG or PNG file.
+        alt: Text for readers who do not see the picture.
         title: Heading above the picture.
         note: Sentence below the picture.
 
@@ -89,9 +108,9 @@ class Sound:
 
     Attributes:
         label: Name on the button.
-        level: Level in dB SPL.
+        level: Level in dB SPL, which is shown beside the name.
         audio: Contents of a FLAC or WAV file.
-        loudness: Level in dB relative to full scale with which it is played.
+        loudness: Level in dB relative to full scale with which the sound is played.
         spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram; empty if
             there is none.
         note: Words over the spectrogram.
@@ -110,16 +129,14 @@ class Sound:
 
 @dataclass(frozen=True)
 class Player:
-    """Sounds of one item, between which a listener switches at the same position.
+    """A player with which a reader switches between sounds at the same position.
 
     Attributes:
-        groups: Sounds with one gain by the heading of their group, which may be empty.
-        seconds: Length of the sounds.
-        full_scale: Peak level in dB SPL of full scale in the first group.
+        groups: Sounds by the heading of their group, which may be empty. The sounds of a group are
+            played with one gain.
+        seconds: Length of the sounds in seconds.
+        full_scale: Level in dB SPL of a peak in the first group that is played at full scale.
         sentence: Words that are spoken.
-        volume: Volume to start with, from 0 to 1.
-        levels: Lowest and highest level in dB SPL of the spectrograms.
-        colours: Colours of the spectrograms in CSS, from the lowest to the highest level.
 
     >>> player = Player({"": [Sound("unaided", 10.2, b"fLaC")]}, seconds=4.0, full_scale=94.0)
     >>> [sound.label for sound in player.sounds]
@@ -130,9 +147,6 @@ class Player:
     seconds: float
     full_scale: float
     sentence: str = ""
-    volume: float = 0.5
-    levels: tuple[float, float] = (0.0, 0.0)
-    colours: Sequence[str] = ()
 
     @property
     def sounds(self) -> list[Sound]:
@@ -146,13 +160,14 @@ class Player:
 
 @dataclass(frozen=True)
 class Card:
-    """A number that a reader should remember, over the same number of all conditions.
+    """A number at the top of a page that a reader should remember, with bars that compare it.
 
     Attributes:
         title: Name of the number.
         value: The number, as text.
         meaning: Sentence that explains the number.
-        bars: Label, text and length from 0 to 1 for each condition; the last one is highlighted.
+        bars: Name, number as text and length from 0 to 1 for each condition. The last one is
+            highlighted.
 
     >>> card = Card("HASPI", "0.93", "Predicted intelligibility.", [("NAL-R", "0.93", 0.93)])
     >>> "width: 93.0%" in Page("Aids", "", [], [card]).html()
@@ -167,9 +182,16 @@ class Card:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page: tables, paragraphs, a player, pictures and inner parts, in this order.
+    """A part of a page.
 
-    A folded section is shown only when it is opened.
+    Attributes:
+        title: Heading.
+        paragraphs: Paragraphs of text, below the tables.
+        tables: Tables.
+        pictures: Pictures, below the player.
+        player: Player of sounds, below the paragraphs.
+        sections: Inner sections, at the end.
+        folded: Whether the page shows only the heading until a reader opens the section.
 
     >>> Section("Scores", ["The mean of ten items."]).folded
     False
@@ -186,7 +208,13 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A title, a verdict in one sentence, and what supports it: cards and sections.
+    """A page about the results of an evaluation.
+
+    Attributes:
+        title: Heading.
+        verdict: Result in one sentence, below the heading.
+        sections: Sections that support it.
+        cards: Numbers to remember, above the verdict.
 
     >>> print(Page("Aids", "NAL-R is better.", [Section("Scores", ["See below."])]).markdown())
     # Aids
@@ -205,11 +233,11 @@ class Page:
     cards: Sequence[Card] = ()
 
     def html(self) -> str:
-        """Return the page as one HTML file; all text is escaped."""
+        """Return the page as the text of one HTML file, which needs no network."""
         return _render("page.html", page=self)
 
     def markdown(self) -> str:
-        """Return text and tables without what is played or drawn; HTML tags stay text."""
+        """Return text and tables in Markdown, without sounds and pictures. HTML tags stay text."""
         blocks = [f"# {self.title}", self.verdict, *_markdown_blocks(self.sections, depth=2)]
         return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", "\n\n".join(filter(None, blocks))) + "\n"
 
@@ -226,14 +254,17 @@ def _markdown_blocks(sections: Sequence[Section], depth: int) -> list[str]:
 
 
 def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
-    """Write ``report.html``, ``report.md``, and ``report.json`` with the data, into a folder.
+    """Write a page as ``report.html`` and ``report.md``, and its data as ``report.json``.
 
-    Files of these names are replaced; others stay.
+    Args:
+        page: The page.
+        data: Results for programs, such as those of ``Evaluation.to_dict``.
+        out: Folder of the files. Files of these names are replaced; others stay.
 
     Returns: The path of ``report.html``.
 
     Raises:
-        ValueError: The files cannot be written, or JSON cannot hold the data.
+        ValueError: The files cannot be written, or JSON cannot represent the data.
         MissingExtraError: jinja2 is not installed.
 
     >>> import tempfile
@@ -258,6 +289,7 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
 
 @cache
 def _environment() -> Any:
+    """Return jinja2's environment with the templates and the script of the players."""
     jinja2 = require("jinja2", "eval")
     loader = jinja2.FileSystemLoader(_TEMPLATES)
     environment = jinja2.Environment(
@@ -265,8 +297,13 @@ def _environment() -> Any:
     )
     script = (_TEMPLATES / "player.js").read_text(encoding="utf-8")
     digest = hashlib.sha256(script.encode()).digest()
-    environment.globals |= {"script": script, "script_hash": base64.b64encode(digest).decode()}
-    environment.filters["uri"] = data_uri
+    environment.globals |= {
+        "script": script,
+        "script_hash": base64.b64encode(digest).decode(),
+        "levels": SPECTROGRAM_LEVELS,
+        "colours": SPECTROGRAM_COLOURS,
+    }
+    environment.filters["uri"] = _data_uri
     return environment
 
 
@@ -275,12 +312,8 @@ def _render(template: str, **values: Any) -> str:
     return f"{text}\n"
 
 
-def data_uri(data: bytes) -> str:
-    """Return the contents of a file as a URI, whose type is known from its first bytes.
-
-    >>> data_uri(b"<svg/>")
-    'data:image/svg+xml;base64,PHN2Zy8+'
-    """
+def _data_uri(data: bytes) -> str:
+    """Return the contents of a file as a URI, whose type is known from its first bytes."""
     types = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
     media_type = types.get(data[:4], "image/svg+xml")
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"

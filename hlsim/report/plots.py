@@ -1,14 +1,13 @@
-"""Plots of a study, narrow enough for a phone, for light and dark pages.
+"""Pictures of a study's scores and curves, narrow enough for a phone, on light and dark pages.
 
-They raise MissingExtraError without matplotlib. They do not use pyplot, so that no window, no
-global state and no notebook's backend is involved.
+All functions raise MissingExtraError without matplotlib. They do not use pyplot, so that no
+window, no global state and no notebook's backend is involved.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from textwrap import fill
 from typing import Any
 
@@ -22,7 +21,7 @@ from hlsim.extras import require
 from hlsim.report.page import Picture, Section
 from hlsim.report.results import ordered
 
-MANY_POINTS = 2000
+_MANY_POINTS = 2000
 """Number of points above which they are drawn as pixels, so that a page stays small."""
 
 INK = "#010203"
@@ -31,14 +30,16 @@ INK = "#010203"
 COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
 """Colours of lines and their labels, which can be read on white and on black."""
 
-POINTS = {"alpha": 0.6, "linewidths": 0, "color": COLOURS[0]}
+_POINTS = {"alpha": 0.6, "linewidths": 0, "color": COLOURS[0]}
 """Style of the points of items."""
 
 UNAIDED_COLOUR = "#7d828a"
+"""Colour of the condition without an aid."""
 
-LINE_STYLES = ("-", "--", ":", "-.")
+_LINE_STYLES = ("-", "--", ":", "-.")
+"""Styles of the curves of one aid, from the lowest level to the highest."""
 
-LINEAR_DB = 0.5
+_LINEAR_DB = 0.5
 """Difference between the gains at two levels below which they are drawn as one curve."""
 
 _NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -62,18 +63,18 @@ _STYLE: dict[str, Any] = {
 _CSS = b"svg { color: #1a1c20 } @media (prefers-color-scheme: dark) { svg { color: #e6e8eb } }"
 
 Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mapping[str, Any]]
-"""Horizontal and vertical places of a curve, and the style of the line."""
+"""Horizontal and vertical values of a curve, and keyword arguments of matplotlib for its line."""
 
 
 def draw_picture(
     draw: Callable[[Any], None], title: str, *, alt: str = "", note: str = "", height: float = 3.2
 ) -> Picture:
-    """Return what a function draws on matplotlib axes, as SVG.
+    """Return an SVG picture for a page of what a function draws on matplotlib axes.
 
     Args:
         draw: Function that is called with the axes.
         title: Heading above the picture.
-        alt: Text in place of the picture; by default the title.
+        alt: Text for readers who do not see the picture; by default the title.
         note: Sentence below the picture.
         height: Height in inches.
 
@@ -92,17 +93,16 @@ def draw_picture(
     return Picture(svg, alt or title, title, note)
 
 
-def plain(text: str) -> str:
-    """Return a label that matplotlib shows as it is, without mathematics.
-
-    >>> plain("5 $")
-    '5 \\\\$'
-    """
+def _plain(text: str) -> str:
+    """Return a label that matplotlib shows as it is, without interpreting $ as mathematics."""
     return text.replace("$", r"\$")
 
 
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
-    """Return a colour for each condition; one that belongs to another has its colour, paler."""
+    """Return a colour of matplotlib for each condition, by name.
+
+    A condition that belongs to another one, such as NAL-R at an aid's level, has its colour, paler.
+    """
     names = [condition.name for condition in conditions]
     aided = [c.name for c in conditions if c.of not in names and c.kind != "unaided"]
     colours: dict[str, Any] = dict.fromkeys(names, UNAIDED_COLOUR)
@@ -113,73 +113,84 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     return colours
 
 
-def label_curves(axes: Any) -> None:
+def _label_curves(axes: Any) -> None:
     """Write the name of each curve beside its right end, in its colour, without overlaps."""
     curves = [line for line in axes.lines if not line.get_label().startswith("_")]
     names = [fill(line.get_label(), 16) for line in curves]
     low, high = axes.get_ylim()
     ends = np.array([(line.get_ydata()[-1] - low) / (high - low) for line in curves])
-    heights = [1 + name.count("\n") for name in names]
     line_height = _LINE_INCHES / axes.figure.get_figheight() / 0.8
-    places = spread_labels(ends.clip(0.0, 1.0), line_height * np.array(heights))
+    heights = line_height * np.array([1 + name.count("\n") for name in names])
+    places = _spread_labels(ends.clip(0.0, 1.0), heights)
     for line, name, place in zip(curves, names, places, strict=True):
         style = {"color": line.get_color(), "alpha": line.get_alpha(), "va": "center"}
         axes.text(1.02, place, name, transform=axes.transAxes, fontsize=9, **style)
 
 
-def spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
+def _spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """Move labels up and down until none covers another; they keep their order.
 
     Args:
         ends: Wanted middle of each label, from 0 to 1. Shape: (labels,).
         heights: Height of each label. Shape: (labels,).
 
-    Returns: The middle of each label. Shape: (labels,).
-
-    >>> spread_labels(np.array([0.5, 0.5]), np.array([0.1, 0.1])).round(2).tolist()
-    [0.5, 0.6]
+    Returns: The middle of each label, at most 1. Shape: (labels,).
     """
-    places = ends.astype(float)
     order = np.argsort(ends, kind="stable")
-    pairs = list(pairwise(order))
-    for below, above in pairs:
-        distance = (heights[below] + heights[above]) / 2.0
-        places[above] = max(places[above], places[below] + distance)
-    if len(order):
-        places[order[-1]] = min(places[order[-1]], 1.0)
-    for below, above in reversed(pairs):
-        distance = (heights[below] + heights[above]) / 2.0
-        places[below] = min(places[below], places[above] - distance)
+    sorted_heights = heights[order]
+    # Middle of each label if all were stacked, on the ground that the lowest one stands on.
+    stacked = np.cumsum(sorted_heights) - sorted_heights / 2.0
+    sorted_places = np.maximum.accumulate(ends[order] - stacked) + stacked
+    places = np.empty(len(ends))
+    places[order] = np.minimum(sorted_places, 1.0 + stacked - stacked[-1:])
     return places
 
 
 def scatter_picture(
-    x: Any, y: Any, axis_titles: tuple[str, str], title: str, ends: Any = None
+    x: Any, y: Any, axis_titles: tuple[str, str], title: str, axis_range: Any = None
 ) -> Picture:
-    """Draw one point per item, and a line where both values are equal."""
+    """Draw two values of each item against each other, and a line where both are equal.
+
+    Args:
+        x, y: Values of the items. Shape: (items,).
+        axis_titles: Titles of the horizontal and of the vertical axis.
+        title: Heading above the picture.
+        axis_range: Lower and upper end of both axes; by default that of the values.
+    """
 
     def draw(axes: Any) -> None:
         axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
-        axes.scatter(x, y, s=16, rasterized=len(x) > MANY_POINTS, **POINTS)
-        axes.set(xlabel=plain(axis_titles[0]), ylabel=plain(axis_titles[1]), xlim=ends, ylim=ends)
+        axes.scatter(x, y, s=16, rasterized=len(x) > _MANY_POINTS, **_POINTS)
+        axes.set(
+            xlabel=_plain(axis_titles[0]),
+            ylabel=_plain(axis_titles[1]),
+            xlim=axis_range,
+            ylim=axis_range,
+        )
 
     note = "Each point is an item; both values are equal on the dashed line."
     return draw_picture(draw, title, note=note)
 
 
 def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Picture:
-    """Draw quartiles, median and every value of each group."""
+    """Draw the median, the quartiles and all values of each group of items.
+
+    Args:
+        groups: Values as a pandas series, by the name of the group.
+        measure: Title of the values.
+        by: Noun for the groups, such as "condition".
+    """
     values = {name: group.dropna().to_numpy() for name, group in groups.items()}
     values = {name: group for name, group in values.items() if len(group)}
 
     def draw(axes: Any) -> None:
-        names = [plain(fill(name, 18)) for name in values]
+        names = [_plain(fill(name, 18)) for name in values]
         style = {"orientation": "horizontal", "tick_labels": names, "widths": 0.5}
         axes.boxplot(list(values.values()), whis=0.0, showfliers=False, showcaps=False, **style)
         generator = np.random.default_rng(0)
         for place, group in enumerate(values.values(), 1):
             heights = place + generator.uniform(-0.18, 0.18, len(group))
-            axes.scatter(group, heights, s=9, rasterized=len(group) > MANY_POINTS, **POINTS)
+            axes.scatter(group, heights, s=9, rasterized=len(group) > _MANY_POINTS, **_POINTS)
         axes.invert_yaxis()
         axes.set(xlabel=measure)
 
@@ -196,31 +207,31 @@ def curves_picture(
     axis: str,
     *,
     over: str = "",
-    ends: tuple[float | None, float | None] = (None, None),
+    axis_range: tuple[float | None, float | None] = (None, None),
     note: str = "",
 ) -> Picture:
-    """Draw curves over frequency, or over what ``over`` names, with their names beside them.
+    """Draw curves, with their names beside them.
 
     Args:
         curves: Curves by name.
         title: Heading above the picture.
         axis: Title of the vertical axis.
         over: Title of the horizontal axis; by default, it is frequency in Hz.
-        ends: Lower and upper end of the vertical axis.
+        axis_range: Lower and upper end of the vertical axis; None is that of the curves.
         note: Sentence below the picture.
     """
 
     def draw(axes: Any) -> None:
         for name, (x, y, style) in curves.items():
-            # a label that begins with an underscore would be hidden
-            axes.plot(x, y, label=plain(f" {name}"), **style)
-        axes.set(ylabel=axis, ylim=ends)
+            # A label that begins with an underscore would be hidden.
+            axes.plot(x, y, label=_plain(f" {name}"), **style)
+        axes.set(ylabel=axis, ylim=axis_range)
         if over:
             axes.set(xlabel=over)
             axes.grid(alpha=0.3)
         else:
             frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
-        label_curves(axes)
+        _label_curves(axes)
 
     return draw_picture(draw, title, note=note)
 
@@ -228,20 +239,34 @@ def curves_picture(
 def gain_picture(
     title: str, results: Sequence[Mapping[str, Any]], colours: Mapping[str, Any]
 ) -> Picture:
-    """Draw insertion gains, rows of ``gain_curves``: one colour per aid, one line per level."""
+    """Draw the gain of aids for one ear over frequency, with one curve per aid and level.
+
+    Args:
+        title: Heading above the picture.
+        results: Results of ``gain_curves`` for each aid.
+        colours: Colour of each aid.
+    """
     curves = {}
     for row in results:
         gains, aid = np.array(row["gain_db"]), row["aid"]
         names = [f"{aid}, {level:g}{_NO_BREAK}dB{_NO_BREAK}SPL" for level in row["levels"]]
-        if float(np.ptp(gains, axis=0).max()) < LINEAR_DB:
+        if float(np.ptp(gains, axis=0).max()) < _LINEAR_DB:
             gains, names = gains[:1], [aid]
-        for name, line, style in zip(names, gains.tolist(), LINE_STYLES, strict=False):
+        for name, line, style in zip(names, gains.tolist(), _LINE_STYLES, strict=False):
             curves[name] = (row["frequencies"], line, {"color": colours[aid], "linestyle": style})
     return curves_picture(curves, title, "insertion gain (dB)")
 
 
 def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, over: str) -> Picture:
-    """Draw the mean of a column over a fact of the items, one curve per condition."""
+    """Draw the mean of a column over a fact of the items, with one curve per condition.
+
+    Args:
+        evaluation: The evaluation.
+        column: Column of its table, such as ``"haspi"``.
+        fact: Column of the fact, such as ``"snr"``.
+        title: Title of the column.
+        over: Title of the fact.
+    """
     colours = condition_colours(evaluation.conditions)
     means = evaluation.table.groupby(["condition", fact])[column].mean()
     curves = {}
@@ -253,22 +278,24 @@ def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, ov
 
 
 def pictures_sections(evaluation: Evaluation) -> list[Section]:
-    """Draw the scores of a study; a picture that would show a single group or item is left out.
+    """Return the section "Pictures" of a page with the scores by which its conditions are compared.
 
-    Returns: One section, or none if there is nothing to compare.
+    A picture that would show a single group or item is left out.
+
+    Returns: The section, or an empty list if there is no comparison.
     """
     c = evaluation.headline
     if c is None or c.overall.n < 2:
         return []
     scores = evaluation.wide(c.measure)
     before, after = scores[[c.before, c.after]].dropna().to_numpy().T
-    ends = MEASURES[c.measure].score_range if c.measure in MEASURES else None
-    margins = None if ends is None else (ends[0] - 0.03, ends[1] + 0.03)
+    scale = MEASURES[c.measure].score_range if c.measure in MEASURES else None
+    axis_range = scale and (scale[0] - 0.03, scale[1] + 0.03)
     axis_titles = (f"{c.title}, {c.before}", f"{c.title}, {c.after}")
     title = f"{c.title} of the {len(before)} items"
     pictures = [
         distribution_picture(dict(scores.items()), c.title, "condition"),
-        scatter_picture(before, after, axis_titles, title, margins),
+        scatter_picture(before, after, axis_titles, title, axis_range),
     ]
     for fact, name in {"severity": "degree of loss", "snr": "SNR (dB)"}.items():
         if fact in evaluation.table and evaluation.table[fact].nunique() > 1:

@@ -1,41 +1,34 @@
-"""The page of ``haspi-report``."""
+"""The page of ``haspi-report``, which presents what ``hlsim.evaluation.recordings`` computes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import title_of
 from hlsim.evaluation.result import Evaluation
-from hlsim.metrics.words import words_change
-from hlsim.report.page import Page, Section, Table, write_page
+from hlsim.report.page import Page, Section, write_page
+from hlsim.report.players import listening_sections
 from hlsim.report.plots import pictures_sections
 from hlsim.report.results import (
     GAIN_NOTE,
     LEVEL,
-    STATISTICS_NOTE,
-    comparison_sections,
     comparison_table,
-    detail_section,
-    items_table,
     mean_verdict,
-    score_cells,
-    scored_by,
-    severity_counts,
+    score_columns,
+    score_details,
     split_rows,
     summary_table,
 )
-from hlsim.report.sounds import listening_sections
 
 
 def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) -> Path:
-    """Write the evaluation as ``report.html``, ``report.md`` and ``report.json`` into a folder.
+    """Write the page of an evaluation as ``report.html`` and ``report.md``, and ``report.json``.
 
     Args:
-        evaluation: Result of ``haspi_report``.
+        evaluation: Evaluation of ``haspi_report``.
         out: Folder of the files.
-        listen: Number of items with players and spectrograms.
+        listen: Number of items with a player.
 
     Returns: The path of ``report.html``.
 
@@ -47,8 +40,13 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 
 
 def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
-    """Return the page of recorded speech: verdict, scores, sounds, pictures, details."""
-    columns = {**score_cells(evaluation), **LEVEL}
+    """Return the page about recorded speech: verdict, scores, sounds, pictures, details.
+
+    Args:
+        evaluation: Evaluation of ``haspi_report``.
+        listen: Number of items with a player.
+    """
+    columns = {**score_columns(evaluation), **LEVEL}
     tables = [summary_table("Means of all items", split_rows(evaluation.table), columns)]
     texts = [GAIN_NOTE] if "haspi" in evaluation.scores else []
     headline = evaluation.headline
@@ -67,44 +65,11 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     return Page(f"{', '.join(evaluation.names)}: {measures}", verdict, sections)
 
 
-def score_details(
-    evaluation: Evaluation, texts: Sequence[str] = (), tables: Sequence[Table] = ()
-) -> Section:
-    """Return all comparisons, scores of items and of ears, failures and notes, folded.
-
-    Args:
-        evaluation: The study.
-        texts: Paragraphs to begin with.
-        tables: Tables to begin with.
-    """
-    item_tables = [items_table(evaluation, "Scores and levels of every item")]
-    better_ear = ""
-    if "ears" in evaluation.groups:
-        caption = "Scores and levels of each ear"
-        item_tables.append(items_table(evaluation.groups["ears"], caption))
-        better_ear = "Each score is that of the better ear, by each measure."
-    sections = [*comparison_sections(evaluation), Section("All items", tables=item_tables)]
-    clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
-    levels = (
-        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for "
-        f"{scale.min():.1f} to {scale.max():.1f} dB SPL."
-    )
-    notes = [
-        scored_by(evaluation),
-        severity_counts(evaluation),
-        levels,
-        better_ear,
-        STATISTICS_NOTE,
-    ]
-    return detail_section(evaluation, sections, notes, texts=texts, tables=tables)
-
-
 def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
     """Return sentences about the words understood, if the headline is that of HASPI."""
     if c.measure != "haspi":
         return []
-    both = evaluation.wide("haspi")[[c.before, c.after]].dropna().clip(0.0, 1.0)
-    words = words_change(both[c.before].to_numpy(), both[c.after].to_numpy())
+    words = evaluation.words(c.before, c.after)
     before, after, change, low, high = (100.0 * share for share in words)
     return [
         f"In words: a listener would understand {before:.0f} % of the words of these sentences "

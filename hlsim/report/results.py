@@ -1,9 +1,11 @@
-"""Tables and sections that the pages of studies share."""
+"""Tables and sections that the pages of several studies share."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import product
 from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
@@ -31,27 +33,36 @@ STATISTICS_NOTE = (
 )
 
 Columns = dict[str, tuple[Callable[["DataFrame"], Any], str]]
-"""Columns of a table by title: a function of some rows of the study's table, and a format."""
+"""Columns of a page's table by title: a function of some rows of the study's table, and a format.
+
+The function returns a number, None or a text, and the format is that of Python's f-strings.
+"""
 
 _STATISTICS: dict[str, Callable[[Series], Any]] = {
     "mean absolute": lambda values: values.abs().mean(),
     "median absolute": lambda values: values.abs().median(),
     "worst tenth": lambda values: values.quantile(0.1),
-    "mean ± std": lambda values: spread(values.mean(), values.std()),
+    "mean ± std": lambda values: _mean_and_deviation(values.mean(), values.std()),
 }
 
 
 def statistic(column: str, name: str = "mean") -> Callable[[DataFrame], Any]:
-    """Return a statistic of a column: a method of a pandas Series, or one of ``_STATISTICS``."""
+    """Return a function that computes a statistic of a column of a study's table.
+
+    Args:
+        column: Name of the column.
+        name: Name of a method of a pandas series, such as ``"median"``, or of ``_STATISTICS``.
+    """
     compute = _STATISTICS.get(name) or methodcaller(name)
     return lambda rows: compute(rows[column])
 
 
 LEVEL: Columns = {"Level (dB SPL)": (statistic("level"), ".1f")}
+"""Column with the mean output level."""
 
 
-def score_cells(evaluation: Evaluation) -> Columns:
-    """Return n and the mean of each score with its standard deviation."""
+def score_columns(evaluation: Evaluation) -> Columns:
+    """Return the columns of a table of scores: number of items, and mean of each score."""
     columns: Columns = {"n": (statistic(evaluation.scores[0], "count"), "d")}
     for score in evaluation.scores:
         columns[f"{title_of(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
@@ -59,7 +70,12 @@ def score_cells(evaluation: Evaluation) -> Columns:
 
 
 def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
-    """Return the rows of each condition, or of each value of a fact and condition, by name."""
+    """Return the parts of a study's table for each condition, by name.
+
+    Args:
+        table: The table.
+        fact: Column of a fact of the items, such as ``"snr"``, whose values are separated too.
+    """
     if not fact:
         return {name: table[table["condition"] == name] for name in table["condition"].unique()}
     rows = {}
@@ -71,7 +87,7 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
 
 
 def ordered(values: Sequence[Any]) -> list[Any]:
-    """Return the values of a fact in order: degrees of loss, numbers, or names."""
+    """Return the values of a fact in ascending order; degrees of loss range from none to severe."""
     degrees = {name: place for place, name in enumerate(SEVERITIES)}
     return sorted(values, key=lambda value: (degrees.get(value, 0), value))
 
@@ -84,14 +100,14 @@ def summary_table(
     first: str = "Condition",
     folded: bool = False,
 ) -> Table:
-    """Return one row of statistics for each part of a study's table.
+    """Return a table with one row of statistics for each part of a study's table.
 
     Args:
         caption: Caption of the table.
-        rows: Parts of the study's table by name.
-        columns: Statistics by the heading of their column.
-        first: Heading of the first column, which contains the names.
-        folded: Whether the table is shown only when it is opened.
+        rows: Parts of the study's table by name, see ``split_rows``.
+        columns: Statistics by the title of their column.
+        first: Title of the first column, which contains the names.
+        folded: Whether the page shows only the caption until a reader opens the table.
     """
     cells = []
     for name, part in rows.items():
@@ -111,19 +127,14 @@ def number(value: Any, form: str) -> str:
     return f"{value:{form}}"
 
 
-def spread(mean: float, deviation: float | None) -> str:
+def _mean_and_deviation(mean: float, deviation: float | None) -> str:
     """Format a mean and its standard deviation, if there is one."""
     text = number(mean, ".3f")
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 
 
-def lower_first(title: str) -> str:
-    """Return a title for use within a sentence."""
-    return title[:1].lower() + title[1:]
-
-
 def loss_name(severity: str) -> str:
-    """Return the name of a severity for a table or a sentence.
+    """Return the name of a degree of hearing loss for a table or a sentence.
 
     >>> loss_name("mild"), loss_name("none")
     ('mild loss', 'no loss')
@@ -132,7 +143,7 @@ def loss_name(severity: str) -> str:
 
 
 def mean_verdict(evaluation: Evaluation) -> str:
-    """Return the mean score of a single condition as a sentence."""
+    """Return the verdict of a page with a single condition: its mean score in a sentence."""
     measure = evaluation.scores[0]
     scored = evaluation.table.dropna(subset=[measure])
     return (
@@ -143,29 +154,29 @@ def mean_verdict(evaluation: Evaluation) -> str:
 
 
 def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparisons") -> Table:
-    """Return one row per comparison, with the p values that the sentences state."""
+    """Return a table with one row per comparison, with the p values that the sentences state."""
     rows = []
     for c in comparisons:
         planned = " (planned)" if c.planned else ""
         row = {"Comparison": f"{c.title}: {c.before} to {c.after}{planned}"}
-        row |= paired_cells(c.overall, c.p_t, c.p_w)
+        row |= _paired_cells(c.overall, c.p_t, c.p_w)
         rows.append({**row, "Level change (dB)": number(c.level_change, "+.1f")})
     return Table.from_rows(caption, rows)
 
 
 def paired_table(caption: str, rows: Mapping[str, PairedComparison]) -> Table:
-    """Return one row per paired comparison, with p values that are not adjusted."""
-    cells = [{"Items": name, **paired_cells(c, c.p_t, c.p_w)} for name, c in rows.items()]
+    """Return a table with one row per paired comparison, by name, with unadjusted p values."""
+    cells = [{"Items": name, **_paired_cells(c, c.p_t, c.p_w)} for name, c in rows.items()]
     return Table.from_rows(f"{caption}; p not adjusted", cells)
 
 
-def paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> dict[str, str]:
-    """Return means, change and interval, both tests with the given p values, and d."""
+def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> dict[str, str]:
+    """Return the cells of a paired comparison by title, with p values that may be adjusted."""
     interval = "" if c.ci_low is None else f" [{c.ci_low:+.3f}, {c.ci_high:+.3f}]"
     return {
         "n": str(c.n),
-        "From (mean ± std)": spread(c.before_mean, c.before_std),
-        "To (mean ± std)": spread(c.after_mean, c.after_std),
+        "From (mean ± std)": _mean_and_deviation(c.before_mean, c.before_std),
+        "To (mean ± std)": _mean_and_deviation(c.after_mean, c.after_std),
         "Change [95 % interval]": f"{c.delta:+.3f}{interval}",
         "t-test (paired)": "n/a" if p_t is None else f"t = {number(c.t, '+.3f')}, {p_text(p_t)}",
         "Wilcoxon": "n/a" if p_w is None else f"W = {number(c.w, '.1f')}, {p_text(p_w)}",
@@ -173,11 +184,11 @@ def paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> d
     }
 
 
-def comparison_sections(evaluation: Evaluation) -> list[Section]:
-    """Return the sections of a page with the details of all comparisons.
+def _comparison_sections(evaluation: Evaluation) -> list[Section]:
+    """Return the sections of a page with the comparisons that the verdict leaves out.
 
-    They contain the pairs of conditions that the verdict leaves out, the comparisons for each
-    degree of hearing loss, and those over other statistical units, such as listeners.
+    These are all pairs of conditions, the verdict's pair for each degree of hearing loss, and this
+    pair by the means of listeners or another unit.
     """
     headline, sections = evaluation.headline, []
     if headline is None:
@@ -206,10 +217,13 @@ def detail_section(
     texts: Sequence[str] = (),
     tables: Sequence[Table] = (),
 ) -> Section:
-    """Return texts, tables, sections, failures and notes, folded.
+    """Return the folded section "Details" at the end of a page.
+
+    It contains texts, tables and sections, the items that failed, and notes about the origin of
+    the values.
 
     Args:
-        evaluation: The study.
+        evaluation: The evaluation of the page.
         sections: Inner sections.
         notes: Sentences about the origin of the values; empty ones are left out.
         texts: Paragraphs to begin with.
@@ -226,31 +240,51 @@ def detail_section(
     return Section("Details", texts, tables, sections=further, folded=True)
 
 
-def items_table(evaluation: Evaluation, caption: str) -> Table:
-    """Return scores and level of every item under every condition."""
+def score_details(
+    evaluation: Evaluation, texts: Sequence[str] = (), tables: Sequence[Table] = ()
+) -> Section:
+    """Return the section "Details" of a page about scores, with all comparisons and items.
+
+    Args:
+        evaluation: The evaluation of the page.
+        texts: Paragraphs to begin with.
+        tables: Tables to begin with.
+    """
+    item_tables = [_items_table(evaluation, "Scores and levels of every item")]
+    better_ear = ""
+    if "ears" in evaluation.groups:
+        caption = "Scores and levels of each ear"
+        item_tables.append(_items_table(evaluation.groups["ears"], caption))
+        better_ear = "Each score is that of the better ear, by each measure."
+    sections = [*_comparison_sections(evaluation), Section("All items", tables=item_tables)]
+    counts = evaluation.table.drop_duplicates("item")["severity"].value_counts()
+    degrees = ", ".join(f"{name} {counts[name]}" for name in SEVERITIES if name in counts)
+    clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
+    notes = [
+        scored_by(evaluation),
+        f"Degrees of hearing loss by item: {degrees}.",
+        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for "
+        f"{scale.min():.1f} to {scale.max():.1f} dB SPL.",
+        better_ear,
+        STATISTICS_NOTE,
+    ]
+    return detail_section(evaluation, sections, notes, texts=texts, tables=tables)
+
+
+def _items_table(evaluation: Evaluation, caption: str) -> Table:
+    """Return a table with scores and level of every item under every condition."""
     facts = evaluation.table.drop_duplicates("item").set_index("item")
     columns = {"Item": facts["name"], "Loss": facts["severity"]}
-    for name in evaluation.names:
-        for score in evaluation.scores:
-            scores = evaluation.wide(score)[name]
-            columns[f"{title_of(score)}, {name}"] = scores.map(lambda value: number(value, ".3f"))
-        levels = evaluation.wide("level")[name]
-        columns[f"dB SPL, {name}"] = levels.map(lambda value: number(value, ".1f"))
+    formats = {**dict.fromkeys(evaluation.scores, ".3f"), "level": ".1f"}
+    for name, (column, form) in product(evaluation.names, formats.items()):
+        title = "dB SPL" if column == "level" else title_of(column)
+        values = evaluation.wide(column)[name]
+        columns[f"{title}, {name}"] = values.map(partial(number, form=form))
     return Table(caption, list(columns), list(zip(*columns.values(), strict=True)))
 
 
 def scored_by(evaluation: Evaluation) -> str:
-    """Return a sentence that says which software computed HASPI and HASQI."""
+    """Return a sentence that says which software computed HASPI and HASQI, if they were."""
     names = [title_of(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
-    version = evaluation.versions["hlsim"]
-    text = (
-        f"{' and '.join(names)} (version 2) are computed by hlsim {version}, as by pyclarity 0.9."
-    )
-    return text if names else ""
-
-
-def severity_counts(evaluation: Evaluation) -> str:
-    """Return a sentence with the number of items for each degree of loss."""
-    counts = evaluation.table.drop_duplicates("item")["severity"].value_counts()
-    texts = [f"{name} {counts[name]}" for name in SEVERITIES if name in counts]
-    return f"Degrees of hearing loss by item: {', '.join(texts)}."
+    software = f"hlsim {evaluation.versions['hlsim']}, as by pyclarity 0.9"
+    return f"{' and '.join(names)} (version 2) are computed by {software}." if names else ""

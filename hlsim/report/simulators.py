@@ -1,4 +1,4 @@
-"""The page of ``evaluate-simulator``."""
+"""The page of ``evaluate-simulator``, which presents what ``evaluation.simulators`` computes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.simulators import agreement, example_item
 from hlsim.extras import install_command, is_installed
 from hlsim.report.page import Page, Picture, Section
+from hlsim.report.players import make_player
 from hlsim.report.plots import distribution_picture, scatter_picture
 from hlsim.report.results import (
     Columns,
@@ -23,13 +24,13 @@ from hlsim.report.results import (
     statistic,
     summary_table,
 )
-from hlsim.report.sounds import make_player
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 
 def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float | None]:
+    """Return a function that computes a statistic of ``agreement`` for a column of a table."""
     return lambda rows: agreement(rows, score)[statistic]
 
 
@@ -55,54 +56,51 @@ _TREATMENTS = {
     "compressed": "Compressed 3:1",
     "compensated": "The output of a compensator",
 }
+"""Titles of the treatments of the input."""
+
+_FACTS = {
+    "severity": "By degree of loss",
+    "input_level": "By level (dB SPL)",
+    "speech": "Clean or noisy",
+}
+"""Titles of the tables for each fact of the items."""
 
 
 def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
-    """Return the page of simulators: verdict, side by side, sounds, pictures, details."""
+    """Return the page about simulators: verdict, side by side, sounds, pictures, details.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_simulators``.
+        listen: Whether (1) or not (0) an item has a player.
+    """
+    sections, details = [], []
+    for treatment, group in evaluation.groups.items():
+        title, rows = _TREATMENTS[treatment], split_rows(group.table)
+        table = summary_table("Simulators side by side", rows, COLUMNS, first="Simulator")
+        comparisons = []
+        if group.comparisons:
+            caption = "SNR compared with the first; p adjusted by Holm"
+            comparisons.append(comparison_table(group.comparisons, caption))
+        sections.append(Section(title, tables=[table, *comparisons]))
+        fact_tables = [
+            summary_table(caption, split_rows(group.table, fact), COLUMNS, first="Items")
+            for fact, caption in _FACTS.items()
+            if group.table[fact].nunique() > 1
+        ]
+        details.append(Section(title, tables=fact_tables))
+    if listen:
+        sections.append(_listening_section(evaluation))
     first = next(iter(evaluation.groups.values()))
-    scores = [_scores(treatment, group) for treatment, group in evaluation.groups.items()]
-    details = [_details(treatment, group) for treatment, group in evaluation.groups.items()]
     pictures = [
         Section(name, pictures=[*_pictures(rows)]) for name, rows in split_rows(first.table).items()
     ]
-    sections = [
-        *scores,
-        *([_listening_section(evaluation)] if listen else []),
-        Section("Pictures", sections=pictures),
-        detail_section(evaluation, details, [_about(evaluation)]),
-    ]
+    sections.append(Section("Pictures", sections=pictures))
+    sections.append(detail_section(evaluation, details, [_about(evaluation)]))
     return Page("Simulators", _verdict(evaluation, first), sections)
 
 
-def _scores(treatment: str, group: Evaluation) -> Section:
-    """Return all simulators side by side, and their comparisons, for a treatment of the input."""
-    tables = [
-        summary_table(
-            "Simulators side by side", split_rows(group.table), COLUMNS, first="Simulator"
-        )
-    ]
-    if group.comparisons:
-        caption = "SNR compared with the first; p adjusted by Holm"
-        tables.append(comparison_table(group.comparisons, caption))
-    return Section(_TREATMENTS[treatment], tables=tables)
-
-
-def _details(treatment: str, group: Evaluation) -> Section:
-    """Return the scores by each fact of the items that differs."""
-    facts = {
-        "severity": "By degree of loss",
-        "input_level": "By level (dB SPL)",
-        "speech": "Clean or noisy",
-    }
-    tables = [
-        summary_table(title, split_rows(group.table, fact), COLUMNS, first="Items")
-        for fact, title in facts.items()
-        if group.table[fact].nunique() > 1
-    ]
-    return Section(_TREATMENTS[treatment], tables=tables)
-
-
 def _teacher(evaluation: Evaluation) -> str:
+    """Return the name of the teacher for a sentence."""
     teacher: str = evaluation.settings["teacher"]
     return "the exact MSBG" if teacher == "msbg" else teacher
 
@@ -118,12 +116,12 @@ def _verdict(evaluation: Evaluation, first: Evaluation) -> str:
     return (
         f"{_TREATMENTS[evaluation.settings['inputs'][0]]}: {best.name} has a median SNR of "
         f"{best.median():.1f} dB (worst tenth {best.quantile(0.1):.1f} dB, {len(best)} items) "
-        "against "
-        f"{_teacher(evaluation)}" + (f"; the others: {other_medians}." if other_medians else ".")
+        f"against {_teacher(evaluation)}{other_medians and f'; the others: {other_medians}'}."
     )
 
 
 def _about(evaluation: Evaluation) -> str:
+    """Return sentences about the items and the columns of the tables."""
     settings = evaluation.settings
     levels = ", ".join(f"{level:g}" for level in settings["levels"])
     text = (
@@ -139,15 +137,15 @@ def _about(evaluation: Evaluation) -> str:
 
 
 def _listening_section(evaluation: Evaluation) -> Section:
-    """Play one item: the input, the teacher's output, and the finite outputs of the simulators."""
+    """Return the player of an item: input, and outputs of the teacher and of the simulators."""
     item, expected = example_item(evaluation)
     signals = {"input": item.signal, "teacher": expected}
     for condition in evaluation.conditions:
-        with suppress(Exception), torch.no_grad():  # a failure is in the table
+        with suppress(Exception), torch.no_grad():  # A failure is in the table.
             output = condition.output(item)
             if output.isfinite().all():
                 signals[condition.name] = output
-    # a short clip is filled up with silence
+    # A short clip is filled up with silence.
     end = int(item.signal.nonzero().max()) + item.sample_rate // 10
     player = make_player({"": {n: signal[:end] for n, signal in signals.items()}}, item.sample_rate)
     facts = item.facts
@@ -159,7 +157,10 @@ def _listening_section(evaluation: Evaluation) -> Section:
 
 
 def _pictures(rows: DataFrame) -> Iterator[Picture]:
-    """Draw the scores of simulator over teacher, and the errors by degree of loss."""
+    """Draw the scores of a simulator over those of the teacher, and its errors by degree of loss.
+
+    The rows are those of one simulator in the study's table.
+    """
     for score, title in (("stoi", "STOI"), ("pesq", "PESQ")):
         pairs = rows.reindex(columns=[f"{score}_teacher", f"{score}_simulator"]).astype(float)
         pairs = pairs.dropna()

@@ -30,7 +30,7 @@ from hlsim.evaluation.clarity import (
     _Scene,
     evaluate_scenes,
 )
-from hlsim.report.clarity import conditions_table, scenes_page
+from hlsim.report.clarity import _conditions_table, scenes_page
 
 RATE = 44100
 LOW_RATE = 16000
@@ -264,14 +264,14 @@ def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_pat
     study = evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, stride=2))
     (failure,) = study.failures.itertuples()
     assert failure.condition == "choosy" and "too loud" in failure.failure
-    table = conditions_table(study)
+    table = _conditions_table(study)
     caption = "Means of the 1 that all conditions have scores of, of 2 pairs of scene and listener"
     assert table.caption == caption
     scored = study.table[study.table.item != failure.item]
     assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in scored.haspi]
     assert (study.details["look_ahead_ms"]["choosy"] is None) == (peaks[0] > peaks[1])
     without = study.table.assign(haspi=study.table.haspi.where(study.table.condition != "choosy"))
-    cells = [row[1] for row in conditions_table(replace(study, table=without)).rows]
+    cells = [row[1] for row in _conditions_table(replace(study, table=without)).rows]
     assert cells[2] == "n/a" and "n/a" not in (cells[0], cells[1], cells[3])
 
 

@@ -12,11 +12,11 @@ from hlsim.evaluation import Condition
 from hlsim.report.plots import (
     INK,
     UNAIDED_COLOUR,
+    _spread_labels,
     condition_colours,
     curves_picture,
     distribution_picture,
     gain_picture,
-    spread_labels,
 )
 
 pandas = pytest.importorskip("pandas")
@@ -37,7 +37,7 @@ def test_ink_follows_the_colour_scheme_of_the_page_and_plots_are_reproducible() 
 def test_labels_keep_their_order_and_their_distance(seed: int) -> None:
     random = np.random.default_rng(seed)
     ends, heights = random.uniform(0.0, 1.0, 6), random.choice([0.05, 0.1], 6)
-    places = spread_labels(ends, heights)
+    places = _spread_labels(ends, heights)
     order = np.argsort(ends)
     distances = np.diff(places[order])
     needed = (heights[order][1:] + heights[order][:-1]) / 2

@@ -9,7 +9,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from hlsim.report.sounds import make_player, spectrogram_levels
+from hlsim.report.page import SPECTROGRAM_COLOURS, SPECTROGRAM_LEVELS
+from hlsim.report.players import make_player, spectrogram_levels
 
 pytest.importorskip("matplotlib")
 
@@ -48,7 +49,7 @@ def test_sounds_of_a_group_have_one_gain_and_groups_are_not_louder_than_others()
 
 def test_spectrograms_have_one_scale_and_say_where_nothing_is_seen() -> None:
     player = make_player({"": {"loud": tone(80.0), "soft": tone(-20.0)}}, 16000)
-    lowest, highest = player.levels
+    lowest, highest = SPECTROGRAM_LEVELS
     loud, soft = (Image.open(io.BytesIO(sound.spectrogram)) for sound in player.sounds)
     bins, frames = spectrogram_levels(tone(80.0), 16000).shape
     assert loud.size == soft.size == (frames, bins)
@@ -59,7 +60,7 @@ def test_spectrograms_have_one_scale_and_say_where_nothing_is_seen() -> None:
     assert [sound.note for sound in player.sounds] == ["", "almost nothing above 0 dB SPL"]
     palette = bytes(loud.getpalette())
     ends = "".join(f"#{palette[place : place + 3].hex()} " for place in (0, 3 * 255))
-    assert ends.split() == [player.colours[0], player.colours[-1]]
+    assert ends.split() == [SPECTROGRAM_COLOURS[0], SPECTROGRAM_COLOURS[-1]]
 
 
 def test_silence_is_rejected() -> None:

@@ -1,4 +1,4 @@
-"""Players of what an ear perceives, with spectrograms on one scale of dB SPL."""
+"""Players for pages and notebooks: sounds to switch between, with spectrograms in dB SPL."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.parallel import describe_error
 from hlsim.evaluation.result import Evaluation
 from hlsim.extras import MissingExtraError, require
-from hlsim.report.page import Player, Section, Sound
+from hlsim.report.page import (
+    SPECTROGRAM_COLOURS,
+    SPECTROGRAM_LEVELS,
+    Player,
+    Section,
+    Sound,
+)
 
-LONGEST_SECONDS = 8.0
-"""Length after which an item is cut on a page."""
-
-SPECTROGRAM_LEVELS = (0.0, 90.0)
-"""Lowest and highest level of all spectrograms in dB SPL, for a bin of 50 Hz."""
+_LONGEST_SECONDS = 8.0
+"""Length in seconds after which an item is cut on a page."""
 
 NORMAL_EAR = "normal ear (the goal)"
 """Label of clean speech as a normal ear perceives it."""
 
-SPECTROGRAM_COLOURS = ("#000004", "#3b0f70", "#8c2981", "#de4968", "#fe9f6d", "#fcfdbf")
-"""Colours from the lowest level of a spectrogram to the highest, those of matplotlib's magma."""
-
-_PEAK = 0.9
-_HIGHEST_HZ = 8000.0  # MSBG and HASPI end there
+_PEAK = 0.9  # largest sample of the sounds of a group
+_HIGHEST_HZ = 8000.0  # at which MSBG and HASPI end
 _EMPTY_SHARE = 0.03  # of the bins that are within the range of an almost empty spectrogram
 
 _EXPLANATION = (
@@ -43,14 +43,18 @@ _EXPLANATION = (
 def listening_sections(
     evaluation: Evaluation, count: int, conditions: Sequence[str] = ()
 ) -> list[Section]:
-    """Return players of some items, from the largest rise of the score to the largest fall.
+    """Return the section "Listen" of a page, with one player per item.
+
+    The items range from the largest rise of the score to the largest fall, by the comparison with
+    which the page begins. A player has what a normal ear perceives of the clean speech, and what
+    the ear perceives under each condition.
 
     Args:
-        evaluation: The study.
+        evaluation: The evaluation of the page.
         count: Number of items.
-        conditions: Names of the conditions to be played, by default all.
+        conditions: Names of the conditions to be played; all of them if empty.
 
-    Returns: One section, or none if there is nothing to play.
+    Returns: The section, or an empty list if there is no comparison or ``count`` is 0.
     """
     headline = evaluation.headline
     if headline is None or not count:
@@ -60,17 +64,16 @@ def listening_sections(
     changes = changes.sort_values(ascending=False, kind="stable")
     places = np.linspace(0, len(changes) - 1, min(count, len(changes))).round().astype(int)
     rows = evaluation.table.drop_duplicates("item").set_index("item")
+    names = conditions or evaluation.names
     sections = []
     for place in places.tolist():
         row, change = rows.loc[changes.index[place]], changes.iloc[place]
         rank = f"change {change:+.3f}, rank {place + 1} of {len(changes)}"
         title = f"{row['name']} ({headline.title}: {rank})"
-        number = int(row.get("source", row.name))
         try:
-            sections.append(
-                _item_section(evaluation, number, title, conditions or evaluation.names)
-            )
-        except Exception as error:  # a page is not lost to a sound
+            number = int(row.get("source", row.name))
+            sections.append(_item_section(evaluation, number, title, names))
+        except Exception as error:  # A sound that cannot be played must not cost the page.
             sections.append(Section(title, [f"It cannot be played: {describe_error(error)}"]))
     return [Section("Listen", [_EXPLANATION], sections=sections)]
 
@@ -78,9 +81,16 @@ def listening_sections(
 def _item_section(
     evaluation: Evaluation, number: int, title: str, conditions: Sequence[str]
 ) -> Section:
-    """Return a player of the signals that a normal ear and, by condition, the ear perceives."""
+    """Return the player of an item, see ``listening_sections``.
+
+    Args:
+        evaluation: The evaluation of the page.
+        number: Number of the item.
+        title: Heading of the section.
+        conditions: Names of the conditions to be played.
+    """
     item = evaluation.items[number].load()
-    gain, end = gain_to_pascals(item.full_scale_spl), int(LONGEST_SECONDS * item.sample_rate)
+    gain, end = gain_to_pascals(item.full_scale_spl), int(_LONGEST_SECONDS * item.sample_rate)
     signals = {NORMAL_EAR: perceive(item.clean[:end].float() * gain, NORMAL, item.sample_rate)}
     for condition in evaluation.conditions:
         if condition.name in conditions:
@@ -95,17 +105,17 @@ def _item_section(
 def make_player(
     groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int, sentence: str = ""
 ) -> Player:
-    """Return a player, with spectrograms if Pillow is installed.
+    """Return a player that switches between sounds, with their spectrograms.
 
-    All signals of a group have one gain, so that their loudness can be compared. Groups may have
-    different gains: the output of an aid is much louder than what the ear perceives of it.
+    All sounds of a group have one gain, so that their loudness can be compared. Groups may have
+    different gains, because the output of an aid is much louder than what the ear perceives of it.
+    Without Pillow and matplotlib there are no spectrograms.
 
     Args:
-        groups: Signals in pascals by label, for each heading of a group.
+        groups: Signals in pascals by the label of their button, for each heading of a group, which
+            may be empty. Shape of each signal: (time,).
         sample_rate: Sample rate in Hz.
-        sentence: Words that are spoken.
-
-    Shape: (time,) for each signal.
+        sentence: Words that are spoken, shown above the sounds.
 
     Raises:
         ValueError: All signals of a group are silent.
@@ -130,13 +140,18 @@ def make_player(
         seconds=samples / sample_rate,
         full_scale=_full_scale(first_peak),
         sentence=sentence,
-        levels=SPECTROGRAM_LEVELS,
-        colours=SPECTROGRAM_COLOURS,
     )
 
 
 def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> Sound:
-    """Encode a signal of a group with a peak in pascals, and draw it."""
+    """Encode a signal in pascals, and draw its spectrogram.
+
+    Args:
+        label: Name on the button.
+        signal: The signal. Shape: (time,).
+        sample_rate: Sample rate in Hz.
+        peak: Largest sample of all signals of the group, which is played as 0.9.
+    """
     level = float(level_spl(signal))
     levels = spectrogram_levels(signal, sample_rate)
     lowest = SPECTROGRAM_LEVELS[0]
@@ -152,7 +167,7 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
 
 
 def _peak(group: Mapping[str, Tensor]) -> float:
-    """Return the largest sample of all signals of a group."""
+    """Return the largest magnitude of a sample in a group of signals."""
     peak = max(float(signal.abs().max()) for signal in group.values())
     if not peak:
         raise ValueError("all sounds are silent; pass a signal with samples other than zero")
@@ -160,18 +175,18 @@ def _peak(group: Mapping[str, Tensor]) -> float:
 
 
 def _full_scale(peak: float) -> float:
-    """Return the level in dB SPL of full scale if a peak in pascals is played at ``_PEAK``."""
+    """Return the level in dB SPL of full scale if a peak in pascals is played as 0.9."""
     return PASCAL_SPL + 20.0 * math.log10(peak / _PEAK)
 
 
 def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
-    """Return levels up to 8 kHz in windows of 20 ms, every 10 ms; silence has -46 dB SPL.
+    """Compute the spectrogram of a signal up to 8 kHz, in windows of 20 ms every 10 ms.
 
     Args:
-        signal: Signal in pascals.
+        signal: Signal in pascals. Shape: (time,).
         sample_rate: Sample rate in Hz.
 
-    Shape: (time,) -> (bins of 50 Hz, frames) in dB SPL.
+    Returns: Levels in dB SPL in bins of 50 Hz, at least -46. Shape: (bins, frames).
 
     >>> spectrogram_levels(torch.zeros(16000), 16000).shape
     torch.Size([161, 101])
@@ -186,24 +201,21 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
 
 
 def _spectrogram_png(levels: Tensor) -> bytes:
-    """Return a picture with one pixel for each bin and frame; nothing without Pillow."""
+    """Return a PNG file with one pixel per bin and frame; nothing without Pillow or matplotlib.
+
+    Shape of the levels in dB SPL: (bins, frames).
+    """
     try:
         image = require("PIL.Image", "eval")
-    except MissingExtraError:  # sounds can be played without it
+        colours = require("matplotlib.colors", "eval").LinearSegmentedColormap
+    except MissingExtraError:  # Sounds can be played without it.
         return b""
     lowest, highest = SPECTROGRAM_LEVELS
     shares = ((levels - lowest) / (highest - lowest)).clamp(0.0, 1.0)
     pixels = (255.0 * shares).round().to(torch.uint8).flip(0).numpy()
     picture = image.fromarray(pixels)
-    picture.putpalette(_palette())
+    palette = colours.from_list("", SPECTROGRAM_COLOURS)(range(256), bytes=True)
+    picture.putpalette(palette[:, :3].tobytes())
     data = io.BytesIO()
     picture.save(data, format="PNG", optimize=True)
     return data.getvalue()
-
-
-def _palette() -> bytes:
-    """Return 256 colours between those of ``SPECTROGRAM_COLOURS``, three bytes each."""
-    anchors = np.array([list(bytes.fromhex(colour[1:])) for colour in SPECTROGRAM_COLOURS])
-    shares, places = np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(anchors))
-    channels = [np.interp(shares, places, channel) for channel in anchors.T]
-    return np.stack(channels, 1).round().astype(np.uint8).tobytes()
