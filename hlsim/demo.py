@@ -13,7 +13,7 @@ from torch import Tensor
 from compensators import NALR, load_compensator
 from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import PASCAL_SPL, set_level
+from hlsim.calibration import set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aid_properties import gain_curves
 from hlsim.evaluation.aids import AtLevelOf, Unaided
@@ -23,7 +23,7 @@ from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
 from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
-from hlsim.metrics.ear.clean_speech import CleanSpeech
+from hlsim.metrics import HaspiReference
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.demo import (
     NAL_R,
@@ -155,7 +155,7 @@ def _read_items(
         clip = resample(waveform[0], rate, NEURO_RATE)[: round(_MAX_SECONDS * NEURO_RATE)]
         clean = set_level(clip, _SPEECH_LEVEL)
         try:
-            CleanSpeech(clean, None, NEURO_RATE, PASCAL_SPL, False, "HASPI")
+            HaspiReference(clean, sample_rate=NEURO_RATE, keep=False)
         except ValueError as error:
             raise ValueError(f"{path} cannot be scored: {error}") from error
         item_seed = (seed + number) % 2**32

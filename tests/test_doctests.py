@@ -65,6 +65,7 @@ MODULES = [
     "hlsim.losses.waveform",
     "hlsim.metrics.ear.clean_speech",
     "hlsim.metrics.ear.envelope_modulation",
+    "hlsim.metrics.ear.extent",
     "hlsim.metrics.ear.fine_structure",
     "hlsim.metrics.ear.input",
     "hlsim.metrics.ear.model",

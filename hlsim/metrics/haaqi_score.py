@@ -37,11 +37,11 @@ from hlsim.checks import Lengths
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
-from hlsim.metrics.ear.model import Extent
+from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.quality import Comparison, QualityReference
-from hlsim.torchtools import constant, not_compiled
+from hlsim.torchtools import constant_like, not_compiled
 
 ENVELOPE_SEGMENT = 192
 """Samples of a segment of the smoothed envelopes, 8 ms at 24 kHz."""
@@ -50,9 +50,13 @@ ENVELOPE_RATE = 2 * RATE // ENVELOPE_SEGMENT
 """Segments per second, 250, for they overlap by half."""
 
 MODULATION_EDGES = (20.0, 32.0, 50.0, 80.0)
-"""Lower edges in Hz of the bands of modulation that count. The last band ends at 125 Hz."""
+"""Lower edges in Hz of four bands of modulation: rates at which envelopes fluctuate.
+
+The last band ends at 125 Hz.
+"""
 
 MODULATION_ORDER = 128
+"""Order of the filters that divide fluctuations into these bands."""
 
 
 @not_compiled  # tracing takes minutes
@@ -68,19 +72,27 @@ def haaqi(
     seed: int | Sequence[int] = 0,
     whole_khz: bool = False,
 ) -> Tensor:
-    """Compute HAAQI version 1 of each item: how good processed music sounds to an ear, 0 to 1.
+    """Compute HAAQI version 1 of each item: how good processed music sounds, from 0 to 1.
 
     The score compares the processed music with clean music that NAL-R has amplified for the same
-    ear. It is differentiable in ``processed``. Stereo signals have one score per ear: take the
-    better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
+    impaired ear. It is differentiable in ``processed``. Stereo signals have one score per ear: take
+    the better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
 
     Args:
-        processed: Music at the impaired ear, at least 0.7 s long.
-        clean: Clean music, not amplified.
-        audiogram, sample_rate, full_scale_spl, lengths, noise, seed, whole_khz: The arguments of
-            ``hasqi``.
+        processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
+        clean: Clean music, not amplified. Shape: (..., time).
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        noise: Noise at the threshold of hearing. ``"expected"`` uses the same noise every time;
+            ``"seeded"`` draws the noise that pyclarity draws with ``seed``; ``"none"`` leaves it
+            out.
+        seed: Seed of the drawn noise, or one seed for each item.
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
 
-    Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
+    Returns:
+        Scores. Shape: (...,).
 
     Raises:
         ValueError: As for ``haspi``.
@@ -108,16 +120,18 @@ def haaqi(
 
 
 class HaaqiReference(QualityReference):
-    """Clean music in an impaired ear, prepared for the HAAQI of many processed signals.
-
-    In float32 it takes about 18 MB per second of music.
+    """Clean music that is prepared once for the HAAQI of many outputs in one impaired ear.
 
     Args:
-        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: The arguments of
-            ``haaqi``. The scores have the dtype and the device of ``clean``, whose gradient is not
-            computed.
-        keep: Store the clean signal's features; otherwise they are computed for each score, which
-            takes less memory.
+        clean: Clean music, not amplified. The scores have its dtype and its device. Its gradient
+            is not computed. Shape: (..., time).
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
+        keep: Store the clean music's features, about 18 MB per second in float32; otherwise they
+            are computed for each score.
 
     Raises:
         ValueError: As for ``haspi``.
@@ -134,15 +148,16 @@ class HaaqiReference(QualityReference):
 
     @staticmethod
     def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
-        envelopes = modulation_correlation(
+        envelopes = fine_structure.envelope_correlation(
             comparison.clean_levels,
             comparison.processed_levels,
             fine_structure.segments_of(extent, ENVELOPE_SEGMENT),
+            _split_by_rate,
         )
         counts = fine_structure.segments_of(extent)
         fine = fine_structure.synchrony(comparison.coherence, comparison.energy, counts)
-        x = fine_structure.relative_loudness(comparison.clean_spectrum)
-        y = fine_structure.relative_loudness(comparison.processed_spectrum)
+        x = fine_structure.channel_shares(comparison.clean_spectrum)
+        y = fine_structure.channel_shares(comparison.processed_spectrum)
         shape = fine_structure.spectral_similarity(x - y, 2.5)
         relative_shape = fine_structure.spectral_similarity((x - y) / (x + y), 25.0)
         nonlinear = 0.754 * envelopes**3 + 0.246 * fine
@@ -155,39 +170,20 @@ class HaaqiReference(QualityReference):
         return first_order + 0.501 * nonlinear.square() + 0.161 * linear.square()
 
 
-def modulation_correlation(reference: Tensor, processed: Tensor, counts: Extent) -> Tensor:
-    """Compute the mean correlation of the cepstra in the bands of modulation from 20 to 125 Hz.
+def _split_by_rate(waves: Tensor) -> Tensor:
+    """Divide the fluctuations of cepstral coefficients into bands of modulation from 20 to 125 Hz.
 
-    Args:
-        reference, processed: Levels by ``fine_structure.smooth_levels`` with ``ENVELOPE_SEGMENT``.
-            Shape: (items, 32, segments).
-        counts: Number of segments of each item.
-
-    Returns:
-        Correlation of each item, 0 to 1. Shape: (items,).
-
-    >>> levels = 40.0 + torch.randn(1, 32, 200)
-    >>> modulation_correlation(levels, 2.0 * levels, Extent((200,))).round(decimals=4)
-    tensor([1.])
+    Shape: (items, 5, time) -> (items, 4 bands, 5, time or more).
     """
-    cepstra = fine_structure.compute_cepstra(reference, processed, counts)
-    extent = cepstra.extent
-    shortest = max(extent.longest + MODULATION_ORDER // 2, MODULATION_ORDER + 1)
-    points = fft_length(shortest, 2)
-    responses = constant(
-        _modulation_responses, points, dtype=reference.dtype, device=reference.device
-    )
-    bands = []
-    for waves in (cepstra.reference, cepstra.processed):
-        spectrum = torch.fft.rfft(waves, points)[:, None] * responses[:, None]
-        filtered = torch.fft.irfft(spectrum, points)  # (items, 4 bands, 5 cosines, points)
-        bands.append(extent.centred(filtered))
-    correlation = fine_structure.absolute_correlation(*bands).mean((-2, -1))
-    return fine_structure.zero_unless_audible(correlation, cepstra.audible)
+    time = waves.shape[-1]
+    points = fft_length(max(time + MODULATION_ORDER // 2, MODULATION_ORDER + 1), 2)
+    responses = constant_like(waves, _modulation_responses, points)
+    spectrum = torch.fft.rfft(waves, points)[:, None] * responses[:, None]
+    return torch.fft.irfft(spectrum, points)
 
 
 def _modulation_responses(points: int) -> NDArray[np.float64]:
-    """Return the frequency responses of the bands: (4, points // 2 + 1)."""
+    """Return the frequency responses of the bands of modulation: (4, points // 2 + 1)."""
     filters = []
     for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
         edges = [low] if high is None else [low, high]

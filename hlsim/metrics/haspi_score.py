@@ -22,9 +22,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,11 +37,12 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
-from hlsim.metrics.ear.model import CHANNELS, Extent
+from hlsim.metrics.ear.clean_speech import CleanSpeech
+from hlsim.metrics.ear.extent import Extent
+from hlsim.metrics.ear.model import CHANNELS
 from hlsim.metrics.pair import Noise, match_pair
-from hlsim.metrics.reference import PreparedBatch, Reference, Settings, map_on_cores
-from hlsim.torchtools import constant, not_compiled
+from hlsim.metrics.reference import PreparedBatch, Reference, map_on_cores
+from hlsim.torchtools import constant_like, not_compiled
 
 
 @not_compiled  # tracing takes minutes
@@ -58,33 +60,36 @@ def haspi(
 ) -> Tensor:
     """Compute HASPI version 2 of each item: the intelligibility for an impaired ear, 0 to 1.
 
-    The score compares the processed signal in the impaired ear with clean speech in a normal ear. A
-    delay of ``processed`` does not count. A silent ``processed`` has the score of the ear's noise.
-    The score is differentiable in ``processed``; the delays that align it are constant. Bands that
-    are inaudible have no gradient. ``HaspiReference`` prepares clean speech once for many scores.
+    The score compares the output of an aid in the impaired ear with clean speech in a normal ear.
+    A delay of the output does not count. A silent output has the score of the ear's internal noise.
+    ``HaspiReference`` prepares clean speech once for many scores.
+
+    The score is differentiable in ``processed``. The delays that align the output are constants for
+    the gradient, and bands that are inaudible have no gradient.
 
     The result is float64 if one of the signals is, and float32 otherwise. On CUDA, leave
     ``torch.backends.cuda.matmul.allow_tf32`` off, as it is by default. The thresholds of an ear on
     a GPU are not read by the host: if they are out of range, the score is NaN.
 
     Args:
-        processed: Signal at the impaired ear, at least 0.7 s long.
-        clean: Clean speech, not amplified. Lengths of both that differ by 0.1 s at most are cut to
-            the shorter one, with a warning.
-        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item. Its
-            thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz count, interpolated over log
-            frequency where they were not measured.
+        processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
+        clean: Clean speech, not amplified. Shape: (..., time). Lengths of both that differ by 0.1 s
+            at most are cut to the shorter one, with a warning.
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item. Shape of a
+            tensor: (..., 8). The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz count,
+            interpolated over log frequency where they were not measured.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
-        lengths: Number of samples of each item in a padded batch.
-        noise: ``"expected"`` computes the mean over seeds, which is smooth and the same every time;
-            ``"seeded"`` draws the noise that pyclarity draws with ``seed`` (scores vary by up to
-            0.007); ``"none"`` leaves it out.
-        seed: One seed, or one for each item.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        noise: Internal noise of the ear. ``"expected"`` computes the mean score over all draws of
+            the noise, which is smooth and the same every time; ``"seeded"`` draws the noise that
+            pyclarity draws with ``seed`` (scores vary by up to 0.007); ``"none"`` leaves it out.
+        seed: Seed of the drawn noise, or one seed for each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does. From 44.1 to 44 kHz, scores
             change by up to 0.005.
 
-    Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
+    Returns:
+        Scores. Shape: (...,).
 
     Raises:
         ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
@@ -107,17 +112,21 @@ def haspi(
     return reference.score(processed, audiogram, noise=noise, seed=seed)
 
 
-class HaspiReference(Reference["_Batch"]):
-    """Clean speech in a normal ear, prepared for the HASPI of many processed signals.
+class HaspiReference(Reference):
+    """Clean speech that is prepared once for the HASPI of many outputs of aids.
 
-    It does not depend on an audiogram. In float32 it takes about 4 MB per second of speech.
+    It does not depend on an audiogram, because the clean speech is that of a normal ear. In float32
+    it takes about 4 MB per second of speech.
 
     Args:
         clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
-            is not computed.
-        settings: ``sample_rate``, ``full_scale_spl``, ``lengths`` and ``whole_khz`` as for
-            ``haspi``. ``keep=False`` computes the clean signal's features for each score instead
-            of storing them, which takes less memory.
+            is not computed. Shape: (..., time).
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
+        keep: Store the clean speech's features; otherwise they are computed for each score, which
+            takes less memory.
 
     Raises:
         ValueError: As for ``haspi``.
@@ -131,11 +140,33 @@ class HaspiReference(Reference["_Batch"]):
 
     score_name = "HASPI"
 
-    def __init__(self, clean: Tensor, **settings: Unpack[Settings]) -> None:
-        super().__init__(clean, **settings)
+    def __init__(
+        self,
+        clean: Tensor,
+        *,
+        sample_rate: int = 16000,
+        full_scale_spl: float = PASCAL_SPL,
+        lengths: Lengths | None = None,
+        whole_khz: bool = False,
+        keep: bool = True,
+    ) -> None:
+        super().__init__(
+            clean,
+            None,
+            sample_rate=sample_rate,
+            full_scale_spl=full_scale_spl,
+            lengths=lengths,
+            whole_khz=whole_khz,
+            keep=keep,
+        )
 
-    def _prepare_batches(self, signals: CleanSpeech) -> list[_Batch]:
-        return map_on_cores(lambda batch: _Batch(signals, batch), signals.batches, signals.clean)
+    def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
+        normal = ear_model.hair_cells(torch.zeros(8, device=signals.device))
+        return map_on_cores(
+            lambda batch: _Batch(signals, batch, batch.signals, normal, keep),
+            signals.batches,
+            signals.clean,
+        )
 
     def score(
         self,
@@ -145,21 +176,23 @@ class HaspiReference(Reference["_Batch"]):
         noise: Noise = "expected",
         seed: int | Sequence[int] = 0,
     ) -> Tensor:
-        """Return the HASPI of each processed signal.
+        """Return the HASPI of each output of an aid.
 
         Args:
-            processed: Signals of the shape, rate and scale of the clean ones. Lengths that differ
-                by 0.1 s at most are cut to the shorter one, with a warning.
-            audiogram, noise, seed: The arguments of ``haspi``.
+            processed: Outputs of the shape, rate and scale of the clean speech. Lengths that differ
+                by 0.1 s at most are cut to the shorter one, with a warning. Shape: (..., time).
+            audiogram: The impaired ear, or one for each item, as in ``haspi``.
+            noise: Internal noise of the ear, as in ``haspi``.
+            seed: Seed of the drawn noise, or one seed for each item.
 
-        Shape: (..., time) -> (...,).
+        Returns:
+            Scores, 0 to 1. Shape: (...,).
 
         Raises:
             ValueError: As for ``haspi``.
         """
         ears = ear_model.hair_cells(self._signals.thresholds(audiogram))
-        features = self._compare(processed, noise, seed, ears)
-        return intelligibility(features).reshape(features.shape[:-1])
+        return _intelligibility(self._compare(processed, noise, seed, ears))
 
 
 class _Channels(NamedTuple):
@@ -167,93 +200,85 @@ class _Channels(NamedTuple):
 
     Attributes:
         channels: The channels.
-        spectrum: Spectrum of the envelopes, which finds the lags of the processed signal.
-        delays: Delays that equalise the filters' group delays. Shape: (items, channels).
-        channel_sum: Sums of the frames over these channels.
+        spectrum: Spectrum of the envelopes, with which the channels of outputs are aligned.
+        delays: Delays that make up for different group delays. Shape: (items, channels).
+        amplitude: Contribution to the mean amplitude of each frame. Shape: (items, frames).
+        cepstrum: Contribution to the cepstrum of each frame. Shape: (items, 5, frames).
     """
 
     channels: slice
     spectrum: Tensor
     delays: Tensor
-    channel_sum: envelopes.ChannelSum
+    amplitude: Tensor
+    cepstrum: Tensor
 
 
-class _Batch(PreparedBatch[_Channels]):
+class _Batch(PreparedBatch):
     """Clean speech of a batch in a normal ear."""
-
-    def __init__(self, signals: CleanSpeech, batch: CleanBatch) -> None:
-        normal = ear_model.hair_cells(torch.zeros(8, device=signals.device))
-        super().__init__(signals, batch, batch.signals, normal)
 
     def _prepare(self, channels: slice) -> _Channels:
         extent = self._extent
         cochlea = ear_model.simulate_cochlea(self._clean, self._cells, channels, extent)
         spectrum = ear_model.lag_spectrum(cochlea.power.sqrt(), extent)
         delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        frames = self._frames(cochlea.power, self._cells.inner[channels], delays)
-        return _Channels(channels, spectrum, delays, envelopes.sum_over_channels(frames, channels))
+        levels = ear_model.nerve_levels(cochlea.power, self._cells.inner[channels])
+        frames = envelopes.smooth_frames(levels, delays, extent)
+        amplitude = envelopes.mean_amplitude(frames)
+        return _Channels(
+            channels, spectrum, delays, amplitude, envelopes.cepstrum(frames, channels)
+        )
 
-    def _frames(self, power: Tensor, inner: Tensor, delays: Tensor) -> Tensor:
-        """Return the smoothed levels of compressed envelopes."""
-        levels = ear_model.apply_adaptation(ear_model.sensation(power, inner))
-        return envelopes.smooth_frames(levels, delays, self._extent)
-
-    def _sum_channels(
-        self, clean: _Channels, sound: Tensor, ear: ear_model.HairCells
-    ) -> tuple[envelopes.ChannelSum, envelopes.ChannelSum]:
-        """Sum the frames of the clean and of the processed speech over some channels."""
+    def _cepstrum(self, clean: _Channels, sound: Tensor, ear: ear_model.HairCells) -> Tensor:
+        """Return the contribution of some channels to the cepstrum of the output's frames."""
         channels, extent = clean.channels, self._extent
-        cochlea = ear_model.simulate_cochlea(sound, ear, channels, extent)
-        lags = ear_model.channel_lags(clean.spectrum, cochlea.power.detach().sqrt(), extent)
-        power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
-        frames = self._frames(power, ear.inner[:, channels], clean.delays)
-        return clean.channel_sum, envelopes.sum_over_channels(frames, channels)
+        power = ear_model.simulate_cochlea(sound, ear, channels, extent).power
+        envelope = power.detach().sqrt()
+        power = ear_model.align_channels(power, envelope, clean.spectrum, extent)
+        levels = ear_model.nerve_levels(power, ear.inner[:, channels])
+        frames = envelopes.smooth_frames(levels, clean.delays, extent)
+        return envelopes.cepstrum(frames, channels)
 
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
         """Compute the ten features of each item."""
         items, extent = self._batch.items, self._extent
-        sound, ear = self._align(processed), ears[0].select_items(items)
-        clean_sum: envelopes.ChannelSum | None = None
-        processed_sum: envelopes.ChannelSum | None = None
-        sums = self._map_channels(lambda clean: self._sum_channels(clean, sound, ear), sound)
-        for clean_part, processed_part in sums:
-            clean_sum = envelopes.add_sums(clean_sum, clean_part)
-            processed_sum = envelopes.add_sums(processed_sum, processed_part)
-        assert clean_sum is not None and processed_sum is not None
-        indices, audible = envelopes.find_audible_frames(clean_sum.loudness, extent)
-        x = envelopes.select_frames(clean_sum.cosines, indices)
-        y = envelopes.select_frames(processed_sum.cosines, indices)
+        sound, ear = self._signals.align(processed, self._batch), ears[0][items]
+        contributions = [
+            (clean.amplitude, clean.cepstrum, self._cepstrum(clean, sound, ear))
+            for clean in self._clean_features()
+        ]
+        amplitude, *cepstra = (reduce(add, parts) for parts in zip(*contributions, strict=True))
+        indices, audible = envelopes.find_audible_frames(amplitude, extent)
+        x, y = (cepstrum.take_along_dim(indices[:, None], -1) for cepstrum in cepstra)
+        if noise == "expected":
+            return envelopes.expected_correlation(x, y, audible)
         if noise == "seeded":
             counts = [2 * CHANNELS * end for end in extent.ends]
             pair = _draw_pairs(seeds[items], counts, audible, x)
             x, y = x + pair[0], y + pair[1]
-        covariance = envelopes.modulation_covariance(x, y, audible)
-        if noise == "expected":
-            return envelopes.expected_correlation(covariance)
-        return envelopes.correlation(covariance)
+        return envelopes.correlation(x, y, audible)
 
 
 # -- noise -----------------------------------------------------------------------------------------
 
 DEVIATES_PER_DRAW = 2**16
-"""Approximate number of deviates that are drawn at once."""
+"""Approximate number of normally distributed numbers (deviates) that are drawn at once."""
 
 
 def _draw_pairs(
     seeds: Sequence[int], skipped: Sequence[int], extent: Extent, like: Tensor
 ) -> Tensor:
-    """Draw the noise of the clean and of the processed signals.
+    """Draw the internal noise of the ear for clean speech and for the output, as pyclarity does.
 
     Args:
         seeds: Seed of each item.
-        skipped: Deviates that pyclarity draws before, for each item.
+        skipped: Number of random numbers that pyclarity draws before, for each item.
         extent: Number of audible frames of each item.
-        like: Cosines of the signals. Shape: (items, 5, audible).
+        like: Cepstrum of the signals. Shape: (items, 5, audible).
 
     Returns:
-        Cosines of the noise. Shape: (2, items, 5, audible).
+        Cepstrum of the noise for clean speech, then for the output. Shape: (2, items, 5, audible).
     """
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
     for item, (seed, count, frames) in enumerate(zip(seeds, skipped, extent.ends, strict=True)):
@@ -264,13 +289,13 @@ def _draw_pairs(
 
 
 def _draw(random: np.random.RandomState, frames: int, dtype: torch.dtype) -> Tensor:
-    """Draw noise on all channels, frame by frame, and return its cosines. Shape: -> (5, frames)."""
+    """Draw noise on all channels, frame by frame, and return its cepstrum. Shape: (5, frames)."""
     parts = []
     step = DEVIATES_PER_DRAW // CHANNELS
     for start in range(0, frames, step):
         deviates = random.standard_normal((min(step, frames - start), CHANNELS))
         parts.append(torch.from_numpy(deviates).to(dtype))
-    return envelopes.NOISE_DB * torch.cat([envelopes.cosines(part.mT) for part in parts], -1)
+    return envelopes.NOISE_DB * torch.cat([envelopes.cepstrum(part.mT) for part in parts], -1)
 
 
 @lru_cache(maxsize=4)
@@ -293,11 +318,17 @@ def _state_after(seed: int, count: int) -> Any:
 
 
 def legacy_rng_after_normals(seed: int, count: int) -> np.random.RandomState:
-    """Return numpy's legacy generator after it has drawn normal deviates.
+    """Return numpy's legacy random generator as it is after drawing normally distributed numbers.
+
+    pyclarity uses one generator for several signals. This function leaps to the noise of a later
+    signal without computing that of the earlier ones.
 
     Args:
         seed: Seed of the generator.
-        count: Number of deviates that were drawn, an even number.
+        count: Number of values that were drawn, an even number.
+
+    Returns:
+        Generator that draws the next values.
 
     >>> expected = np.random.RandomState(7).standard_normal(5)[4]
     >>> bool(legacy_rng_after_normals(7, 4).standard_normal() == expected)
@@ -311,29 +342,25 @@ def legacy_rng_after_normals(seed: int, count: int) -> np.random.RandomState:
 # -- networks --------------------------------------------------------------------------------------
 
 
-def intelligibility(features: Tensor) -> Tensor:
-    """Compute the score from the features, by the mean of ten small networks, scaled to end at 1.
+def _intelligibility(features: Tensor) -> Tensor:
+    """Compute HASPI from its features, by the mean of ten small networks, scaled to end at 1.
 
     Shape: (..., 10) -> (...,).
-
-    >>> intelligibility(torch.ones(1, 10)).round(decimals=3)
-    tensor([1.])
     """
     hidden, output, normalisation = (
-        constant(_network, part, dtype=features.dtype, device=features.device)
-        for part in ("hidden", "output", "normalisation")
+        constant_like(features, _network, part) for part in ("hidden", "output", "normalisation")
     )
     hidden_sums = (features[..., None, None, :] * hidden[..., 1:]).sum(-1) + hidden[..., 0]
     output_sums = (torch.sigmoid(hidden_sums) * output[:, 1:]).sum(-1) + output[:, 0]
-    return torch.sigmoid(output_sums).mean(-1) / normalisation
+    return torch.sigmoid(output_sums).mean(-1) / normalisation.squeeze(0)
 
 
 def _network(part: str) -> NDArray[np.float64]:
-    """Return weights of the networks, biases first.
+    """Return weights of the networks that map features to HASPI, biases first.
 
-    Shape: (10, 4, 11) for ``"hidden"``, (10, 5) for ``"output"``, () for ``"normalisation"``.
+    Shape: (10, 4, 11) for ``"hidden"``, (10, 5) for ``"output"``, (1,) for ``"normalisation"``.
     """
     stored = json.loads((Path(__file__).parent / "haspi_networks.json").read_text())
     if part == "normalisation":
-        return np.array(stored[part])
+        return np.array([stored[part]])
     return np.array([network[part] for network in stored["networks"]])

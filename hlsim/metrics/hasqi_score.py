@@ -18,7 +18,7 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import fine_structure
-from hlsim.metrics.ear.model import Extent
+from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.quality import Comparison, QualityParts, QualityReference
 from hlsim.torchtools import not_compiled
@@ -39,19 +39,26 @@ def hasqi(
     seed: int | Sequence[int] = 0,
     whole_khz: bool = False,
 ) -> Tensor:
-    """Compute HASQI version 2 of each item: how good the processed speech sounds to an ear, 0 to 1.
+    """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
-    The score compares the processed speech with clean speech that NAL-R has amplified for the same
+    The score compares the output with clean speech that NAL-R has amplified for the same impaired
     ear. It is differentiable in ``processed``.
 
     Args:
-        processed, clean, audiogram, sample_rate, full_scale_spl, lengths, seed, whole_khz: The
-            arguments of ``haspi``.
-        noise: Noise at the threshold of hearing, which matters where nothing of the processed
-            speech is audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the
-            noise that pyclarity draws with ``seed``; ``"none"`` leaves it out.
+        processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
+        clean: Clean speech, not amplified. Shape: (..., time).
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        noise: Noise at the threshold of hearing, which matters where nothing of the output is
+            audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the noise
+            that pyclarity draws with ``seed``; ``"none"`` leaves it out.
+        seed: Seed of the drawn noise, or one seed for each item.
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
 
-    Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
+    Returns:
+        Scores. Shape: (...,).
 
     Raises:
         ValueError: As for ``haspi``.
@@ -75,16 +82,18 @@ def hasqi(
 
 
 class HasqiReference(QualityReference):
-    """Clean speech in an impaired ear, prepared for the HASQI of many processed signals.
-
-    In float32 it takes about 18 MB per second of speech.
+    """Clean speech that is prepared once for the HASQI of many outputs in one impaired ear.
 
     Args:
-        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: The arguments of
-            ``hasqi``. The scores have the dtype and the device of ``clean``, whose gradient is not
-            computed.
-        keep: Store the clean signal's features; otherwise they are computed for each score, which
-            takes less memory.
+        clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
+            is not computed. Shape: (..., time).
+        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
+        keep: Store the clean speech's features, about 18 MB per second in float32; otherwise they
+            are computed for each score.
 
     Raises:
         ValueError: As for ``haspi``.
@@ -106,8 +115,8 @@ class HasqiReference(QualityReference):
             comparison.clean_levels, comparison.processed_levels, counts
         )
         fine = fine_structure.synchrony(comparison.coherence, comparison.energy, counts)
-        x = fine_structure.relative_loudness(comparison.clean_spectrum)
-        y = fine_structure.relative_loudness(comparison.processed_spectrum)
+        x = fine_structure.channel_shares(comparison.clean_spectrum)
+        y = fine_structure.channel_shares(comparison.processed_spectrum)
         shape = fine_structure.spectral_similarity(x - y, 2.5)
         slope = fine_structure.spectral_similarity((x - y).diff(dim=-1), 1.0)
         return torch.stack((envelopes.square() * fine, 0.579 * shape + 0.421 * slope), -1)

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
+from hlsim.audiogram.thresholds import check_two_channels
+from hlsim.checks import Lengths, check_lengths
 from hlsim.dsp.fft import power, rfft
-from hlsim.metrics.ear.model import Extent, integers
+from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.pair import cut_to_common_length
 from hlsim.metrics.reference import map_on_cores
 from hlsim.torchtools import constant_like
@@ -54,13 +55,14 @@ LEVELS = np.linspace(-20.0, 20.0, 40)
 """Interaural levels in dB that are compared."""
 
 CPU_SEGMENTS, GPU_SEGMENTS = 2**17 // 4000, 2**25 // 4000
-"""Segments that are compared at once. Each has 4000 values, which fit into caches or memory."""
+"""Segments that are computed at once. Each takes 4000 values per band."""
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-"""Pairs of features. Features are the powers of the left and of the right ear, and the real and the
-imaginary part of their cross-spectrum."""
+"""Pairs of the four features of a band: the powers of the left and of the right ear, and the real
+and the imaginary part of their cross-spectrum."""
 
 LEFT_PAIR, RIGHT_PAIR = PAIRS.index((0, 0)), PAIRS.index((1, 1))
+"""Positions in ``PAIRS`` of the power of the left and of the right ear alone."""
 
 
 def mbstoi(
@@ -69,17 +71,19 @@ def mbstoi(
     """Compute MBSTOI of each item: the intelligibility of speech at two ears, about 0 to 1.
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
-    gradient: which frames are speech, the interaural delays and levels, and the better ear.
+    gradient: which frames are speech, the interaural delays and levels, and the better ear. It is
+    computed in float64 where the device supports it.
 
     Args:
-        processed: Processed speech at the left and the right ear.
-        clean: Clean speech at the left and the right ear, time-aligned with ``processed``.
+        processed: Processed speech at the left and the right ear. Shape: (..., 2, time).
+        clean: Clean speech at the left and the right ear, time-aligned with ``processed``. Shape:
+            (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
         lengths: Number of samples of each item in a padded batch. Without it, zeros at the end of
-            an item change its score by up to 0.007.
+            an item change its score by up to 0.007. Shape: (...).
 
-    Shape: (..., 2, time) twice -> (...,). The score is computed in float64 where the device
-    supports it.
+    Returns:
+        Scores. Shape: (...).
 
     Raises:
         ValueError: Signals of other shapes, on different devices or not finite; clean speech that
@@ -90,99 +94,87 @@ def mbstoi(
     >>> round(float(mbstoi(clean, clean)), 2)
     1.0
     """
-    rate = check_rate(sample_rate)
-    processed, clean, lengths = cut_to_common_length(processed, clean, rate, lengths)
-    _check_shapes(processed, clean)
+    equally_long = cut_to_common_length(processed, clean, sample_rate)
+    longest = max(processed.shape[-1], clean.shape[-1])
+    processed, clean = equally_long
+    check_two_channels(clean)
     items, time = clean.shape[:-2], clean.shape[-1]
     ends = [time] * items.numel()
     if lengths is not None:
-        ends = check_lengths(lengths, torch.Size((*items, time))).flatten().tolist()
+        all_ends = check_lengths(lengths, torch.Size((*items, longest)))
+        ends = all_ends.clamp_max(time).flatten().tolist()
     dtype = torch.promote_types(processed.dtype, clean.dtype)
     precision = torch.float32 if processed.device.type == "mps" else torch.float64
     with torch.autocast(processed.device.type, enabled=False):
         signals = torch.stack([clean, processed], -3).to(precision).reshape(-1, 4, time)
         _check_values(signals)
-        frames, counts = _remove_silence(*_resample_items(signals, ends, rate))
-        envelopes = _band_envelopes(frames.unflatten(1, (2, 2)))
-        return _mean_correlation(envelopes, np.array(counts)).to(dtype).reshape(items)
+        frames, counts = _remove_silence(*_resample_items(signals, ends, sample_rate))
+        envelopes = _band_features(frames.unflatten(1, (2, 2)))
+        return _mean_correlation(envelopes, counts).to(dtype).reshape(items)
 
 
-def _mean_correlation(envelopes: Tensor, counts: NDArray[np.int64]) -> Tensor:
+def _mean_correlation(features: Tensor, counts: tuple[int, ...]) -> Tensor:
     """Compute the mean correlation over all segments of each item.
 
     Args:
-        envelopes: Output of ``_band_envelopes``.
+        features: Output of ``_band_features``.
         counts: Number of frames of each item.
 
     Returns:
         Scores. Shape: (items,).
     """
-    device = envelopes.device
-    windows = envelopes.unfold(1, SEGMENT, 1)  # a segment begins at every frame
-    segments = counts - SEGMENT
-    item = np.repeat(np.arange(len(segments)), segments)
-    start = np.concatenate([np.arange(count) for count in segments])
+    device = features.device
+    windows = features.unfold(1, SEGMENT, 1)  # a segment begins at every frame
+    segments = integers(counts, device) - SEGMENT
+    total = sum(counts) - SEGMENT * len(counts)
+    item = torch.arange(len(counts), device=device)
+    item = item.repeat_interleave(segments, output_size=total)
+    start = torch.arange(total, device=device) - (segments.cumsum(0) - segments)[item]
     # As in pyclarity, one ear alone does not count in the last segment of an item.
     may_use_one_ear = start < segments[item] - 1
-    positions = _to_device(np.stack((item, start, may_use_one_ear)), device)
     segments_at_once = CPU_SEGMENTS if device.type == "cpu" else GPU_SEGMENTS
-    parts = positions.split(segments_at_once, -1)
+    groups = torch.arange(total, device=device).split(segments_at_once)
 
-    def correlate(part: Tensor) -> Tensor:
-        return _correlate(windows[part[0], part[1]], part[2].bool())
+    def correlate(group: Tensor) -> Tensor:
+        return _correlate(windows[item[group], start[group]], may_use_one_ear[group])
 
-    if len(segments) == 1:  # a single item is so short that starting threads costs more
-        correlations = [correlate(part) for part in parts]
+    if len(counts) == 1:  # a single item is so short that starting threads costs more
+        correlations = [correlate(group) for group in groups]
     else:
-        correlations = map_on_cores(correlate, parts, envelopes)
-    total = envelopes.new_zeros(len(segments)).index_add(0, positions[0], torch.cat(correlations))
-    return total / _to_device(segments, device)
-
-
-def _to_device(values: NDArray[np.int64], device: torch.device) -> Tensor:
-    """Return integers on a device, for which the host does not wait."""
-    return torch.from_numpy(values).to(device, non_blocking=device.type != "cpu")
-
-
-def _check_shapes(processed: Tensor, clean: Tensor) -> None:
-    for signal, name in ((processed, "processed"), (clean, "clean")):
-        check_waveform(signal, name)
-        if signal.ndim < 2 or signal.shape[-2] != 2:
-            raise ValueError(
-                f"expected {name} of shape (..., 2, time), left ear first, "
-                f"got {tuple(signal.shape)}"
-            )
-    if processed.shape != clean.shape:
-        raise ValueError(
-            f"expected signals of the same shape, got processed {tuple(processed.shape)} "
-            f"and clean {tuple(clean.shape)}"
-        )
-    if processed.device != clean.device:
-        raise ValueError(
-            f"expected signals on the same device, got processed on {processed.device} "
-            f"and clean on {clean.device}; move one of them with .to(device)"
-        )
+        correlations = map_on_cores(correlate, groups, features)
+    sums = features.new_zeros(len(counts)).index_add(0, item, torch.cat(correlations))
+    return sums / segments
 
 
 def _check_values(signals: Tensor) -> None:
-    """Validate clean and processed signals. The host waits for the device once.
+    """Raise ValueError unless all samples are finite and clean speech is not silent.
 
-    Shape: (items, 4, time).
+    The host waits for the device once.
+
+    Args:
+        signals: Clean speech at the left and the right ear, then processed speech. Shape: (items,
+            4, time).
     """
     finite = signals.detach().isfinite().all(-1).all(0)
     sounding = signals.detach()[:, :2].flatten(1).any(-1).all()
-    values = torch.cat((finite, sounding[None])).tolist()
-    for name, ears in (("processed", values[2:4]), ("clean", values[:2])):
-        if not all(ears):
-            raise ValueError(f"{name} holds samples that are NaN or infinite")
-    if not values[4]:
-        raise ValueError("clean is silent, every sample of an item is zero")
+    clean_left, clean_right, left, right, is_sounding = torch.cat((finite, sounding[None])).tolist()
+    if not (left and right):
+        raise ValueError("processed holds samples that are NaN or infinite")
+    if not (clean_left and clean_right and is_sounding):
+        raise ValueError("clean is silent, or holds samples that are NaN or infinite")
 
 
 def _resample_items(signals: Tensor, ends: list[int], rate: int) -> tuple[Tensor, Extent]:
-    """Resample items to 10 kHz, each by itself if the lengths differ, on which the method depends.
+    """Resample items to 10 kHz, each by itself if their lengths differ, as pyclarity does.
 
-    Shape: (items, 4, time) -> (items, 4, longest), zero after the end of each item.
+    Args:
+        signals: Signals. Shape: (items, 4, time).
+        ends: Number of samples of each item.
+        rate: Sample rate in Hz.
+
+    Returns:
+        Resampled signals, zero after the end of each item, (items, 4, longest), and the number of
+        samples of each item.
     """
     if min(ends) == max(ends):
         resampled = _resample(signals[..., : ends[0]], rate)
@@ -206,7 +198,7 @@ def _resample(signals: Tensor, rate: int) -> Tensor:
     return torch.fft.irfft(spectrum, points) * (points / time)
 
 
-def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]]:
+def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, tuple[int, ...]]:
     """Remove the frames where clean speech is silent at both ears, and overlap and add the others.
 
     The host waits for the device once.
@@ -214,11 +206,11 @@ def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]]
     Args:
         signals: Clean signals of the left and the right ear, then the processed ones. Shape:
             (items, 4, time).
-        extent: Lengths of the items.
+        extent: Number of samples of each item.
 
     Returns:
-        Frames of the shortened signals, (items, 4, frames, samples), and the number of frames of
-        each item.
+        Windowed frames of the shortened signals, (items, 4, frames, 256), and the number of frames
+        of each item.
 
     Raises:
         ValueError: Too few frames remain for a segment.
@@ -235,7 +227,7 @@ def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]]
     levels = 20.0 * torch.log10(norms + np.finfo(np.float64).eps)
     is_loud = levels > levels.amax(-1, keepdim=True) - RANGE_DB
     is_active = is_loud.any(1) & is_inside
-    counts = is_active.sum(-1).tolist()
+    counts = tuple(is_active.sum(-1).tolist())
     if min(counts) <= SEGMENT:
         item = f" in item {counts.index(min(counts))}" if len(counts) > 1 else ""
         raise ValueError(
@@ -243,7 +235,7 @@ def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]]
             f"{RANGE_DB:g} dB of its loudest frame{item}, got {_seconds(min(counts)):.2g} s"
         )
     order = (~is_active).byte().argsort(dim=-1, stable=True)[:, : max(counts)]
-    is_used = Extent(tuple(counts)).inside(rows.device)
+    is_used = Extent(counts).inside(rows.device)
     active = frames.take_along_dim(order[:, None, :, None], 2) * is_used[:, None, :, None]
     first_halves = functional.pad(active[..., :HOP], (0, 0, 0, 1))
     second_halves = functional.pad(active[..., HOP:], (0, 0, 1, 0))
@@ -261,11 +253,15 @@ def _window() -> NDArray[np.float64]:
     return window
 
 
-def _band_envelopes(frames: Tensor) -> Tensor:
-    """Compute the four features of each band (see ``PAIRS``) of clean and of processed frames.
+def _band_features(frames: Tensor) -> Tensor:
+    """Compute the four features of each band, which ``PAIRS`` names, in each frame.
 
-    Shape: (items, clean and processed, left and right, frames, samples) -> (items, frames, bands,
-    8).
+    Args:
+        frames: Windowed frames of clean, then processed speech at the left, then the right ear.
+            Shape: (items, 2, 2, frames, 256).
+
+    Returns:
+        Features of clean, then processed speech. Shape: (items, frames, bands, 8).
     """
     spectrum = rfft(functional.pad(frames, (0, POINTS - FRAME)))
     left, right = spectrum.unbind(2)
@@ -284,13 +280,13 @@ def _band_matrix() -> NDArray[np.float64]:
 
 
 def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
-    """Compute the mean over bands of the correlation of clean and processed envelopes.
+    """Compute the mean correlation of clean and processed envelopes over bands, for each segment.
 
     The envelopes are those after equalisation and cancellation with the best delay and level, or
     those of one ear if it is better.
 
     Args:
-        windows: Segments of the output of ``_band_envelopes``. Shape: (segments, bands, 8, frames).
+        windows: Segments of the output of ``_band_features``. Shape: (segments, bands, 8, frames).
         may_use_one_ear: Whether one ear alone may be used. Shape: (segments,).
 
     Returns:
@@ -324,7 +320,12 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
 
 
 def _correlation(both: Tensor, clean: Tensor, processed: Tensor) -> Tensor:
-    """Divide covariances by the standard deviations; 0 where a signal has no modulation."""
+    """Divide covariances by standard deviations; 0 where a signal has no modulation.
+
+    Args:
+        both: Covariances of clean and processed envelopes.
+        clean, processed: Variances of both.
+    """
     is_varying = (clean > 0.0) & (processed > 0.0)
     clean, processed = (torch.where(is_varying, part, 1.0) for part in (clean, processed))
     return torch.where(is_varying, both * clean.rsqrt() * processed.rsqrt(), 0.0)
@@ -333,8 +334,12 @@ def _correlation(both: Tensor, clean: Tensor, processed: Tensor) -> Tensor:
 def _find_largest_ratio(clean: Tensor, processed: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
     """Find the delay and level with the largest ratio of clean to processed modulation.
 
-    Shape: (segments, bands, pairs) twice, (bands, pairs, delays * levels) -> (segments, bands)
-    twice, the ratios and their indices on the grid.
+    Args:
+        clean, processed: Products of features. Shape: (segments, bands, pairs).
+        grid: Output of ``_cancellation_weights``. Shape: (bands, pairs, delays * levels).
+
+    Returns:
+        Largest ratios, and the indices of their delays and levels. Shape: (segments, bands) each.
     """
     largest = [
         (clean[:, band] @ weights).div_(processed[:, band] @ weights).max(-1)

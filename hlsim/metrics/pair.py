@@ -1,4 +1,4 @@
-"""Validation of pairs of signals that are scored, and of seeds."""
+"""Validation of the two signals that a score compares, and of random seeds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHORTEST_SECONDS = 0.7
 """Shortest signal in seconds for which a score can be trusted."""
 
 LOWEST_REFERENCE_SPL = 20.0
-"""Lowest level of the reference in dB SPL for which a score can be trusted."""
+"""Lowest level of clean speech or music in dB SPL for which a score can be trusted."""
 
 LARGEST_LENGTH_DIFFERENCE = 0.1
 """Largest difference in seconds between the lengths of two signals, of which the longer is cut."""
@@ -53,67 +53,75 @@ def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, 
 
 
 def cut_to_common_length(
-    processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
-) -> tuple[Tensor, Tensor, Lengths | None]:
-    """Cut two signals to their common length, with a warning if their lengths differ.
-
-    Arguments that do not fit together for other reasons are returned unchanged, because later
-    checks reject them.
+    processed: Tensor, clean: Tensor, sample_rate: int
+) -> tuple[Tensor, Tensor]:
+    """Validate that an output and a clean signal can be compared, and cut the longer one.
 
     Args:
-        processed: Signal to score. Shape: (..., time).
-        clean: Clean speech. Shape: (..., time).
-        sample_rate: Sample rate in Hz.
-        lengths: Number of samples of each item in a padded batch, which are limited to the common
-            length.
+        processed: Output of an aid. Shape: (..., time).
+        clean: Clean signal. Shape: (..., time), where ``time`` may differ by 0.1 s.
+        sample_rate: Sample rate of both in Hz.
+
+    Returns:
+        Output and clean signal of the same length.
 
     Raises:
-        ValueError: The lengths differ by more than 0.1 s.
+        ValueError: A signal is not a waveform, the shapes or devices differ, the lengths differ by
+            more than 0.1 s, or the rate is out of range.
 
-    >>> output, clean, _ = cut_to_common_length(torch.ones(9000), torch.ones(9000), 16000, None)
+    >>> output, clean = cut_to_common_length(torch.ones(9000), torch.ones(9000), 16000)
     >>> output.shape
     torch.Size([9000])
     """
-    are_tensors = isinstance(processed, Tensor) and isinstance(clean, Tensor)
-    if not are_tensors or processed.ndim == 0 or processed.shape[:-1] != clean.shape[:-1]:
-        return processed, clean, lengths
+    check_waveform(processed, "processed")
+    check_waveform(clean, "clean")
+    if processed.shape[:-1] != clean.shape[:-1] or processed.device != clean.device:
+        raise ValueError(
+            "expected processed and clean of the same shape and on the same device, got "
+            f"{tuple(processed.shape)} on {processed.device} and {tuple(clean.shape)} on "
+            f"{clean.device}; pass one clean signal for each processed one, and move both with "
+            ".to(device)"
+        )
     times = processed.shape[-1], clean.shape[-1]
-    if times[0] == times[1] or 0 in times:
-        return processed, clean, lengths
     time = common_length(times, check_rate(sample_rate), ("processed", "clean"))
-    if lengths is not None:
-        padded_shape = torch.Size((*clean.shape[:-1], max(times)))
-        lengths = check_lengths(lengths, padded_shape).clamp_max(time)
-    return processed[..., :time], clean[..., :time], lengths
+    return processed[..., :time], clean[..., :time]
 
 
 def match_pair(
     processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
 ) -> tuple[Tensor, Tensor, Lengths | None]:
-    """Cut two signals to their common length, and convert clean speech to the wider precision.
+    """Prepare the arguments of a score: one length, and the wider precision for clean speech.
 
     Args:
-        processed: Signal to score. Shape: (..., time).
-        clean: Clean speech. Shape: (..., time).
+        processed: Output of an aid. Shape: (..., time).
+        clean: Clean speech. Shape: (..., time), where ``time`` may differ by 0.1 s.
         sample_rate: Sample rate in Hz.
-        lengths: Number of samples of each item in a padded batch.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+
+    Returns:
+        Output, clean speech, and lengths that are limited to the common length.
 
     Raises:
-        ValueError: ``processed`` is not a waveform, or the lengths differ by more than 0.1 s.
+        ValueError: As for ``cut_to_common_length``, or ``lengths`` do not fit.
 
     >>> output, clean, _ = match_pair(torch.ones(8000).double(), torch.ones(8000), 16000, None)
     >>> clean.dtype
     torch.float64
     """
-    check_waveform(processed, "processed")
-    processed, clean, lengths = cut_to_common_length(processed, clean, sample_rate, lengths)
-    if isinstance(clean, Tensor):
-        clean = clean.to(torch.promote_types(clean.dtype, processed.dtype))
-    return processed, clean, lengths
+    cut_processed, cut_clean = cut_to_common_length(processed, clean, sample_rate)
+    if lengths is not None:
+        time = max(processed.shape[-1], clean.shape[-1])
+        lengths = check_lengths(lengths, torch.Size((*clean.shape[:-1], time)))
+        lengths = lengths.clamp_max(cut_clean.shape[-1])
+    dtype = torch.promote_types(clean.dtype, processed.dtype)
+    return cut_processed, cut_clean.to(dtype), lengths
 
 
 def check_seed(seed: int) -> int:
     """Return a seed that NumPy accepts.
+
+    Args:
+        seed: Seed to validate.
 
     Raises:
         ValueError: The seed is not a whole number from 0 to 2 ** 32 - 1.
@@ -128,20 +136,19 @@ def check_seed(seed: int) -> int:
     return seed
 
 
-def item_seeds(seed: int | Sequence[int], shape: torch.Size) -> list[int]:
-    """Return one seed for each item.
+def item_seeds(seed: int | Sequence[int], items: int) -> list[int]:
+    """Return one seed for each item of a batch.
 
     Args:
-        seed: One seed, or one for each item.
-        shape: Shape of the batch of items.
+        seed: One seed for all items, or a sequence with one for each item.
+        items: Number of items.
 
     Raises:
         ValueError: The number of seeds is another one, or a seed is out of range.
 
-    >>> item_seeds(3, torch.Size([2]))
+    >>> item_seeds(3, 2)
     [3, 3]
     """
-    items = shape.numel()
     try:
         seeds: list[Any] = list(seed)  # type: ignore[arg-type]
     except TypeError:  # neither a sequence nor a tensor with elements

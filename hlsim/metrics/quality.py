@@ -1,15 +1,14 @@
 """Comparison of two signals in one impaired ear, which HASQI and HAAQI have in common.
 
-The ear receives the clean signal amplified by NAL-R. What is scored is therefore distortion, noise
-and colour, not whether enough is audible.
+The ear receives the clean signal amplified by NAL-R, and the output of an aid as it is. The scores
+therefore show distortion, noise and colour, not whether enough is audible.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -19,17 +18,20 @@ from torch.nn import functional
 
 from compensators.nalr import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import Lengths
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.dsp.windows import hamming
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
-from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS, Extent
+from hlsim.metrics.ear.extent import Extent
+from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi_score import legacy_rng_after_normals
 from hlsim.metrics.pair import Noise
-from hlsim.metrics.reference import PreparedBatch, Reference, Settings, map_on_cores
+from hlsim.metrics.reference import PreparedBatch, Reference, map_on_cores
 from hlsim.torchtools import constant
 
 NALR_ORDER = 140
@@ -39,25 +41,21 @@ THRESHOLD_NOISE_DB = -10.0
 """Level of the noise on the motion of the basilar membrane, in dB over threshold."""
 
 FROZEN_SAMPLES = 2**17
-"""Length of the noise from which every channel takes a part."""
+"""Length of the fixed noise of ``noise="expected"``, from which every channel takes a part."""
 
 FROZEN_STRIDE = 4001
-"""Samples between the parts of two neighbouring channels."""
-
-NoiseSource = Callable[[slice], Tensor | None]
-"""Function that returns noise of some channels, (items or 1, channels, longest), or None.
-
-Channels are requested in ascending order.
-"""
+"""Samples between the starts of the parts of two neighbouring channels."""
 
 
 class QualityParts(NamedTuple):
-    """Score of quality and its two parts. Shape of all: (...,).
+    """HASQI or HAAQI with the two parts from which it follows. Shape of all: (...,).
 
     Attributes:
         combined: The score, 0 to 1.
-        nonlinear: Similarity of envelopes and fine structure, which noise and distortion reduce.
-        linear: Similarity of long-term spectra, which colour reduces.
+        nonlinear: Similarity of envelopes and fine structure, 0 to 1. Noise and distortion reduce
+            it.
+        linear: Similarity of long-term spectra, 0 to 1. Changes of the frequency response reduce
+            it.
 
     >>> QualityParts(torch.tensor(0.4), torch.tensor(0.5), torch.tensor(0.8)).nonlinear
     tensor(0.5000)
@@ -69,15 +67,19 @@ class QualityParts(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Features of two signals in one ear, from which a score is computed.
+    """Features of a clean signal and of the output of an aid in one ear, which give a score.
 
     Attributes:
-        clean_levels, processed_levels: Smoothed levels in dB over threshold. Shape: (items, 32,
+        clean_levels: Smoothed levels of the clean signal in dB over threshold. Shape: (items, 32,
             segments).
-        coherence: Coherence of the fine structures. Shape: (items, 32, segments of 16 ms).
-        energy: Mean squares of the clean segments. Shape: (items, 32, segments of 16 ms).
-        clean_spectrum, processed_spectrum: long-term levels in dB over threshold. Shape: (items,
-            32).
+        processed_levels: The same of the output.
+        coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
+            (items, 32, segments).
+        energy: Mean square of the clean signal in each segment of 16 ms. Shape: (items, 32,
+            segments).
+        clean_spectrum: Long-term level of the clean signal in each channel, in dB over threshold.
+            Shape: (items, 32).
+        processed_spectrum: The same of the output.
 
     >>> Comparison._fields[:2]
     ('clean_levels', 'processed_levels')
@@ -91,18 +93,21 @@ class Comparison(NamedTuple):
     processed_spectrum: Tensor
 
 
-class QualityReference(Reference["_Batch"]):
-    """Clean signals in an impaired ear, prepared for the scores of many processed signals.
+class QualityReference(Reference):
+    """Base of ``HasqiReference`` and ``HaaqiReference``: clean signals in an impaired ear.
 
-    Subclasses compute the score from a ``Comparison``. In float32 it takes about 18 MB per second.
+    Subclasses compute the score from a ``Comparison``.
 
     Args:
         clean: Clean signals, not amplified. The scores have their dtype and their device. Their
-            gradient is not computed.
+            gradient is not computed. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
-        settings: ``sample_rate``, ``full_scale_spl``, ``lengths`` and ``whole_khz`` as for
-            ``haspi``. ``keep=False`` computes the clean signals' features for each score instead
-            of storing them, which takes less memory.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
+        keep: Store the clean signals' features, about 18 MB per second in float32; otherwise they
+            are computed for each score.
 
     Raises:
         ValueError: As for ``haspi``.
@@ -117,62 +122,89 @@ class QualityReference(Reference["_Batch"]):
     envelope_segment: ClassVar[int]
 
     def __init__(
-        self, clean: Tensor, audiogram: AudiogramLike, **settings: Unpack[Settings]
+        self,
+        clean: Tensor,
+        audiogram: AudiogramLike,
+        *,
+        sample_rate: int = 16000,
+        full_scale_spl: float = PASCAL_SPL,
+        lengths: Lengths | None = None,
+        whole_khz: bool = False,
+        keep: bool = True,
     ) -> None:
-        super().__init__(clean, audiogram, **settings)
+        super().__init__(
+            clean,
+            audiogram,
+            sample_rate=sample_rate,
+            full_scale_spl=full_scale_spl,
+            lengths=lengths,
+            whole_khz=whole_khz,
+            keep=keep,
+        )
 
-    def _prepare_batches(self, signals: CleanSpeech) -> list[_Batch]:
+    def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
         assert self._audiogram is not None
         ears = signals.thresholds(self._audiogram)
         host_ears = signals.thresholds(self._audiogram, host=True).detach().double()
-        return map_on_cores(
-            lambda batch: _Batch(
-                signals, batch, ears[batch.items], host_ears[batch.items], type(self)
-            ),
-            signals.batches,
-            signals.clean,
-        )
+
+        def prepare(batch: CleanBatch) -> _Batch:
+            amplified = _amplify(batch.signals, host_ears[batch.items], batch.audible)
+            cells = ear_model.hair_cells(ears[batch.items])
+            return _Batch(signals, batch, amplified, cells, keep, score=type(self))
+
+        return map_on_cores(prepare, signals.batches, signals.clean)
 
     def score(
         self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
     ) -> Tensor:
-        """Return the score of each processed signal.
+        """Return the score of each output of an aid.
 
         Args:
-            processed: Signals of the shape, rate and scale of the clean ones. Lengths that differ
-                by 0.1 s at most are cut to the shorter one, with a warning.
+            processed: Outputs of the shape, rate and scale of the clean signals. Lengths that
+                differ by 0.1 s at most are cut to the shorter one, with a warning. Shape: (...,
+                time).
             noise: Noise at the threshold of hearing, as in ``hasqi``.
-            seed: One seed, or one for each item.
+            seed: Seed of the drawn noise, or one seed for each item.
 
-        Shape: (..., time) -> (...,).
+        Returns:
+            Scores, 0 to 1. Shape: (...,).
 
         Raises:
-            ValueError: Signals of another shape, not finite or on another device.
+            ValueError: Outputs of another shape, not finite or on another device.
         """
         return self.parts(processed, noise=noise, seed=seed).combined
 
     def parts(
         self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
     ) -> QualityParts:
-        """Return the score of each processed signal with its nonlinear and its linear part.
+        """Return the score of each output of an aid with its nonlinear and its linear part.
 
-        The arguments are those of ``score``.
+        Args:
+            processed, noise, seed: The arguments of ``score``.
         """
         nonlinear, linear = self._compare(processed, noise, seed).unbind(-1)
         return QualityParts(self._combine(nonlinear, linear), nonlinear, linear)
 
     @staticmethod
     def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
-        """Return the nonlinear and the linear part of each item. Shape: -> (items, 2)."""
+        """Compute the nonlinear and the linear part of the score of each item.
+
+        Args:
+            comparison: Features of the clean signals and of the outputs.
+            extent: Number of samples of each item.
+
+        Returns:
+            Nonlinear and linear parts. Shape: (items, 2).
+        """
         raise NotImplementedError
 
     @staticmethod
     def _combine(nonlinear: Tensor, linear: Tensor) -> Tensor:
-        """Return the scores. Shape: (...,) twice -> (...,)."""
+        """Compute the score from its parts. Shape: (...,) twice -> (...,)."""
         raise NotImplementedError
 
 
-# -- items that are processed together -------------------------------------------------------------
+# -- batches --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -181,12 +213,12 @@ class _Channels:
 
     Attributes:
         channels: The channels.
-        envelope, motion: Spectra that find the lags of the processed signal.
-        delays: Delays that equalise the filters' group delays. Shape: (items, channels).
+        envelope, motion: Spectra with which envelope and motion of an output are aligned.
+        delays: Delays that make up for different group delays. Shape: (items, channels).
         smooth_levels: Smoothed levels. Shape: (items, channels, segments).
         adapted_motion: Motion after adaptation. Shape: (items, channels, padded).
         segments: ``segment_spectra`` of that motion.
-        spectrum: long-term levels in dB over threshold. Shape: (items, channels).
+        level: Long-term level in dB over threshold. Shape: (items, channels).
     """
 
     channels: slice
@@ -196,91 +228,80 @@ class _Channels:
     smooth_levels: Tensor
     adapted_motion: Tensor
     segments: tuple[Tensor, Tensor]
-    spectrum: Tensor
+    level: Tensor
 
 
-class _Batch(PreparedBatch[_Channels]):
-    """Clean signals of a batch in their impaired ears.
+class _Batch(PreparedBatch):
+    """Clean signals of a batch, amplified by NAL-R, in their impaired ears.
 
     Args:
-        signals: All clean signals.
-        batch: Those of the batch.
-        ears, host_ears: Ears of the items, on the device of the signals and on the CPU.
-            Shape: (items, 8) dB HL.
+        arguments: Those of ``PreparedBatch``.
         score: The score that is computed.
     """
 
-    def __init__(
-        self,
-        signals: CleanSpeech,
-        batch: CleanBatch,
-        ears: Tensor,
-        host_ears: Tensor,
-        score: type[QualityReference],
-    ) -> None:
-        amplified = _amplify(batch.signals, host_ears, batch.audible)
-        super().__init__(signals, batch, amplified, ear_model.hair_cells(ears))
+    def __init__(self, *arguments: Any, score: type[QualityReference]) -> None:
         self._score = score
-        self._unit = 10.0 ** (-signals.full_scale / 20.0)
+        super().__init__(*arguments)
+
+    @property
+    def _unit(self) -> float:
+        """Amplitude of 20 uPa in the unit of the input."""
+        return 10.0 ** (-self._signals.full_scale / 20.0)
 
     def _prepare(self, channels: slice) -> _Channels:
         extent = self._extent
-        cochlea, motion = self._simulate(self._clean, channels)
+        cochlea = self._simulate(self._clean, channels)
         delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        cells = self._cells[channels]
-        smooth_levels, adapted_motion = self._adapt(cochlea.power, motion, cells, delays)
+        levels, motion = self._adapt(cochlea.power, cochlea.motion, channels, delays)
         return _Channels(
             channels=channels,
             envelope=ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
-            motion=ear_model.lag_spectrum(motion, extent),
+            motion=ear_model.lag_spectrum(cochlea.motion, extent),
             delays=delays,
-            smooth_levels=smooth_levels,
-            adapted_motion=adapted_motion,
-            segments=self._segment_spectra(adapted_motion, delays, None),
-            spectrum=ear_model.mean_level(cochlea, cells),
+            smooth_levels=levels,
+            adapted_motion=motion,
+            segments=self._segment_spectra(motion, delays, None),
+            level=cochlea.level,
         )
 
-    def _simulate(self, sound: Tensor, channels: slice) -> tuple[ear_model.CochlearOutput, Tensor]:
-        """Return the output of the cochlea, and the motion of its basilar membrane."""
-        cells, extent = self._cells, self._extent
-        cochlea = ear_model.simulate_cochlea(sound, cells, channels, extent, motion=True)
-        assert cochlea.motion is not None
-        return cochlea, cochlea.motion
+    def _simulate(self, sound: Tensor, channels: slice) -> ear_model.CochlearOutput:
+        return ear_model.simulate_cochlea(sound, self._cells, channels, self._extent, motion=True)
 
     def _adapt(
-        self, power: Tensor, motion: Tensor, cells: ear_model.HairCells, delays: Tensor
+        self, power: Tensor, motion: Tensor, channels: slice, delays: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the smoothed levels, with equal group delays, and the adapted motion."""
-        levels = ear_model.apply_adaptation(ear_model.sensation(power, cells.inner))
-        motion = scale_motion_to_level(motion, power, levels, self._unit)
-        delayed = self._equalise_delays(levels, delays)
+        levels = ear_model.nerve_levels(power, self._cells[..., channels].inner)
+        motion = _scale_motion_to_level(motion, power, levels, self._unit)
         segment = self._score.envelope_segment
+        delayed = self._delay(levels, delays)
         return fine_structure.smooth_levels(delayed, self._extent, segment), motion
 
-    def _equalise_delays(self, channels: Tensor, delays: Tensor) -> Tensor:
+    def _delay(self, signal: Tensor, delays: Tensor) -> Tensor:
+        """Delay channels. Shape: (items, channels, padded) -> (items, channels, longest)."""
         ends, longest = self._extent.ends, self._extent.longest
-        return ear_model.shift(channels, delays, ends, ends, longest)
+        return ear_model.shift(signal, delays, ends, ends, longest)
 
     def _segment_spectra(
         self, motion: Tensor, delays: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Add noise to the motion, equalise the group delays, and compute ``segment_spectra``."""
+        """Add noise to the motion, delay its channels, and compute ``segment_spectra``."""
         extent = self._extent
         motion = motion[..., : extent.longest]
         if noise is not None:
             motion = motion + self._unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0) * noise
-        return fine_structure.segment_spectra(self._equalise_delays(motion, delays), extent)
+        return fine_structure.segment_spectra(self._delay(motion, delays), extent)
 
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
         """Compute the nonlinear and the linear part of each item."""
-        sound, chunks = self._align(processed), self._channel_chunks()
-        sources = _noise_sources(noise, seeds[self._batch.items], self._extent, sound)
-        noises = {channels.start: [source(channels) for source in sources] for channels in chunks}
-        comparisons = self._map_channels(
-            lambda clean: self._compare_channels(clean, sound, *noises[clean.channels.start]), sound
-        )
+        sound = self._signals.align(processed, self._batch)
+        sources = _NoiseSources(noise, seeds[self._batch.items], self._extent, sound)
+        comparisons = [
+            self._compare_channels(clean, sound, *sources.draw(clean.channels))
+            for clean in self._clean_features()
+        ]
         joined = Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
         return self._score.compute_parts(joined, self._extent)
 
@@ -292,13 +313,12 @@ class _Batch(PreparedBatch[_Channels]):
         processed_noise: Tensor | None,
     ) -> Comparison:
         channels, extent = clean.channels, self._extent
-        cells = self._cells[channels]
-        cochlea, motion = self._simulate(sound, channels)
-        lags = ear_model.channel_lags(clean.envelope, cochlea.power.detach().sqrt(), extent)
-        power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
-        lags = ear_model.channel_lags(clean.motion, motion.detach(), extent)
-        motion = ear_model.shift(motion, lags, extent.ends, extent.ends, extent.padded)
-        smooth_levels, motion = self._adapt(power, motion, cells, clean.delays)
+        cochlea = self._simulate(sound, channels)
+        power, motion = cochlea.power, cochlea.motion
+        envelope = power.detach().sqrt()
+        power = ear_model.align_channels(power, envelope, clean.envelope, extent)
+        motion = ear_model.align_channels(motion, motion.detach(), clean.motion, extent)
+        levels, motion = self._adapt(power, motion, channels, clean.delays)
         segments = self._segment_spectra(motion, clean.delays, processed_noise)
         clean_segments = clean.segments
         if clean_noise is not None:
@@ -306,16 +326,16 @@ class _Batch(PreparedBatch[_Channels]):
         counts = fine_structure.segments_of(extent)
         return Comparison(
             clean_levels=clean.smooth_levels,
-            processed_levels=smooth_levels,
+            processed_levels=levels,
             coherence=fine_structure.coherence(clean_segments, segments, counts),
             energy=clean_segments[1],
-            clean_spectrum=clean.spectrum,
-            processed_spectrum=ear_model.mean_level(cochlea, cells),
+            clean_spectrum=clean.level,
+            processed_spectrum=cochlea.level,
         )
 
 
-def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
-    """Give the motion of the basilar membrane the adapted level as its envelope.
+def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
+    """Give the motion of the basilar membrane the level at the auditory nerve as its envelope.
 
     Envelope and motion are aligned separately. Where the shift of the envelope leaves nothing,
     pyclarity keeps the motion in the unit of the signals, and so does this function.
@@ -323,14 +343,10 @@ def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: f
     Args:
         motion: Motion of the basilar membrane.
         power: Power of its envelope, in multiples of that at 0 dB SPL.
-        levels: Adapted levels in dB over threshold.
+        levels: Levels in dB over threshold.
         unit: Amplitude of 20 uPa in the signals.
 
     Shape: (items, channels, padded) three times -> (items, channels, padded).
-
-    >>> motion, power, levels = torch.tensor([4.0]), torch.tensor([100.0]), torch.tensor([20.0])
-    >>> scale_motion_to_level(motion, power, levels, unit=0.25)
-    tensor([8.])
     """
     scaled = motion * levels * power.clamp_min(1.0).rsqrt()  # below 0 dB SPL the level is 0
     return torch.where(power > 0.0, scaled, unit * motion)
@@ -339,47 +355,60 @@ def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: f
 # -- noise -----------------------------------------------------------------------------------------
 
 
-def _noise_sources(
-    noise: Noise, seeds: Sequence[int], extent: Extent, like: Tensor
-) -> tuple[NoiseSource, NoiseSource]:
-    """Return the sources of noise for the clean and for the processed signals."""
-    if noise == "seeded":
-        return _drawn_noise(seeds, extent, like, 0), _drawn_noise(seeds, extent, like, 1)
-    if noise == "expected":
-        # Only audible parts of the clean signal count, and the noise is far below them.
-        return _no_noise, partial(_frozen_noise, extent=extent, like=like)
-    return _no_noise, _no_noise
+class _NoiseSources:
+    """Noise at the threshold of hearing, which is added to the motion of clean signal and output.
 
+    Args:
+        noise: Kind of the noise.
+        seeds: Seed of each item.
+        extent: Number of samples of each item.
+        like: Tensor whose dtype and device the noise has.
+    """
 
-def _no_noise(channels: slice) -> None:
-    return None
+    def __init__(self, noise: Noise, seeds: Sequence[int], extent: Extent, like: Tensor) -> None:
+        self._noise, self._extent, self._like = noise, extent, like
+        if noise == "seeded":  # pyclarity draws that of the clean signal, then that of the output
+            self._generators = [
+                [
+                    legacy_rng_after_normals(seed, skipped * CHANNELS * end)
+                    for seed, end in zip(seeds, extent.ends, strict=True)
+                ]
+                for skipped in (0, 1)
+            ]
 
+    def draw(self, channels: slice) -> tuple[Tensor | None, Tensor | None]:
+        """Return the noise of the clean signal and of the output in some channels.
 
-def _drawn_noise(seeds: Sequence[int], extent: Extent, like: Tensor, skipped: int) -> NoiseSource:
-    """Draw the noise of pyclarity, after skipping the deviates of a number of signals."""
-    generators = [
-        legacy_rng_after_normals(seed, skipped * CHANNELS * end)
-        for seed, end in zip(seeds, extent.ends, strict=True)
-    ]
+        Channels must be requested in ascending order.
 
-    def draw(channels: slice) -> Tensor:
+        Shape: -> (items or 1, channels, longest) twice, or None where there is no noise.
+        """
+        if self._noise == "seeded":
+            clean, processed = (self._draw(generators, channels) for generators in self._generators)
+            return clean, processed
+        if self._noise == "expected":
+            # Only audible parts of the clean signal count, and the noise is far below them.
+            return None, self._frozen_noise(channels)
+        return None, None
+
+    def _draw(self, generators: list[np.random.RandomState], channels: slice) -> Tensor:
+        """Draw the noise of pyclarity."""
+        ends, like = self._extent.ends, self._like
         count = channels.stop - channels.start
-        noise = torch.zeros(len(extent.ends), count, extent.longest, dtype=like.dtype)
-        for row, generator, end in zip(noise, generators, extent.ends, strict=True):
+        noise = torch.zeros(len(ends), count, self._extent.longest, dtype=like.dtype)
+        for row, generator, end in zip(noise, generators, ends, strict=True):
             row[:, :end] = torch.from_numpy(generator.standard_normal((count, end)))
         return noise.to(like.device, non_blocking=like.device.type != "cpu")
 
-    return draw
-
-
-def _frozen_noise(channels: slice, *, extent: Extent, like: Tensor) -> Tensor:
-    """Return the same noise every time: each channel takes its part of one signal."""
-    table = constant(_frozen_table, dtype=torch.float32, device=like.device)
-    first = channels.start * FROZEN_STRIDE
-    last = (channels.stop - 1) * FROZEN_STRIDE
-    repeated = table.repeat(-(-(last + extent.longest) // FROZEN_SAMPLES))[first:]
-    count = channels.stop - channels.start
-    return repeated.unfold(0, extent.longest, FROZEN_STRIDE)[:count].to(like)
+    def _frozen_noise(self, channels: slice) -> Tensor:
+        """Return the same noise every time: each channel takes its part of one signal."""
+        longest = self._extent.longest
+        table = constant(_frozen_table, dtype=torch.float32, device=self._like.device)
+        first = channels.start * FROZEN_STRIDE
+        last = (channels.stop - 1) * FROZEN_STRIDE
+        repeated = table.repeat(-(-(last + longest) // FROZEN_SAMPLES))[first:]
+        count = channels.stop - channels.start
+        return repeated.unfold(0, longest, FROZEN_STRIDE)[:count].to(self._like)
 
 
 def _frozen_table() -> NDArray[np.float64]:

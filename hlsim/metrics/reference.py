@@ -1,16 +1,20 @@
-"""Clean signals that are prepared once for the scores of many processed signals."""
+"""Scores of many outputs against the same clean signals, which are prepared once.
+
+``Reference`` is the base of ``HaspiReference``, ``HasqiReference`` and ``HaaqiReference``. It holds
+one ``PreparedBatch`` for each group of items that is computed together: a single item on a CPU, all
+items on a GPU.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar, Generic, TypedDict, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_choice
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
@@ -18,115 +22,86 @@ from hlsim.metrics.pair import Noise, item_seeds
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
-Channels = TypeVar("Channels")
-"""Type of the features of clean signals in some channels."""
 
 
-class Settings(TypedDict, total=False):
-    """Keyword arguments of ``Reference``.
+class PreparedBatch:
+    """Clean signals of a batch as an ear receives them, ready to be compared with outputs of aids.
 
-    >>> sorted(Settings.__optional_keys__)
-    ['full_scale_spl', 'keep', 'lengths', 'sample_rate', 'whole_khz']
-    """
-
-    sample_rate: int
-    full_scale_spl: float
-    lengths: Lengths | None
-    whole_khz: bool
-    keep: bool
-
-
-class PreparedBatch(Generic[Channels]):
-    """Clean signals of a batch in their ears, some channels at a time.
+    Subclasses compute the features of a score in a few channels of the ear at a time.
 
     Args:
         signals: All clean signals.
-        batch: Those of the batch.
-        clean: Clean signals of the batch as the ears receive them. Shape: (items, padded).
-        cells: Hair cells of the ears. Shape: (items, 32) or (32,).
+        batch: The clean signals of this batch.
+        clean: Sound that reaches the ear, in multiples of 20 uPa. Shape: (items, padded).
+        cells: Hair cells of the ear, or of the ear of each item. Shape: (32,) or (items, 32).
+        keep: Store the features of the clean signals instead of computing them for each score.
 
-    >>> issubclass(PreparedBatch, Generic)
-    True
+    >>> from hlsim.metrics import HaspiReference
+    >>> reference = HaspiReference(0.02 * torch.randn(2, 16000))
+    >>> [isinstance(batch, PreparedBatch) for batch in reference._batches]
+    [True, True]
     """
 
     def __init__(
-        self, signals: CleanSpeech, batch: CleanBatch, clean: Tensor, cells: ear_model.HairCells
+        self,
+        signals: CleanSpeech,
+        batch: CleanBatch,
+        clean: Tensor,
+        cells: ear_model.HairCells,
+        keep: bool,
     ) -> None:
         self._signals, self._batch, self._cells = signals, batch, cells
         self._extent = batch.audible
-        self._clean = signals.through_middle_ear(clean, self._extent)
+        self._clean = signals.through_middle_ear(clean)
         self._longest_delay = ear_model.longest_group_delay(self._clean, cells, self._extent)
-        self._stored: list[Channels] | None = None
+        self._stored: list[Any] | None = None
+        if keep:
+            self._stored = list(self._clean_features())
 
-    def store(self) -> None:
-        """Compute the features of all channels, and store them."""
-        self._stored = self._map_channels(lambda features: features, self._clean)
-
-    def _map_channels(self, function: Callable[[Channels], Result], signal: Tensor) -> list[Result]:
-        """Call a function with the features of some channels at a time, from low to high.
-
-        Args:
-            function: Function to call.
-            signal: Tensor on which the function depends.
-        """
+    def _clean_features(self) -> Iterator[Any]:
+        """Yield the features of the clean signals in a few channels, from low to high."""
         if self._stored is not None:
-            return map_on_cores(function, self._stored, signal)
-
-        def prepare_and_call(channels: slice) -> Result:
+            yield from self._stored
+            return
+        items, padded = self._clean.shape
+        for channels in ear_model.channel_chunks(items, padded, self._signals.device):
             with torch.no_grad():
                 features = self._prepare(channels)
-            return function(features)
+            yield features
 
-        return map_on_cores(prepare_and_call, self._channel_chunks(), signal)
-
-    def _channel_chunks(self) -> list[slice]:
-        items, padded = self._clean.shape
-        return list(ear_model.channel_chunks(items, padded, self._signals.device))
-
-    def _prepare(self, channels: slice) -> Channels:
+    def _prepare(self, channels: slice) -> Any:
+        """Compute the features of the clean signals in some channels."""
         raise NotImplementedError
-
-    def _align(self, processed: Tensor) -> Tensor:
-        """Align the batch's part of all processed signals, and filter it by the middle ear.
-
-        Shape: (all items, time) -> (items, padded).
-        """
-        aligned = self._signals.align(processed, self._batch)
-        return self._signals.through_middle_ear(aligned, self._extent)
 
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
-        """Compare processed signals with the clean ones.
-
-        This object has some of the items. Arguments are for all items, and the result is for its
-        own ones.
+        """Compare outputs of aids with the clean signals of this batch.
 
         Args:
-            processed: All processed signals. Shape: (all items, time).
+            processed: Outputs for the items of all batches. Shape: (all items, time).
             noise: Kind of the internal noise of the ear.
-            seeds: Seeds of all items.
-            ears: Hair cells of all items, where they are not those of the clean signals.
+            seeds: Seeds of the items of all batches.
+            ears: Hair cells for all items, if the outputs reach other ears than the clean signals.
+                Shape: (all items, 32).
 
         Returns:
-            Features of each item of the batch. Shape: (items, features).
+            Features of each item of this batch, from which its score follows. Shape: (items,
+            features).
         """
         raise NotImplementedError
 
 
-Batch = TypeVar("Batch", bound=PreparedBatch[Any])
+class Reference:
+    """Clean signals that are prepared for the scores of many outputs of aids.
 
-
-class Reference(Generic[Batch]):
-    """Clean signals that are prepared for the scores of many processed signals.
-
-    On a CPU the items, or the channels of one item, are distributed over as many threads as torch
-    uses, if no gradient is needed. The scores do not depend on it.
+    On a CPU the items of a batch are distributed over as many threads as torch uses, unless a
+    gradient is needed. The scores do not depend on it.
 
     Args:
-        clean: Clean signals, whose dtype and device are those of the scores. Their gradient is not
+        clean: Clean signals. The scores have their dtype and their device. Their gradient is not
             computed. Shape: (..., time).
-        audiogram: The ear in which they are prepared, or one for each item; None for a normal ear.
+        audiogram: Ear that receives the clean signals, or one for each item; None for a normal ear.
         sample_rate, full_scale_spl, lengths, whole_khz: The arguments of ``haspi``.
         keep: Store the clean signals' features; otherwise they are computed for each score, which
             takes less memory.
@@ -145,43 +120,43 @@ class Reference(Generic[Batch]):
     def __init__(
         self,
         clean: Tensor,
-        audiogram: AudiogramLike | None = None,
+        audiogram: AudiogramLike | None,
         *,
-        sample_rate: int = 16000,
-        full_scale_spl: float = PASCAL_SPL,
-        lengths: Lengths | None = None,
-        whole_khz: bool = False,
-        keep: bool = True,
+        sample_rate: int,
+        full_scale_spl: float,
+        lengths: Lengths | None,
+        whole_khz: bool,
+        keep: bool,
     ) -> None:
         self._audiogram = audiogram
-        settings = sample_rate, full_scale_spl, whole_khz, self.score_name
-        self._signals = CleanSpeech(clean, lengths, *settings)
-        self._batches = self._prepare(self._signals)
-        if keep:
-            with torch.autocast(clean.device.type, enabled=False):
-                map_on_cores(lambda batch: batch.store(), self._batches, self._signals.clean)
+        self._signals = CleanSpeech(
+            clean, sample_rate, full_scale_spl, lengths, whole_khz, self.score_name
+        )
+        self._batches = self._prepare(self._signals, keep)
 
     @torch.no_grad()
-    def _prepare(self, signals: CleanSpeech) -> list[Batch]:
+    def _prepare(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
         with torch.autocast(signals.device.type, enabled=False):
-            return self._prepare_batches(signals)
+            return self._prepare_batches(signals, keep)
 
-    def _prepare_batches(self, signals: CleanSpeech) -> list[Batch]:
+    def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
         raise NotImplementedError
 
     def _compare(
-        self,
-        processed: Tensor,
-        noise: Noise,
-        seed: int | Sequence[int],
-        *ears: ear_model.HairCells,
+        self, processed: Tensor, noise: Noise, seed: int | Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
-        """Return the features of each processed signal. Shape: (..., time) -> (..., features)."""
+        """Return the features of each output, from which its score follows.
+
+        The arguments are those of ``PreparedBatch.compare``, with one seed or one for each item.
+
+        Shape: (..., time) -> (..., features).
+        """
         check_choice("noise", noise, Noise)
-        processed, signals = self._signals.cut(processed)
-        batches = self._batches if signals is self._signals else self._prepare(signals)
-        rows = signals.check(processed)
-        seeds = item_seeds(seed, signals.shape)
+        rows, signals = self._signals.match(processed)
+        batches = self._batches
+        if signals is not self._signals:
+            batches = self._prepare(signals, keep=False)
+        seeds = item_seeds(seed, len(rows))
         with torch.autocast(rows.device.type, enabled=False):
             features = map_on_cores(
                 lambda batch: batch.compare(rows, noise, seeds, *ears), batches, rows
@@ -194,14 +169,17 @@ def map_on_cores(
 ) -> list[Result]:
     """Call a function for each of several arguments, in as many threads as torch uses.
 
-    Each call computes in one thread. This takes less time than calls that are made one after
-    another, each in many threads, which wait for each other after every operation.
+    Each call computes on one core. Calls one after another, each on all cores, take longer, because
+    the cores wait for each other after every operation, and much longer while other programs run.
 
     Args:
         function: Function to call.
         arguments: Arguments of the calls.
         signal: Tensor on which the function depends. If it is not on a CPU or has a gradient, the
             calls are made in this thread, to which the hooks of autograd belong.
+
+    Returns:
+        Results in the order of the arguments.
 
     >>> map_on_cores(abs, [-1, -2], torch.zeros(1))
     [1, 2]

@@ -18,10 +18,10 @@ from hlsim.audio import read_audio
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
 from hlsim.metrics.ear import clean_speech, fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.model import Extent
-from hlsim.metrics.haaqi_score import modulation_correlation
+from hlsim.metrics.ear.extent import Extent
+from hlsim.metrics.haaqi_score import _split_by_rate
 from hlsim.metrics.haspi_score import legacy_rng_after_normals
-from hlsim.metrics.quality import _nalr_taps, scale_motion_to_level
+from hlsim.metrics.quality import _nalr_taps, _scale_motion_to_level
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
@@ -158,7 +158,7 @@ def test_modulation_correlation_equals_pyclaritys(segments: int) -> None:
     x[:, 2] = 0.0  # a silent segment
     expected = eb.melcor9(x.copy(), y.copy(), 2.5, 0.0, 8)[2]
     levels = (torch.from_numpy(signal)[None] for signal in (x, y))
-    result = modulation_correlation(*levels, Extent((segments,)))
+    result = fine_structure.envelope_correlation(*levels, Extent((segments,)), _split_by_rate)
     assert float(result) == pytest.approx(expected, abs=1e-12)
 
 
@@ -197,7 +197,7 @@ def test_features_of_segments_equal_pyclaritys(time: int) -> None:
 
 def test_motion_keeps_its_unit_where_the_shifted_envelope_is_zero() -> None:
     motion, power = torch.tensor([4.0, 4.0, 4.0]), torch.tensor([0.0, 0.5, 100.0])
-    scaled = scale_motion_to_level(motion, power, torch.tensor([0.0, 0.0, 20.0]), 0.25)
+    scaled = _scale_motion_to_level(motion, power, torch.tensor([0.0, 0.0, 20.0]), 0.25)
     torch.testing.assert_close(scaled, torch.tensor([1.0, 0.0, 8.0]))
 
 

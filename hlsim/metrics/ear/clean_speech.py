@@ -1,4 +1,9 @@
-"""Batches of clean speech, prepared for Kates' ear, and the alignment of processed speech."""
+"""Clean speech or music as the reference of scores, and the alignment of outputs with it.
+
+Everything in a score that depends on the clean signal alone is computed here once: it is validated,
+resampled to the ear's rate of 24 kHz, and cut to its audible part. The output of an aid is then
+brought to the same rate and cut to the same part, behind a delay that makes both match.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +19,8 @@ from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale
 from hlsim.checks import Lengths, broadcast_shape, check_lengths, check_rate, check_waveform
 from hlsim.metrics.ear import input as ear_input
-from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.model import Extent, integers
+from hlsim.metrics.ear.extent import Extent, integers
+from hlsim.metrics.ear.model import shift
 from hlsim.metrics.ear.recursions import RATE, middle_ear
 from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS, cut_to_common_length
 
@@ -33,18 +38,18 @@ class UnscorableError(ValueError):
 
 @dataclass(frozen=True)
 class CleanBatch:
-    """Clean signals that are processed together.
+    """Clean signals that are computed together, cut to their audible parts.
 
     Attributes:
         items: Indices of the signals among all items.
-        extent: Lengths at the rate of the input.
-        resampled: Lengths at 24 kHz.
-        starts: First samples at 24 kHz that are not silence.
-        audible: Lengths at 24 kHz from there to the last sample that is not silence.
-        spectrum: Spectra for the bulk alignment.
+        extent: Number of samples of each item at the input's rate.
+        resampled: Number of samples of each item at 24 kHz.
+        starts: For each item, the first sample at 24 kHz that is not silent.
+        audible: Number of samples at 24 kHz from there to the last one that is not silent.
+        spectrum: Spectra from which the delays of outputs are computed.
         signals: Audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
 
-    >>> speech = CleanSpeech(torch.randn(2, 16000), None, 16000, 94.0, False, "HASPI")
+    >>> speech = CleanSpeech(torch.randn(2, 16000), 16000, 94.0, None, False, "HASPI")
     >>> speech.batches[0].signals.shape
     torch.Size([1, 24000])
     """
@@ -59,81 +64,70 @@ class CleanBatch:
 
 
 class CleanSpeech:
-    """Clean signals at 24 kHz without silent ends, and the alignment of processed signals.
+    """Validated clean signals in batches, with which outputs of aids are aligned.
 
-    On a CPU each item is a batch, because its caches hold no more. On a GPU a batch has as many
-    items as fit into memory with all their channels.
+    On a CPU each item is a batch of its own, because caches hold no more. On a GPU all items are
+    one batch.
 
     Args:
         clean: Clean signals. Shape: (..., time).
-        lengths: Number of samples of each item in a padded batch.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
-        whole_khz: Round the rate to whole kHz.
-        name: Name of the score, for messages.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
+        score_name: Name of the score, for messages.
 
     Raises:
         ValueError: The signals are too short or not finite, or a rate, level or length is out of
             range.
         UnscorableError: The signals are silent, too soft or too short to be scored.
 
-    >>> CleanSpeech(torch.randn(2, 16000), None, 16000, 94.0, False, "HASPI").shape
+    >>> CleanSpeech(torch.randn(2, 16000), 16000, 94.0, None, False, "HASPI").shape
     torch.Size([2])
     """
 
     def __init__(
         self,
         clean: Tensor,
-        lengths: Lengths | None,
         sample_rate: int,
         full_scale_spl: float,
+        lengths: Lengths | None,
         whole_khz: bool,
-        name: str,
+        score_name: str,
     ) -> None:
-        self._name = name
+        self._settings = sample_rate, full_scale_spl
+        self._whole_khz, self._score_name = whole_khz, score_name
         self._input_rate = check_rate(sample_rate)
         self.full_scale = check_full_scale(full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale)
-        self.shape, self.time = clean.shape[:-1], clean.shape[-1]
+        self.clean, self.shape = clean.detach(), clean.shape[:-1]
         self.dtype, self.device = torch.promote_types(clean.dtype, torch.float32), clean.device
-        ends = [self.time] * self.shape.numel()
+        time = clean.shape[-1]
+        self._ends = [time] * self.shape.numel()
         if lengths is not None:
-            ends = check_lengths(lengths, clean.shape).flatten().tolist()
-        self._rate = self._input_rate
-        if whole_khz:
-            self._rate = 1000 * round(self._input_rate / 1000)
-        self._settings = sample_rate, full_scale_spl, whole_khz, name
-        self.clean, self._ends = clean.detach(), ends
+            self._ends = check_lengths(lengths, clean.shape).flatten().tolist()
+        self._rate = 1000 * round(self._input_rate / 1000) if whole_khz else self._input_rate
         self._gain = 10.0 ** (self.full_scale / 20.0)
         with torch.no_grad():
             # Double precision, because one sample more at an end would shift all frames.
-            rows = clean.detach().double().reshape(-1, self.time)
-            self.batches = [
-                self._batch(rows[items], items, Extent(tuple(ends[items])))
-                for items in self._batch_slices(len(rows))
-            ]
+            rows = self.clean.double().reshape(-1, time)
+            self.batches = [self._prepare(rows, items) for items in self._batch_slices(len(rows))]
 
     def _batch_slices(self, items: int) -> list[slice]:
-        size = 1
+        """Return the indices of the items of each batch."""
         if self.device.type != "cpu":
-            samples = self.time * RATE // self._rate
-            size = max(1, ear_model.GPU_CHUNK // (ear_model.CHANNELS * samples))
-        return [slice(start, min(start + size, items)) for start in range(0, items, size)]
+            return [slice(0, items)]
+        return [slice(item, item + 1) for item in range(items)]
 
-    def _batch(self, signals: Tensor, items: slice, extent: Extent) -> CleanBatch:
-        """Validate and prepare signals. The host waits for the device once."""
-        for index, end in enumerate(extent.ends, start=items.start):
-            if end < SHORTEST_SECONDS * self._input_rate:
-                raise ValueError(
-                    f"{self._label(index)} lasts {end / self._input_rate:.2g} s; expected "
-                    f"{SHORTEST_SECONDS} s or more, because {self._name} means nothing below"
-                )
-        signals = extent.cut(signals)
+    def _prepare(self, rows: Tensor, items: slice) -> CleanBatch:
+        """Validate and prepare some of the items. The host waits for the device once."""
+        extent = Extent(tuple(self._ends[items]))
+        signals = extent.cut(rows[items])
         variance = extent.mean(extent.centred(signals).square())
         at_ear = ear_input.to_ear_rate(signals, self._rate, extent) * self._gain
         first, last = ear_input.audible_ends(at_ear)
-        finite, sounding = signals.isfinite().all(-1), signals.any(-1)
-        values = (finite, sounding, variance, first, last)
+        is_finite, is_sounding = signals.isfinite().all(-1), signals.any(-1)
+        values = (is_finite, is_sounding, variance, first, last)
         summary = torch.stack([value.double() for value in values])
         starts, ends = [], []
         for index, row in enumerate(summary.mT.tolist(), start=items.start):
@@ -144,81 +138,76 @@ class CleanSpeech:
         audible = Extent(tuple(end - start for start, end in zip(starts, ends, strict=True)))
         spectrum = ear_input.spectrum_for_alignment(at_ear.to(self.dtype), resampled)
         delays = -integers(tuple(starts), self.device)[:, None]
-        parts = ear_model.shift(
-            at_ear[:, None], delays, resampled.ends, audible.ends, audible.padded
-        )
+        parts = shift(at_ear[:, None], delays, resampled.ends, audible.ends, audible.padded)
         return CleanBatch(
             items, extent, resampled, tuple(starts), audible, spectrum, parts.squeeze(1)
         )
 
-    def _label(self, index: int) -> str:
-        return "clean" if self.shape.numel() == 1 else f"clean, item {index}"
-
     def _validate(
-        self, index: int, finite: float, sounding: float, variance: float, first: float, last: float
+        self,
+        index: int,
+        is_finite: float,
+        is_sounding: float,
+        variance: float,
+        first: float,
+        last: float,
     ) -> None:
         """Raise an error unless the score of a signal is meaningful."""
-        label = self._label(index)
-        if not finite:
+        label = "clean" if self.shape.numel() == 1 else f"clean, item {index}"
+        seconds = self._ends[index] / self._input_rate
+        if seconds < SHORTEST_SECONDS:
+            raise ValueError(
+                f"{label} lasts {seconds:.2g} s; expected {SHORTEST_SECONDS} s or more, because "
+                f"{self._score_name} means nothing below"
+            )
+        if not is_finite:
             raise ValueError(f"{label} holds samples that are NaN or infinite")
-        if not sounding:
-            raise UnscorableError(f"{label} is silent, every sample is zero")
         level = 10.0 * math.log10(max(variance, 1e-30)) + self.full_scale
-        if level < LOWEST_REFERENCE_SPL:
-            raise UnscorableError(
-                f"{label} is at {level:.1f} dB SPL with full_scale_spl {self.full_scale:g}; "
-                f"expected {LOWEST_REFERENCE_SPL:g} dB SPL or more, because "
-                f"{self._name} means nothing below"
-            )
         length = last - first + 1
-        if length < MIN_AUDIBLE_SAMPLES:
-            raise UnscorableError(
-                f"{label} has sound for only {1000.0 * length / RATE:.2g} ms; expected "
-                f"{1000.0 * MIN_AUDIBLE_SAMPLES / RATE:g} ms or more, as {self._name} requires"
+        reason = ""
+        if not is_sounding:
+            reason = "is silent, every sample is zero"
+        elif level < LOWEST_REFERENCE_SPL:
+            reason = (
+                f"is at {level:.1f} dB SPL with full_scale_spl {self.full_scale:g}; expected "
+                f"{LOWEST_REFERENCE_SPL:g} dB SPL or more, because {self._score_name} means "
+                "nothing below"
             )
+        elif length < MIN_AUDIBLE_SAMPLES:
+            reason = (
+                f"has sound for only {1000.0 * length / RATE:.2g} ms; expected "
+                f"{1000.0 * MIN_AUDIBLE_SAMPLES / RATE:g} ms or more, as {self._score_name} "
+                "requires"
+            )
+        if reason:
+            raise UnscorableError(f"{label} {reason}")
 
-    def cut(self, processed: Tensor) -> tuple[Tensor, CleanSpeech]:
-        """Cut signals to their common length, with a warning, if it differs by 0.1 s at most.
+    def match(self, processed: Tensor) -> tuple[Tensor, CleanSpeech]:
+        """Validate outputs of aids, and match their length and that of the clean signals.
 
         Args:
-            processed: Signals of the same rate. Shape: (..., time).
+            processed: Outputs at the rate of the clean signals. Shape: (..., time), where ``time``
+                may differ by 0.1 s, which causes a warning.
 
         Returns:
-            Both signals. The clean ones are prepared again if they are longer.
+            Outputs, (items, time), and the clean signals, which are prepared again if they were
+            longer.
 
         Raises:
-            ValueError: The lengths differ by more than 0.1 s.
-        """
-        ends = torch.tensor(self._ends).reshape(self.shape)
-        processed, clean, lengths = cut_to_common_length(
-            processed, self.clean, self._input_rate, ends
-        )
-        if clean.shape == self.clean.shape:
-            return processed, self
-        return processed, CleanSpeech(clean, lengths, *self._settings)
-
-    def check(self, processed: Tensor) -> Tensor:
-        """Validate processed signals, and return them as rows.
-
-        Shape: (..., time) -> (items, time).
+            ValueError: The outputs are not finite, are on another device, or have another shape.
         """
         check_waveform(processed, "processed", full_scale_spl=self.full_scale)
-        if processed.shape != (*self.shape, self.time):
-            raise ValueError(
-                f"expected processed of the shape of clean, {(*self.shape, self.time)}, "
-                f"got {tuple(processed.shape)}"
-            )
-        if processed.device != self.device:
-            raise ValueError(
-                f"processed is on {processed.device} and clean on {self.device}; "
-                "move both to one device"
-            )
+        processed, clean = cut_to_common_length(processed, self.clean, self._input_rate)
         if not bool(processed.detach().isfinite().all()):
             raise ValueError("processed holds samples that are NaN or infinite")
-        return processed.reshape(-1, self.time)
+        time, signals = clean.shape[-1], self
+        if time < self.clean.shape[-1]:
+            ends = torch.tensor(self._ends).clamp_max(time).reshape(self.shape)
+            signals = CleanSpeech(clean, *self._settings, ends, self._whole_khz, self._score_name)
+        return processed.reshape(-1, time), signals
 
     def thresholds(self, audiogram: AudiogramLike, *, host: bool = False) -> Tensor:
-        """Return the ear of each item.
+        """Return the thresholds of the ear that hears each item.
 
         Args:
             audiogram: One ear, or one for each item.
@@ -229,25 +218,26 @@ class CleanSpeech:
         """
         probe = torch.empty((*self.shape, 1), device=self.device)
         ears = resolve_thresholds(
-            None, audiogram, probe, highest=HIGHEST_LEVEL, consumer=self._name
+            None, audiogram, probe, highest=HIGHEST_LEVEL, consumer=self._score_name
         )
         if broadcast_shape(self.shape, ears.shape[:-1]) != self.shape:
             raise ValueError(
                 f"expected one audiogram or one for each item, got shape {tuple(ears.shape)} "
-                f"for signals of shape {(*self.shape, self.time)}"
+                f"for signals of shape {tuple(self.clean.shape)}"
             )
         ears = on_host(ears) if host else ears
         return ears.expand(*self.shape, 8).reshape(-1, 8)
 
     def align(self, processed: Tensor, batch: CleanBatch) -> Tensor:
-        """Return the parts of processed signals that match the audible parts of the clean ones.
+        """Return the parts of outputs that match the audible parts of the clean signals.
 
         Args:
-            processed: All processed signals. Shape: (items, time).
+            processed: Outputs for all items. Shape: (items, time).
             batch: Batch whose items are returned.
 
         Returns:
-            Aligned parts in multiples of 20 uPa. Shape: (items of the batch, padded).
+            Aligned parts behind the middle ear, in multiples of 20 uPa. Shape: (items of the batch,
+            padded).
         """
         signals = batch.extent.cut(processed[batch.items].double())
         at_ear = ear_input.to_ear_rate(signals, self._rate, batch.extent) * self._gain
@@ -256,10 +246,12 @@ class CleanSpeech:
         )
         delays = (delays - integers(batch.starts, self.device))[:, None]
         ends, stops = batch.resampled.ends, batch.audible.ends
-        parts = ear_model.shift(at_ear[:, None], delays, ends, stops, batch.audible.padded)
-        return parts.squeeze(1)
+        parts = shift(at_ear[:, None], delays, ends, stops, batch.audible.padded)
+        return self.through_middle_ear(parts.squeeze(1))
 
-    def through_middle_ear(self, signals: Tensor, extent: Extent) -> Tensor:
-        """Filter signals by the middle ear. Shape: (items, padded or more) -> (items, padded)."""
-        rows = signals[:, : extent.padded].to(self.dtype)
-        return middle_ear(self.device, self.dtype)(rows).flatten(-2)
+    def through_middle_ear(self, signals: Tensor) -> Tensor:
+        """Filter signals by the middle ear, in the precision of the scores.
+
+        Shape: (items, padded) -> (items, padded).
+        """
+        return middle_ear(self.device, self.dtype)(signals.to(self.dtype)).flatten(-2)

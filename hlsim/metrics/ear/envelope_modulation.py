@@ -1,8 +1,12 @@
-"""Features of HASPI: correlation of the envelopes of two signals, by rate of modulation.
+"""Features of HASPI: how well the fluctuations of an output follow those of clean speech.
 
-The levels of 32 channels are smoothed and sampled 2667 times per second. Frames that are silent in
-the reference are left out. Five cosines over frequency describe each frame. Ten band-passes filter
-the cosines over time, and the outputs of reference and processed signal are correlated.
+1. The levels of the ear's 32 channels are smoothed and sampled 2667 times per second. A sample of
+   all channels is a *frame*. Frames in which clean speech is inaudible are left out.
+2. Five numbers describe the shape of the spectrum in a frame: projections of the levels on cosines
+   over frequency, the *cepstrum*.
+3. Ten filters divide the fluctuations of each cepstral coefficient over time into bands, the *rates
+   of modulation*, from 2 to 256 Hz.
+4. At each rate, the output is correlated with clean speech. The ten correlations are the features.
 
 Source: Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI) version 2", Speech
 Communication 131, 35-46.
@@ -22,8 +26,9 @@ from torch import Tensor
 
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.clean_speech import UnscorableError
-from hlsim.metrics.ear.model import CHANNELS, Extent, integers, shift
-from hlsim.torchtools import constant, constant_like
+from hlsim.metrics.ear.extent import Extent, integers
+from hlsim.metrics.ear.model import CHANNELS, shift
+from hlsim.torchtools import constant_like
 
 STRIDE = 9
 """Samples at 24 kHz between frames."""
@@ -38,9 +43,10 @@ SILENCE_DB = 2.5
 """Level over threshold in dB that a frame of the reference must exceed to count."""
 
 COSINES = 5
+"""Number of cepstral coefficients."""
 
 RATES = (2.0, 6.0, 10.0, 16.0, 25.0, 40.0, 64.0, 100.0, 160.0, 256.0)
-"""Centre frequencies of the modulation filters in Hz."""
+"""Rates of modulation: centre frequencies of the modulation filters in Hz."""
 
 FRAME_RATE = 2560.0
 """Frame rate for which pyclarity designs the modulation filters. The true one is 24000 / 9."""
@@ -52,16 +58,17 @@ NOISE_DB = 0.1
 """Standard deviation of the noise on the firing rate, in dB."""
 
 ENERGY_FLOOR = 1e-30
-"""Energies below this one count as zero."""
+"""Energy below which a signal counts as constant."""
 
 
 def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
-    """Delay the levels of channels, smooth them, and sample them at 24000 / 9 Hz.
+    """Delay the levels of channels, smooth them, and take every ninth sample as a frame.
 
     Args:
-        levels: Levels in dB over threshold. Shape: (items, channels, padded).
-        delays: Delays in samples. Shape: (items, channels), int64.
-        extent: Lengths of the items.
+        levels: Levels in dB over threshold at 24 kHz. Shape: (items, channels, padded).
+        delays: Delays in samples that make up for different group delays of the channels. Shape:
+            (items, channels), int64.
+        extent: Number of samples of each item.
 
     Returns:
         Frames. Shape: (items, channels, ceil(longest / 9)).
@@ -75,7 +82,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
     delayed = shift(
         levels, delays + WINDOW_LEAD, extent.ends, stops, STRIDE * (count + WINDOW_STRIDES - 1)
     )
-    window = constant(_smoothing, dtype=levels.dtype, device=levels.device)
+    window = constant_like(levels, _smoothing)
     parts = delayed.unflatten(-1, (-1, STRIDE)) @ window
     return sum(
         (parts[..., i : i + count, i] for i in range(1, WINDOW_STRIDES)),
@@ -84,7 +91,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
 
 
 def _smoothing() -> NDArray[np.float64]:
-    """Return a Hann window without its zeros, by phase: (STRIDE, WINDOW_STRIDES)."""
+    """Return a Hann window without its zeros, nine taps per column: (STRIDE, WINDOW_STRIDES)."""
     window = np.hanning(WINDOW_SAMPLES + 2)[1:-1]
     padded = np.concatenate(
         (np.zeros(WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES), window / window.sum())
@@ -92,68 +99,54 @@ def _smoothing() -> NDArray[np.float64]:
     return padded.reshape(WINDOW_STRIDES, STRIDE).T
 
 
-class ChannelSum(NamedTuple):
-    """Features of frames that are sums over channels, and can be added over chunks of channels.
+def mean_amplitude(levels: Tensor) -> Tensor:
+    """Return the contribution of some channels to the mean amplitude over all 32 channels.
 
-    Attributes:
-        loudness: Mean over the channels of the amplitude over threshold. Shape: (items, frames).
-        cosines: Five cosines over frequency. Shape: (items, 5, frames).
-
-    >>> sum_over_channels(torch.zeros(1, 32, 4), slice(0, 32)).loudness
-    tensor([[1., 1., 1., 1.]])
-    """
-
-    loudness: Tensor
-    cosines: Tensor
-
-
-def sum_over_channels(levels: Tensor, channels: slice) -> ChannelSum:
-    """Sum the frames of some channels.
+    The mean, the sum of the contributions of all channels, tells whether a frame is audible.
 
     Args:
-        levels: Frames in dB over threshold. Shape: (items, channels, frames).
+        levels: Frames of these channels in dB over threshold. Shape: (items, channels, frames).
+
+    Returns:
+        Amplitudes, where 1 is the threshold. They have no gradient. Shape: (items, frames).
+
+    >>> mean_amplitude(torch.zeros(1, 16, 2))
+    tensor([[0.5000, 0.5000]])
+    """
+    return (levels.detach() * (math.log(10.0) / 20.0)).exp().sum(-2) / CHANNELS
+
+
+def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
+    """Return the contribution of some channels to the five cepstral coefficients of each frame.
+
+    The coefficients, the sums of the contributions of all channels, describe the shape of the
+    spectrum: they are its projections on five cosines over frequency.
+
+    Args:
+        levels: Frames of these channels in dB over threshold. Shape: (..., channels, frames).
         channels: The channels.
 
-    >>> sum_over_channels(torch.zeros(1, 8, 4), slice(0, 8)).cosines.shape
-    torch.Size([1, 5, 4])
-    """
-    loudness = (levels.detach() * (math.log(10.0) / 20.0)).exp().sum(-2) / CHANNELS
-    return ChannelSum(loudness, cosines(levels, channels))
+    Returns:
+        Coefficients. Shape: (..., 5, frames).
 
-
-def cosines(levels: Tensor, channels: slice = slice(None)) -> Tensor:
-    """Return five cosines over frequency. Shape: (..., channels, frames) -> (..., 5, frames).
-
-    >>> cosines(torch.ones(32, 4)).shape
+    >>> cepstrum(torch.ones(32, 4)).shape
     torch.Size([5, 4])
     """
-    return constant(_cosines, dtype=levels.dtype, device=levels.device)[:, channels] @ levels
+    return constant_like(levels, _cosines)[:, channels] @ levels
 
 
-def add_sums(total: ChannelSum | None, part: ChannelSum) -> ChannelSum:
-    """Add the sums over two chunks of channels.
-
-    >>> part = sum_over_channels(torch.zeros(1, 16, 4), slice(0, 16))
-    >>> add_sums(part, part).loudness
-    tensor([[1., 1., 1., 1.]])
-    """
-    if total is None:
-        return part
-    return ChannelSum(total.loudness + part.loudness, total.cosines + part.cosines)
-
-
-def find_audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
-    """Find the frames in which the reference exceeds the threshold of hearing.
+def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
+    """Find the frames in which clean speech exceeds the threshold of hearing.
 
     The host waits for the device once.
 
     Args:
-        loudness: Loudness of the reference. Shape: (items, frames).
+        amplitude: Mean amplitude of clean speech over all channels. Shape: (items, frames).
         extent: Number of samples of each item.
 
     Returns:
-        Indices of the frames of each item, followed by other indices, (items, audible), and the
-        number of audible frames of each item.
+        Indices of the audible frames of each item, (items, most audible frames), and the number of
+        audible frames of each item. Items with fewer frames have other indices at the end.
 
     Raises:
         UnscorableError: An item has fewer than two audible frames.
@@ -163,28 +156,16 @@ def find_audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Exten
     (tensor([[1, 2]]), (2,))
     """
     frames_of = Extent(tuple(-(-end // STRIDE) for end in extent.ends))
-    loudness = frames_of.cut(loudness)
-    audible = loudness > 10.0 ** (SILENCE_DB / 20.0)
-    counts = audible.sum(-1).tolist()
-    if min(counts) < 2:
+    is_audible = frames_of.cut(amplitude) > 10.0 ** (SILENCE_DB / 20.0)
+    audible = Extent(tuple(is_audible.sum(-1).tolist()))
+    if min(audible.ends) < 2:
         raise UnscorableError("clean is below the threshold of hearing")
-    audible_extent = Extent(tuple(counts))
-    indices = (~audible).byte().argsort(dim=-1, stable=True)
-    return indices[:, : audible_extent.longest], audible_extent
-
-
-def select_frames(waves: Tensor, indices: Tensor) -> Tensor:
-    """Return the frames with the indices of each item.
-
-    Shape: (items, 5, frames), (items, audible) -> (items, 5, audible).
-
-    >>> select_frames(torch.tensor([[[1.0, 2.0, 3.0]]]), torch.tensor([[1, 2]]))
-    tensor([[[2., 3.]]])
-    """
-    return waves.take_along_dim(indices[:, None], -1)
+    indices = (~is_audible).byte().argsort(dim=-1, stable=True)
+    return indices[:, : audible.longest], audible
 
 
 def _cosines() -> NDArray[np.float64]:
+    """Return five cosines over the channels, of 0.5 to 2.5 periods and of norm 1: (5, 32)."""
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
     waves = np.cos(np.arange(1, COSINES + 1)[:, None] * angle)
     return waves / np.linalg.norm(waves, axis=1, keepdims=True)
@@ -193,18 +174,16 @@ def _cosines() -> NDArray[np.float64]:
 # -- modulation filters ----------------------------------------------------------------------------
 
 
-class ModulationCovariance(NamedTuple):
-    """Covariances of the filtered cosines of two signals.
+class _Covariance(NamedTuple):
+    """Covariances of the cepstral coefficients of two signals at each rate of modulation.
 
     Attributes:
-        xx, yy, xy: Sums of squares and of products, without the means. Shape: (items, 10, 5).
-        waves: zero-mean cosines before the filters. Shape: (items, 5, audible) twice.
-        spectra: Spectra of these cosines. Shape: (items, 5, bins) twice.
+        xx, yy, xy: Sums of squares and of products of the filtered coefficients without their
+            means. Shape: (items, 10, 5).
+        waves: Coefficients without their means before the filters. Shape: (items, 5, audible)
+            twice.
+        spectra: Spectra of these. Shape: (items, 5, frequencies) twice.
         extent: Number of audible frames of each item.
-
-    >>> waves = torch.randn(1, 5, 900)
-    >>> modulation_covariance(waves, waves, Extent((900,))).xx.shape
-    torch.Size([1, 10, 5])
     """
 
     xx: Tensor
@@ -215,23 +194,18 @@ class ModulationCovariance(NamedTuple):
     extent: Extent
 
 
-def modulation_covariance(
-    reference: Tensor, processed: Tensor, extent: Extent
-) -> ModulationCovariance:
-    """Filter the cosines over time by ten band-passes without delay, and compute covariances.
+def _modulation_covariance(reference: Tensor, processed: Tensor, extent: Extent) -> _Covariance:
+    """Filter the coefficients over time by ten band-passes without delay, and compute covariances.
 
     Args:
-        reference, processed: Cosines of the audible frames. Shape: (items, 5, audible).
+        reference, processed: Cepstral coefficients of the audible frames. Shape: (items, 5,
+            audible).
         extent: Number of audible frames of each item.
-
-    >>> waves = torch.randn(1, 5, 900)
-    >>> modulation_covariance(waves, waves, Extent((900,))).xy.shape
-    torch.Size([1, 10, 5])
     """
     frames, points = extent.longest, _points(extent.longest)
     waves = extent.centred(reference), extent.centred(processed)
     a, b = (torch.fft.rfft(wave, points) for wave in waves)
-    responses = constant(_responses, points, dtype=reference.dtype, device=reference.device)
+    responses = constant_like(reference, _responses, points)
     filters_at_once = 1 if reference.device.type == "cpu" else len(responses)
     sums = []
     for part in responses.split(filters_at_once):
@@ -241,10 +215,11 @@ def modulation_covariance(
         )
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
     xx, yy, xy = torch.cat(sums, 2)
-    return ModulationCovariance(xx, yy, xy, waves, (a, b), extent)
+    return _Covariance(xx, yy, xy, waves, (a, b), extent)
 
 
 def _points(frames: int) -> int:
+    """Return the length of the Fourier transform by which the longest filter is applied."""
     return fft_length(frames + len(_filters()[0]) // 2, 256)
 
 
@@ -292,41 +267,67 @@ def zero_phase_responses(
 # -- correlation -----------------------------------------------------------------------------------
 
 
-def correlation(covariance: ModulationCovariance) -> Tensor:
-    """Compute the correlation of clean and processed envelopes at each rate of modulation.
+def normalised_covariance(xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
+    """Return the magnitude of the correlation of two signals; 0 where one of them is constant.
 
-    Its magnitude is averaged over the cepstral coefficients, which are the projections of the
-    spectrum on cosines. A coefficient that is constant over time counts as 0.
+    Args:
+        xx, yy: Energies of both signals without their means. Any shape.
+        xy: Sums of their products, of the same shape.
 
-    Returns:
-        Correlations. Shape: (items, 10).
-
-    >>> waves = torch.randn(1, 5, 900)
-    >>> correlation(modulation_covariance(waves, waves, Extent((900,)))).round(decimals=4)[0, :3]
-    tensor([1., 1., 1.])
+    >>> normalised_covariance(torch.tensor(4.0), torch.tensor(9.0), torch.tensor(-3.0))
+    tensor(0.5000)
     """
-    xx, yy, xy = covariance.xx, covariance.yy, covariance.xy
     is_varying = (xx >= ENERGY_FLOOR) & (yy >= ENERGY_FLOOR)
     norm = torch.where(is_varying, xx, 1.0).sqrt() * torch.where(is_varying, yy, 1.0).sqrt()
-    return torch.where(is_varying, xy.abs() / norm, 0.0).mean(-1)
+    return torch.where(is_varying, xy.abs() / norm, 0.0)
 
 
-def expected_correlation(covariance: ModulationCovariance) -> Tensor:
-    """Return the mean of ``correlation`` over the noise of the hair cells, without drawing noise.
+def correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
+    """Compute the features of HASPI from two signals without internal noise of the ear.
 
-    The noise increases the energies by which the covariance is divided. Its contribution to the
-    covariance itself has mean zero. The mean and the variance of the quotient are computed to
-    second order. The mean of its magnitude is that of a folded normal distribution.
+    The magnitude of the correlation is averaged over the five cepstral coefficients. A coefficient
+    that is constant over time counts as 0.
+
+    Args:
+        reference, processed: Cepstral coefficients of the audible frames of clean speech and of the
+            output. Shape: (items, 5, audible).
+        extent: Number of audible frames of each item.
 
     Returns:
-        Correlations. Shape: (items, 10).
+        Correlation at each rate of modulation, 0 to 1. Shape: (items, 10).
 
     >>> waves = torch.randn(1, 5, 900)
-    >>> expected_correlation(modulation_covariance(waves, waves, Extent((900,)))).shape
+    >>> correlation(waves, waves, Extent((900,))).round(decimals=4)[0, :3]
+    tensor([1., 1., 1.])
+    """
+    covariance = _modulation_covariance(reference, processed, extent)
+    return normalised_covariance(covariance.xx, covariance.yy, covariance.xy).mean(-1)
+
+
+def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
+    """Compute the mean of ``correlation`` over the ear's internal noise, without drawing noise.
+
+    HASPI adds noise to the levels of both signals. It increases the energies by which the
+    covariance is divided. Its contribution to the covariance itself has mean zero. The mean and the
+    variance of the quotient are computed to second order. The mean of its magnitude is that of a
+    folded normal distribution.
+
+    Args:
+        reference, processed, extent: The arguments of ``correlation``.
+
+    Returns:
+        Mean correlation at each rate of modulation. Shape: (items, 10).
+
+    >>> waves = torch.randn(1, 5, 900)
+    >>> expected_correlation(waves, waves, Extent((900,))).shape
     torch.Size([1, 10])
     """
+    covariance = _modulation_covariance(reference, processed, extent)
     variance = NOISE_DB**2
-    noise = variance * _noise_energies(covariance)
+    energies = torch.from_numpy(np.stack([_noise_energy(frames) for frames in extent.ends]))
+    on_gpu = reference.device.type != "cpu"
+    energies = energies.to(reference.device, reference.dtype, non_blocking=on_gpu)
+    noise = variance * energies.unsqueeze(-1)
     xx, yy, xy = covariance.xx + noise, covariance.yy + noise, covariance.xy
     xx2, yy2, xy2, noise2 = _energies_filtered_twice(covariance)
     noise2 = variance**2 * noise2
@@ -347,25 +348,14 @@ def expected_correlation(covariance: ModulationCovariance) -> Tensor:
     return (folded + mean * torch.erf(mean / (2.0 * spread).sqrt())).mean(-1)
 
 
-def _noise_energies(covariance: ModulationCovariance) -> Tensor:
-    """Return ``_noise_energy`` of each item. Shape: -> (items, 10, 1)."""
-    rows = [_noise_energy(frames) for frames in covariance.extent.ends]
-    energies = torch.from_numpy(np.stack(rows))
-    device = covariance.xy.device
-    energies = energies.to(device, covariance.xy.dtype, non_blocking=device.type != "cpu")
-    return energies.unsqueeze(-1)
+def _energies_filtered_twice(covariance: _Covariance) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the energies of coefficients and of white noise after filtering them twice.
 
-
-def _energies_filtered_twice(
-    covariance: ModulationCovariance,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the energies of cosines and of white noise after filtering them twice.
-
-    They determine the covariance of the cosines with noise that passed the same filter. The filters
-    are circular, therefore each item is transformed with as many points as it is alone.
+    They determine the covariance of the coefficients with noise that passed the same filter. The
+    filters are circular, therefore each item is transformed with as many points as it is alone.
 
     Returns:
-        Energies xx, yy and xy of the cosines, (items, 10, 5), and of noise, (items, 10, 1).
+        Energies xx, yy and xy of the coefficients, (items, 10, 5), and of noise, (items, 10, 1).
     """
     ends = covariance.extent.ends
     if len({_points(frames) for frames in ends}) == 1:
@@ -382,7 +372,12 @@ def _energies_filtered_twice(
 def _filter_twice(
     reference: Tensor, processed: Tensor, ends: tuple[int, ...]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return ``_energies_filtered_twice`` from spectra of the length of every item."""
+    """Return ``_energies_filtered_twice`` of items whose spectra are equally long.
+
+    Args:
+        reference, processed: Spectra. Shape: (items, 5, frequencies).
+        ends: Number of audible frames of each item.
+    """
     x, y = torch.view_as_real(reference), torch.view_as_real(processed)
     weights = constant_like(x, _twice_filtered, _points(max(ends)))
     xx, yy, xy = (weights @ product.sum(-1).mT for product in (x.square(), y.square(), x * y))
@@ -393,9 +388,15 @@ def _filter_twice(
 
 @lru_cache(maxsize=1024)
 def _noise_energy(frames: int) -> NDArray[np.float64]:
-    """Return the energy of the filters' zero-mean outputs for zero-mean white noise of variance 1.
+    """Return the energy of white noise of variance 1 at each rate of modulation.
 
-    Returns: (10,).
+    The means before and after the filters are subtracted, as in ``_modulation_covariance``.
+
+    Args:
+        frames: Number of frames.
+
+    Returns:
+        Energies. Shape: (10,).
     """
     energies = []
     for taps in _filters():
@@ -412,7 +413,10 @@ def _noise_energy(frames: int) -> NDArray[np.float64]:
 
 
 def _twice_filtered(points: int) -> NDArray[np.float64]:
-    """Return the weights of squared spectra in the energy after filtering twice: (10, bins)."""
+    """Return the weights of squared spectra in the energy after filtering twice.
+
+    Shape: (10, frequencies).
+    """
     sides = np.full(points // 2 + 1, 2.0)
     sides[[0, -1]] = 1.0
     return _responses(points) ** 4 * sides / points

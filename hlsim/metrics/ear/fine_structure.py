@@ -1,7 +1,14 @@
-"""Features of quality: smoothed envelopes, fine structure in 16 ms segments, and long-term spectra.
+"""Features of HASQI and HAAQI: what an aid changes in the sound, besides its level.
 
-HASQI and HAAQI share them. Segments at 24 kHz overlap by half; the first and the last one are half
-as long.
+Both scores compare the output of an aid with clean speech or music by:
+
+- the *envelopes*: levels of the ear's 32 channels, smoothed over 16 or 8 ms. Five numbers describe
+  the shape of the spectrum at a time, the *cepstrum*: projections on cosines over frequency.
+- the *fine structure*: the motion of the basilar membrane within segments of 16 ms, which shows
+  whether the fast vibrations are the same, too.
+- the long-term spectra: the level of each channel over the whole signal.
+
+Segments overlap by half; the first and the last one are half as long. All signals are at 24 kHz.
 
 Source: Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio
 Eng. Soc. 62(3), 99-117.
@@ -10,8 +17,7 @@ Eng. Soc. 62(3), 99-117.
 from __future__ import annotations
 
 import math
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,14 +25,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.metrics.ear.model import CHANNELS, Extent, centre_frequencies, integers
+from hlsim.metrics.ear.envelope_modulation import ENERGY_FLOOR, normalised_covariance
+from hlsim.metrics.ear.extent import Extent, integers
+from hlsim.metrics.ear.model import CHANNELS, centre_frequencies
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 SEGMENT = 384
 """Samples of a segment of the fine structure, 16 ms at 24 kHz."""
 
 HALF_SEGMENT = SEGMENT // 2
+"""Samples between the starts of neighbouring segments."""
+
 MAX_LAG = RATE // 1000
 """Largest lag in samples between the fine structures of two signals, 1 ms in both directions."""
 
@@ -42,23 +52,7 @@ SYNCHRONY_HZ = 3500.0
 SYNCHRONY_ORDER = 5
 """Order of the low-pass that describes this loss."""
 
-ENERGY_FLOOR = 1e-30
-"""Energies below this one count as zero."""
-
 NEPERS_PER_DB = math.log(10.0) / 20.0
-
-
-def count_segments(samples: int, segment: int = SEGMENT) -> int:
-    """Return the number of segments of a signal.
-
-    Args:
-        samples: Length of the signal.
-        segment: Length of a segment in samples, an even number.
-
-    >>> count_segments(1000)
-    5
-    """
-    return 1 + samples // segment + (samples - segment // 2) // segment
 
 
 def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
@@ -71,28 +65,31 @@ def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
     >>> segments_of(Extent((1000, 800))).ends
     (5, 4)
     """
-    return Extent(tuple(count_segments(end, segment) for end in extent.ends))
+    return Extent(
+        tuple(1 + end // segment + (end - segment // 2) // segment for end in extent.ends)
+    )
 
 
 # -- envelopes -------------------------------------------------------------------------------------
 
 
 def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Tensor:
-    """Compute the Hann-weighted means of segments, which overlap by half.
+    """Smooth the levels of channels: compute the Hann-weighted mean of each segment.
 
     Args:
-        levels: Levels of the envelopes in dB.
+        levels: Levels in dB.
         extent: Number of samples of each item.
         segment: Length of a segment in samples, an even number.
 
-    Shape: (items, channels, longest) -> (items, channels, segments).
+    Returns:
+        Means. Shape: (items, channels, longest) -> (items, channels, segments).
 
     >>> smooth_levels(torch.ones(1, 2, 1000), Extent((1000,))).shape
     torch.Size([1, 2, 5])
     """
     counts = segments_of(extent, segment)
     half = segment // 2
-    window = constant(_half_windows, segment, dtype=levels.dtype, device=levels.device)
+    window = constant_like(levels, _half_windows, segment)
     halves = levels[..., : counts.longest * half].unflatten(-1, (counts.longest, half))
     rising, falling = (halves @ window).unbind(-1)
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
@@ -110,71 +107,24 @@ def _half_windows(segment: int) -> NDArray[np.float64]:
     return halves
 
 
-class Cepstra(NamedTuple):
-    """Five cosines over frequency of the audible segments of two signals, without their means.
+def envelope_correlation(
+    reference: Tensor,
+    processed: Tensor,
+    counts: Extent,
+    split_by_rate: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
+    """Compute how well the fluctuations of an output's spectrum follow those of the clean signal.
 
-    Attributes:
-        reference, processed: Cosines over time. Shape: (items, 5, audible segments).
-        audible: Number of audible segments of each item.
-        extent: The same, but at least 1.
-
-    >>> levels = 40.0 + torch.randn(1, 32, 5)
-    >>> compute_cepstra(levels, levels, Extent((5,))).audible.ends
-    (5,)
-    """
-
-    reference: Tensor
-    processed: Tensor
-    audible: Extent
-    extent: Extent
-
-
-def compute_cepstra(reference: Tensor, processed: Tensor, counts: Extent) -> Cepstra:
-    """Compute the cepstra of the segments that are audible in the reference.
-
-    The host waits for the device once.
+    Five cepstral coefficients describe the shape of the spectrum in each segment. The result is the
+    mean magnitude of their correlations over time. Only segments that are audible in the clean
+    signal count; the value is 0 where there are fewer than two. The host waits for the device once.
 
     Args:
-        reference, processed: Levels by ``smooth_levels``. Shape: (items, 32, segments).
+        reference, processed: Levels of the clean signal and of the output by ``smooth_levels``.
+            Shape: (items, 32, segments).
         counts: Number of segments of each item.
-
-    >>> levels = 40.0 + torch.randn(1, 32, 5)
-    >>> compute_cepstra(levels, levels, Extent((5,))).reference.shape
-    torch.Size([1, 5, 5])
-    """
-    is_audible = _audible_segments(reference, counts)
-    audible = Extent(tuple(is_audible.sum(-1).tolist()))
-    extent = Extent(tuple(max(1, count) for count in audible.ends))
-    order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
-    basis = constant(_cosines, dtype=reference.dtype, device=reference.device)
-    x = extent.centred(basis @ reference.take_along_dim(order, -1))
-    y = extent.centred(basis @ processed.take_along_dim(order, -1))
-    return Cepstra(x, y, audible, extent)
-
-
-def absolute_correlation(x: Tensor, y: Tensor) -> Tensor:
-    """Compute the magnitude of the correlation of zero-mean signals; 0 where one is constant.
-
-    Shape: (..., time) twice -> (...).
-
-    >>> absolute_correlation(torch.tensor([1.0, -1.0]), torch.tensor([-2.0, 2.0])).round(decimals=4)
-    tensor(1.)
-    """
-    xx, yy, xy = x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1)
-    is_varying = (xx >= ENERGY_FLOOR) & (yy >= ENERGY_FLOOR)
-    norm = torch.where(is_varying, xx, 1.0).sqrt() * torch.where(is_varying, yy, 1.0).sqrt()
-    return torch.where(is_varying, xy.abs() / norm, 0.0)
-
-
-def envelope_correlation(reference: Tensor, processed: Tensor, counts: Extent) -> Tensor:
-    """Compute the mean magnitude of the correlation of five cosines over frequency.
-
-    Only segments that are audible in the reference count; the value is 0 where there are fewer than
-    two. The host waits for the device once.
-
-    Args:
-        reference, processed: Levels by ``smooth_levels``. Shape: (items, 32, segments).
-        counts: Number of segments of each item.
+        split_by_rate: Function that divides fluctuations into bands of modulation, which are
+            correlated separately. Shape: (items, 5, time) -> (items, bands, 5, time or more).
 
     Returns:
         Correlation of each item, 0 to 1. Shape: (items,).
@@ -183,30 +133,40 @@ def envelope_correlation(reference: Tensor, processed: Tensor, counts: Extent) -
     >>> envelope_correlation(levels, 2.0 * levels, Extent((5,))).round(decimals=4)
     tensor([1.])
     """
-    cepstra = compute_cepstra(reference, processed, counts)
-    correlation = absolute_correlation(cepstra.reference, cepstra.processed).mean(-1)
-    return zero_unless_audible(correlation, cepstra.audible)
-
-
-def zero_unless_audible(values: Tensor, audible: Extent) -> Tensor:
-    """Replace the values of items with fewer than two audible segments by 0. Shape: (items,).
-
-    >>> zero_unless_audible(torch.ones(2), Extent((9, 1)))
-    tensor([1., 0.])
-    """
-    return torch.where(integers(audible.ends, values.device) < 2, 0.0, values)
+    is_audible = _audible_segments(reference, counts)
+    audible = tuple(is_audible.sum(-1).tolist())
+    extent = Extent(tuple(max(1, count) for count in audible))
+    order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
+    basis = constant_like(reference, _cosines)
+    waves = []
+    for levels in (reference, processed):
+        wave = extent.centred(basis @ levels.take_along_dim(order, -1))
+        if split_by_rate is not None:
+            wave = extent.centred(split_by_rate(wave))
+        waves.append(wave)
+    x, y = waves
+    correlations = normalised_covariance(
+        x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1)
+    ).flatten(1)
+    return torch.where(integers(audible, x.device) < 2, 0.0, correlations.mean(-1))
 
 
 def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
-    """Return whether a segment exceeds the threshold of hearing.
+    """Return for each segment whether it exceeds the threshold of hearing.
 
-    Shape: (items, 32, segments) in dB over threshold -> bool (items, segments).
+    Args:
+        levels: Levels in dB over threshold. Shape: (items, 32, segments).
+        counts: Number of segments of each item.
+
+    Returns:
+        Shape: (items, segments), bool.
     """
     loudness = (levels.detach() * NEPERS_PER_DB).exp().mean(1)
     return counts.inside(levels.device) & (loudness > 10.0 ** (SILENCE_DB / 20.0))
 
 
 def _cosines() -> NDArray[np.float64]:
+    """Return five cosines over the channels, of 0.5 to 2.5 periods: (5, 32)."""
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
     return np.cos(np.arange(1, 6)[:, None] * angle)
 
@@ -226,27 +186,27 @@ def _segment_kinds(counts: Extent, device: torch.device) -> Tensor:
 
 
 def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
-    """Compute the spectra of windowed segments and their mean squares.
+    """Compute the spectrum and the energy of each segment of the fine structure.
 
-    The means are subtracted first. Mean squares are those of an envelope, twice those of the
-    motion.
+    Segments are windowed, and their means are subtracted.
 
     Args:
-        motion: Motion of the basilar membrane, zero after the end of each item.
+        motion: Motion of the basilar membrane, zero after the end of each item. Shape: (items,
+            channels, longest).
         extent: Number of samples of each item.
 
-    Shape: (items, channels, longest) -> (items, channels, segments, bins), (items, channels,
-    segments).
+    Returns:
+        Spectra, (items, channels, segments, frequencies), and mean squares of the envelope, which
+        are twice those of the motion, (items, channels, segments).
 
     >>> spectra, energy = segment_spectra(torch.randn(1, 2, 1000), Extent((1000,)))
     >>> spectra.shape, energy.shape
     (torch.Size([1, 2, 5, 217]), torch.Size([1, 2, 5]))
     """
     counts = segments_of(extent)
-    constant_like_motion = partial(constant, dtype=motion.dtype, device=motion.device)
     kinds = _segment_kinds(counts, motion.device)
-    window = constant_like_motion(_windows)[kinds][:, None]
-    inside = constant_like_motion(_inside)[kinds][:, None]
+    window = constant_like(motion, _windows)[kinds][:, None]
+    inside = constant_like(motion, _inside)[kinds][:, None]
     missing = (counts.longest + 1) * HALF_SEGMENT - motion.shape[-1]
     padded = functional.pad(motion, (0, max(0, missing)))
     segments = padded.unfold(-1, SEGMENT, HALF_SEGMENT)[..., : counts.longest, :] * window
@@ -277,10 +237,12 @@ def _inside() -> NDArray[np.float64]:
 def coherence(
     reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor], counts: Extent
 ) -> Tensor:
-    """Compute the largest normalised cross-covariance over lags of up to 1 ms.
+    """Compute how similar the fine structures of two signals are in each segment.
+
+    It is the largest normalised cross-covariance over delays of up to 1 ms.
 
     Args:
-        reference, processed: Spectra and mean squares by ``segment_spectra``.
+        reference, processed: Spectra and mean squares of both signals by ``segment_spectra``.
         counts: Number of segments of each item.
 
     Returns:
@@ -292,7 +254,7 @@ def coherence(
     """
     (x, xx), (y, yy) = reference, processed
     kinds = _segment_kinds(counts, xx.device)
-    weights = constant(_lag_weights, dtype=xx.dtype, device=xx.device)[kinds][:, None]
+    weights = constant_like(xx, _lag_weights)[kinds][:, None]
     covariance = torch.fft.irfft(x * y.conj(), FFT_POINTS)
     near = torch.cat((covariance[..., : MAX_LAG + 1], covariance[..., -MAX_LAG:]), -1) * weights
     is_moving = (xx > 2.0 * ENERGY_FLOOR) & (yy > 2.0 * ENERGY_FLOOR)
@@ -311,14 +273,15 @@ def _lag_weights() -> NDArray[np.float64]:
 
 
 def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor:
-    """Compute the mean coherence of what is audible in the reference.
+    """Compute the mean coherence of all segments and channels in which the clean signal is audible.
 
-    Channels count less where hair cells lose synchrony. The value is 0 where fewer than two
-    segments are audible.
+    Above 3.5 kHz channels count less, because the nerve no longer follows each vibration. The value
+    is 0 where fewer than two segments are audible.
 
     Args:
         coherences: Values by ``coherence``. Shape: (items, 32, segments).
-        mean_square: Mean squares of the reference's segments. Shape: (items, 32, segments).
+        mean_square: Mean squares of the clean signal's segments by ``segment_spectra``. Shape:
+            (items, 32, segments).
         counts: Number of segments of each item.
 
     Returns:
@@ -330,7 +293,7 @@ def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor
     """
     rms = mean_square.detach().sqrt()
     is_audible = _audible_segments(rms, counts)
-    weights = constant(_synchrony_weights, dtype=rms.dtype, device=rms.device)[:, None]
+    weights = constant_like(rms, _synchrony_weights)[:, None]
     weights = weights * ((rms > SILENCE_DB) & is_audible[:, None])
     total = (weights * coherences).sum((-2, -1))
     mean = total / weights.sum((-2, -1)).clamp_min(ENERGY_FLOOR)
@@ -345,12 +308,16 @@ def _synchrony_weights() -> NDArray[np.float64]:
 # -- long-term spectra -----------------------------------------------------------------------------
 
 
-def relative_loudness(levels: Tensor) -> Tensor:
-    """Return the share that each channel has in the loudness.
+def channel_shares(levels: Tensor) -> Tensor:
+    """Return the share of each channel in the sum of amplitudes over all channels.
 
-    Shape: (..., 32) dB over threshold -> (..., 32), of sum 1.
+    Args:
+        levels: Level of each channel in dB over threshold. Shape: (..., channels).
 
-    >>> relative_loudness(torch.tensor([20.0, 20.0]))
+    Returns:
+        Shares, whose sum is 1. Shape: (..., channels).
+
+    >>> channel_shares(torch.tensor([20.0, 20.0]))
     tensor([0.5000, 0.5000])
     """
     amplitude = torch.exp(levels * NEPERS_PER_DB)
@@ -358,7 +325,7 @@ def relative_loudness(levels: Tensor) -> Tensor:
 
 
 def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
-    """Compute the similarity of two spectra, from 0 to 1.
+    """Compute the similarity of two long-term spectra from their differences.
 
     It is 1 - 32 s / scale, where s is the standard deviation of the differences over the 32
     channels, and at least 0.
@@ -367,7 +334,8 @@ def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
         differences: One spectrum minus the other. Shape: (..., channels).
         scale: Value of 32 s at which the similarity is 0.
 
-    Shape: (..., channels) -> (...).
+    Returns:
+        Similarity from 0 to 1. Shape: (...).
 
     >>> spectral_similarity(torch.zeros(32), 2.5)
     tensor(1.)

@@ -1,4 +1,9 @@
-"""Preparation of signals for Kates' ear: resampling to 24 kHz, bulk alignment and silent ends."""
+"""Preparation of signals for Kates' ear, before its filters.
+
+Signals are resampled to 24 kHz, silence before and after the clean signal is found, and the delay
+of the whole output of an aid relative to the clean signal is measured. (Later, each channel of the
+ear is aligned once more; see ``model.align_channels``.)
+"""
 
 from __future__ import annotations
 
@@ -12,9 +17,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
-from hlsim.metrics.ear.model import Extent
+from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 ZERO_CROSSINGS, KAISER_BETA = 10, 5.0
 """Zero crossings per side and window of the resampling filter, those of ``resample_poly``."""
@@ -23,17 +28,24 @@ OUTPUTS_PER_ROW = 64
 """Approximate number of resampled outputs that share a row of inputs."""
 
 RING_SAMPLES = 4096
-"""Samples in which the response of the Chebyshev filters vanishes."""
+"""Number of samples after which the response of the Chebyshev filters has vanished."""
 
 HEADROOM = RATE // 500
-"""Delay of the processed signal after alignment in samples, 2 ms, which allows for dispersion."""
+"""Samples, 2 ms, by which the output is late after alignment.
+
+An aid may delay some frequencies less than the whole signal; these would be early otherwise.
+"""
 
 AUDIBLE_RATIO = 0.001
-"""Magnitude, relative to the maximum, below which the ends of the reference are silent."""
+"""Magnitude, relative to the maximum, below which the clean signal is silent at its ends."""
 
 
 def at_ear_rate(extent: Extent, sample_rate: int) -> Extent:
-    """Return the lengths of the items at 24 kHz.
+    """Return the lengths of items that are resampled to 24 kHz.
+
+    Args:
+        extent: Number of samples of each item at ``sample_rate``.
+        sample_rate: Sample rate in Hz.
 
     >>> at_ear_rate(Extent((16000,)), 16000).ends
     (24000,)
@@ -42,15 +54,15 @@ def at_ear_rate(extent: Extent, sample_rate: int) -> Extent:
 
 
 def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
-    """Resample signals to 24 kHz, and keep their RMS level as Kates does.
+    """Resample signals to 24 kHz, the rate of the ear, without a change of their RMS level.
 
-    From higher rates, the RMS of the band below 10.5 kHz is kept. The filter is a Kaiser-windowed
-    sinc as in scipy's ``resample_poly``.
+    From rates above 24 kHz, the level of the band below 10.5 kHz is kept. The filter is a
+    Kaiser-windowed sinc as in scipy's ``resample_poly``.
 
     Args:
         signals: Signals, zero after the end of each item. Shape: (items, time).
         sample_rate: Sample rate of the signals in Hz.
-        extent: Lengths of the items at that rate.
+        extent: Number of samples of each item at that rate.
 
     Returns:
         Resampled signals, zero after the end of each item. Shape: (items, longest).
@@ -64,7 +76,7 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
     common = math.gcd(RATE, sample_rate)
     up, down = RATE // common, sample_rate // common
     periods = max(1, OUTPUTS_PER_ROW // up)
-    kernel = constant(_kernel, up, down, periods, dtype=signals.dtype, device=signals.device)
+    kernel = constant_like(signals, _kernel, up, down, periods)
     inputs, outputs = kernel.shape
     rows = -(-resampled_extent.longest // outputs)
     lead = _reach(up, down)
@@ -88,7 +100,10 @@ def _reach(up: int, down: int) -> int:
 
 
 def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
-    """Return the weights of a row of inputs in a row of outputs: (inputs, periods * up)."""
+    """Return the matrix from a row of input samples to a row of output samples.
+
+    Shape: (inputs, periods * up).
+    """
     half = ZERO_CROSSINGS * max(up, down)
     taps = up * scipy.signal.firwin(
         2 * half + 1, 1.0 / max(up, down), window=("kaiser", KAISER_BETA)
@@ -107,8 +122,8 @@ def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
     Shape: (items, time) -> (items,).
     """
     points = fft_length(extent.longest + RING_SAMPLES, 2)
-    response = constant(_chebyshev, rate, points, dtype=torch.complex128, device=signals.device)
-    spectrum = torch.fft.rfft(signals, points) * response.to(signals.dtype.to_complex())
+    response = constant_like(signals, _chebyshev, rate, points)
+    spectrum = torch.fft.rfft(signals, points) * response
     return extent.mean(torch.fft.irfft(spectrum, points).square())
 
 
@@ -121,9 +136,13 @@ def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
 
 
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first and the last sample of each reference that is not silence.
+    """Find the first and the last sample of each clean signal that is not silent.
 
-    Shape: (items, time) -> int64 (items,) twice.
+    Args:
+        references: Clean signals. Shape: (items, time).
+
+    Returns:
+        Index of the first and of the last sample, int64. Shape: (items,) each.
 
     >>> audible_ends(torch.tensor([[0.0, 0.5, 0.0, 0.2, 0.0]]))
     (tensor([1]), tensor([3]))
@@ -136,14 +155,14 @@ def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
-    """Return the spectra of zero-mean signals, zero-padded for correlations over all lags.
+    """Return the spectra of signals without their means, from which ``bulk_delays`` are computed.
 
     Args:
-        signals: Signals. Shape: (items, time).
-        extent: Lengths of the items.
+        signals: Signals at 24 kHz. Shape: (items, time).
+        extent: Number of samples of each item.
 
     Returns:
-        Spectra. Shape: (items, bins).
+        Spectra, long enough for correlations at all delays. Shape: (items, frequencies).
 
     >>> spectrum_for_alignment(torch.randn(1, 100), Extent((100,))).shape
     torch.Size([1, 101])
@@ -153,17 +172,17 @@ def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
 
 
 def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -> Tensor:
-    """Return the delays that place processed signals 2 ms behind their references.
+    """Return the delay that each output of an aid needs to lie 2 ms behind its clean signal.
 
-    They follow from the largest magnitude of the cross-covariance.
+    It follows from the largest magnitude of the cross-covariance of the whole signals.
 
     Args:
-        reference_spectrum: Spectra of the references by ``spectrum_for_alignment``.
-        processed: Processed signals. Shape: (items, time).
-        extent: Lengths of the items, equal for references and processed signals.
+        reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``.
+        processed: Outputs at 24 kHz. Shape: (items, time).
+        extent: Number of samples of each item, equal for clean signals and outputs.
 
     Returns:
-        Delays in samples; negative ones advance the signal. Shape: (items,), int64.
+        Delays in samples; negative ones advance the output. Shape: (items,), int64.
 
     >>> reference, extent = torch.randn(1, 100), Extent((100,))
     >>> bulk_delays(spectrum_for_alignment(reference, extent), reference, extent)

@@ -1,17 +1,21 @@
-"""Kates' model of the auditory periphery, for normal and impaired ears.
+"""Kates' model of the ear: from a sound to the levels that reach the auditory nerve.
 
-The stages of a channel are:
+The model divides a sound into 32 channels, band-passes from 80 Hz to 8 kHz. In each channel:
 
-1. A control gammatone, as wide as with a loss of 100 dB, determines the bandwidth of the channel
-and
-   the gain of the outer hair cells.
-2. A gammatone of that bandwidth filters the signal, and the gain is applied.
-3. The output is aligned with the reference and converted to dB over the threshold of hearing.
-4. The inner hair cells adapt.
+1. A gammatone filter splits off the band. Its complex output has a magnitude, the *envelope*, and a
+   real part, the *motion* of the basilar membrane. Louder sounds and a hearing loss widen it.
+2. The outer hair cells amplify soft sounds more than loud ones. A wide *control* filter measures
+   how loud the sound is. A hearing loss reduces this gain.
+3. The inner hair cells turn the envelope into a level in dB over the threshold of hearing, and
+   adapt: they emphasise onsets. A hearing loss reduces the level.
 
-Signals are in multiples of 20 uPa, so that amplitude 1 is 0 dB SPL. They are padded to a multiple
-of ``BLOCK`` samples, and the padding does not matter. Channels lie in the last dimension but one,
-and are computed a few at a time.
+Between steps 2 and 3, the scores align each channel of the output of an aid in time with the same
+channel of the clean signal, because aids delay frequencies differently.
+
+Signals are in multiples of 20 uPa at 24 kHz, so that amplitude 1 is 0 dB SPL. They have the shape
+(items, padded) before the filters and (items, channels, padded) after them, where ``padded`` is a
+multiple of 64 samples; the padding has no effect. Channels are computed a few at a time, because
+all of them do not fit into caches.
 
 Source: Kates 2013, "An auditory model for intelligibility and quality predictions", Proceedings of
 Meetings on Acoustics 19, 050184. The constants are those of pyclarity 0.9.0, which this model
@@ -23,7 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from types import EllipsisType
 from typing import Any
 
 import numpy as np
@@ -34,6 +38,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.fft import fft_length
+from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import (
     BLOCK,
     RATE,
@@ -43,7 +48,7 @@ from hlsim.metrics.ear.recursions import (
     gain_lowpass,
     gammatone,
 )
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant, constant_like
 
 CHANNELS = 32
 """Number of channels of the ear."""
@@ -70,14 +75,17 @@ CONTROL_LOSS = 100.0
 """Hearing loss in dB HL that gives the bandwidth of the control filters."""
 
 MAX_LAG = 2400
-"""Largest shift of a channel in samples, 100 ms."""
+"""Largest time in samples, 100 ms, by which a channel of an output is shifted to be aligned."""
 
 CPU_CHUNK, GPU_CHUNK = 2**19, 2**25
-"""Samples of channels that are computed at once, so that they fit into caches or memory."""
+"""Samples of all items and channels that are computed at once.
+
+On a CPU they fit into its caches. On a GPU they take 128 MB per tensor in float32.
+"""
 
 
 def centre_frequencies() -> NDArray[np.float64]:
-    """Return the centre frequencies of the channels in Hz, evenly spaced on the ERB scale: (32,).
+    """Return the centre frequencies of the 32 channels in Hz, evenly spaced on the ERB scale.
 
     >>> centre_frequencies()[[0, -1]].round()
     array([  80., 8000.])
@@ -91,45 +99,51 @@ def centre_frequencies() -> NDArray[np.float64]:
 
 
 def _normal_decay() -> NDArray[np.float64]:
-    """Return the decay per sample of the gammatones of normal bandwidth: (32,)."""
+    """Return the decay per sample of gammatones of normal bandwidth.
+
+    The response of a channel decays by exp(-decay) from one sample to the next. Shape: (32,).
+    """
     erb: NDArray[np.float64] = MIN_ERB_HZ + centre_frequencies() / EAR_Q
     return 2.0 * math.pi / RATE * 1.019 * erb
 
 
 @dataclass(frozen=True)
 class HairCells:
-    """State of the hair cells in each channel. Shape of all: (..., 32), float64.
+    """Effect of a hearing loss on the hair cells of each channel. Shape of all: (..., 32), float64.
 
     Attributes:
-        attenuation: Attenuation by the outer hair cells in dB.
-        bandwidth: Bandwidth of the filters at low levels, relative to normal hearing.
+        outer: Loss of the outer hair cells in dB: gain that soft sounds no longer receive.
+        bandwidth: Bandwidth of the filters for soft sounds, relative to normal hearing.
         knee: Level in dB SPL above which the channel compresses.
-        ratio: Compression ratio.
-        inner: Attenuation by the inner hair cells in dB.
+        ratio: Compression ratio: input dB per output dB above the knee.
+        inner: Loss of the inner hair cells in dB.
 
     >>> cells = hair_cells(torch.zeros(8))
-    >>> cells[0:2].knee
+    >>> cells[..., 0:2].knee
     tensor([30., 30.], dtype=torch.float64)
     """
 
-    attenuation: Tensor
+    outer: Tensor
     bandwidth: Tensor
     knee: Tensor
     ratio: Tensor
     inner: Tensor
 
-    def __getitem__(self, channels: slice) -> HairCells:
-        return HairCells(*(field[..., channels] for field in vars(self).values()))
-
-    def select_items(self, items: slice) -> HairCells:
-        """Return the hair cells of some items. Shape of all: (items, 32)."""
-        return HairCells(*(field[items] for field in vars(self).values()))
+    def __getitem__(self, index: slice | tuple[EllipsisType, slice]) -> HairCells:
+        """Return some items, ``cells[items]``, or channels, ``cells[..., channels]``."""
+        return HairCells(*(field[index] for field in vars(self).values()))
 
 
 def hair_cells(thresholds: Tensor) -> HairCells:
-    """Divide a hearing loss between outer and inner hair cells. Shape: (..., 8) dB HL.
+    """Divide a hearing loss between outer and inner hair cells.
+
+    The outer hair cells account for 80 % of the loss, up to the loss at which they no longer
+    compress, and the inner hair cells for the rest.
 
     Source: Moore et al. 1999, J. Acoust. Soc. Am. 106(5), 2761-2778.
+
+    Args:
+        thresholds: Audiogram at ``hlsim.audiogram.FREQUENCIES`` in dB HL. Shape: (..., 8).
 
     >>> float(hair_cells(torch.full((8,), 40.0)).inner[0].round())
     26.0
@@ -137,14 +151,14 @@ def hair_cells(thresholds: Tensor) -> HairCells:
     indices = integers(AUDIOMETRIC_INDICES, thresholds.device)
     weights = constant(_interpolation, dtype=torch.float64, device=thresholds.device)
     loss = (thresholds.detach().double().index_select(-1, indices) @ weights).clamp_min(0.0)
-    normal = torch.linspace(1.25, 3.5, CHANNELS, dtype=torch.float64, device=loss.device)
+    normal_ratio = torch.linspace(1.25, 3.5, CHANNELS, dtype=torch.float64, device=loss.device)
     # With this loss of the outer hair cells, no compression remains.
-    max_outer = 70.0 * (1.0 - 1.0 / normal)
+    max_outer = 70.0 * (1.0 - 1.0 / normal_ratio)
     outer = torch.minimum(0.8 * loss, max_outer)
     inner = torch.where(loss < 1.25 * max_outer, 0.2 * loss, loss - max_outer)
     bandwidth = 1.0 + outer / 50.0 + 2.0 * (outer / 50.0) ** 6
     knee = outer + KNEE_SPL
-    ratio = (CEILING_SPL - knee) / (KNEE_SPL + 70.0 / normal + outer - knee)
+    ratio = (CEILING_SPL - knee) / (KNEE_SPL + 70.0 / normal_ratio + outer - knee)
     return HairCells(outer, bandwidth, knee, ratio, inner)
 
 
@@ -162,83 +176,16 @@ def _control_bandwidth(device: torch.device) -> Tensor:
     return hair_cells(torch.full((8,), CONTROL_LOSS, device=device)).bandwidth
 
 
-@lru_cache(maxsize=64)
-def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
-    """Return integers as a tensor on a device, for which the host does not wait.
-
-    Shape: -> (len(values),), int64.
-
-    >>> integers((3, 5), torch.device("cpu"))
-    tensor([3, 5])
-    """
-    with torch.inference_mode(False):  # the cached tensor may serve a training later
-        return torch.tensor(values).to(device, non_blocking=device.type != "cpu")
-
-
-@dataclass(frozen=True)
-class Extent:
-    """Lengths of the items of a padded batch.
+def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[slice]:
+    """Split the 32 channels into groups that are computed at once, from low to high frequencies.
 
     Args:
-        ends: Number of samples of each item.
+        items: Number of items of the batch.
+        samples: Number of samples of each item.
+        device: Device that computes.
 
-    >>> extent = Extent((100, 30))
-    >>> extent.longest, extent.padded
-    (100, 128)
-    """
-
-    ends: tuple[int, ...]
-
-    def __getitem__(self, items: slice) -> Extent:
-        return Extent(self.ends[items])
-
-    @property
-    def longest(self) -> int:
-        return max(self.ends)
-
-    @property
-    def padded(self) -> int:
-        """Length of the longest item, rounded up to whole blocks."""
-        return -(-self.longest // BLOCK) * BLOCK
-
-    def cut(self, signal: Tensor) -> Tensor:
-        """Remove the padding, and set the samples behind the end of each item to zero.
-
-        Shape: (items, ..., padded) -> (items, ..., longest).
-        """
-        signal = signal[..., : self.longest]
-        if self.is_even:
-            return signal
-        inside = self.inside(signal.device).view(-1, *[1] * (signal.ndim - 2), self.longest)
-        return torch.where(inside, signal, 0.0)
-
-    def mean(self, signal: Tensor) -> Tensor:
-        """Return the mean of each item over time. Shape: (items, ..., padded) -> (items, ...)."""
-        ends = integers(self.ends, signal.device).to(signal.dtype)
-        return self.cut(signal).sum(-1) / ends.view(-1, *[1] * (signal.ndim - 2))
-
-    def centred(self, signal: Tensor) -> Tensor:
-        """Subtract the mean of each item, and set the samples behind its end to zero.
-
-        Shape: (items, ..., padded) -> (items, ..., longest).
-        """
-        return self.cut(signal[..., : self.longest] - self.mean(signal).unsqueeze(-1))
-
-    def inside(self, device: torch.device) -> Tensor:
-        """Return whether samples lie before the end of their item.
-
-        Shape: -> bool (items, longest).
-        """
-        return torch.arange(self.longest, device=device) < integers(self.ends, device)[:, None]
-
-    @property
-    def is_even(self) -> bool:
-        """Whether all items are equally long."""
-        return min(self.ends) == self.longest
-
-
-def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[slice]:
-    """Split the channels so that caches or memory hold those of a chunk, from low to high.
+    Yields:
+        Channels of each group.
 
     >>> len(list(channel_chunks(1, 48000, torch.device("cpu"))))
     4
@@ -256,12 +203,18 @@ def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[s
 def _control_filters(
     channels: tuple[int, int], device: torch.device, dtype: torch.dtype
 ) -> Recursion:
-    chosen = slice(*channels)
-    decay = (
-        constant(_normal_decay, dtype=torch.float64, device=device)[chosen]
-        * _control_bandwidth(device)[chosen]
-    )
-    return gammatone(decay, _centre_angles(device)[chosen], _filter_memory(chosen), dtype)
+    """Return the control filters from the first to the last of ``channels``, which is excluded."""
+    group = slice(*channels)
+    decay = _decay(_control_bandwidth(device)[group], group)
+    return gammatone(decay, _centre_angles(device)[group], _filter_memory(group), dtype)
+
+
+def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
+    """Return the decay per sample of gammatones of a bandwidth that is relative to normal hearing.
+
+    Shape: (..., channels) -> (..., channels).
+    """
+    return bandwidth * constant_like(bandwidth, _normal_decay)[channels]
 
 
 def _filter_memory(channels: slice) -> int:
@@ -270,76 +223,62 @@ def _filter_memory(channels: slice) -> int:
 
 
 def _centre_angles(device: torch.device) -> Tensor:
+    """Return the phase by which a tone at each centre frequency advances per sample: (32,)."""
     return constant(centre_frequencies, dtype=torch.float64, device=device) * (2.0 * math.pi / RATE)
 
 
 def _apply_filters(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the real and the imaginary part of the filtered signals in blocks.
+    """Filter signals, and return the real part in blocks and the power of the envelope.
 
-    Shape: (items, padded) -> (items, channels, padded / BLOCK, BLOCK) twice.
+    Shape: (items, padded) -> (items, channels, padded / 64, 64), (items, channels, padded).
     """
-    items = len(signal)
-    channels = len(filters.through) // items
-    rows = signal if items == 1 else signal.repeat_interleave(channels, 0)
-    real, imaginary = filters(rows).unflatten(0, (items, channels)).split(BLOCK, -1)
-    return real, imaginary
+    # Torch rounds products of tensors with a dimension for items differently.
+    output = filters(signal)[None] if len(signal) == 1 else filters(signal[:, None])
+    real, imaginary = output.split(BLOCK, -1)
+    return real, (real * real).addcmul_(imaginary, imaginary).flatten(-2)
 
 
-def _envelope_power(real: Tensor, imaginary: Tensor) -> Tensor:
-    return (real * real).addcmul_(imaginary, imaginary).flatten(-2)
-
-
-def control_power(signal: Tensor, channels: slice) -> Tensor:
+def _control_power(signal: Tensor, channels: slice) -> Tensor:
     """Return the power of the control filters' envelopes.
 
-    Args:
-        signal: Output of the middle ear.
-        channels: Channels to compute.
-
     Shape: (items, padded) -> (items, channels, padded).
-
-    >>> control_power(torch.zeros(1, 128), slice(0, 3)).shape
-    torch.Size([1, 3, 128])
     """
     filters = _control_filters((channels.start, channels.stop), signal.device, signal.dtype)
-    if len(signal) > 1:
-        filters = filters.repeated(len(signal))
-    return _envelope_power(*_apply_filters(filters, signal))
+    return _apply_filters(filters, signal)[1]
 
 
-def bandwidths(control: Tensor, ear: HairCells, channels: slice, extent: Extent) -> Tensor:
+def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Extent) -> Tensor:
     """Return the bandwidths of the filters, which widen with the level, relative to normal hearing.
 
     Args:
-        control: Power of the control filters' envelopes.
-        ear: Hair cells of these channels.
+        control: Power of the control filters' envelopes. Shape: (items, channels, padded).
+        cells: Hair cells of these channels.
         channels: The channels.
-        extent: Lengths of the items.
+        extent: Number of samples of each item.
 
-    Shape: (items, channels, padded) -> (items, channels).
-
-    >>> control, ear = torch.zeros(1, 3, 128), hair_cells(torch.zeros(8))
-    >>> bandwidths(control, ear[0:3], slice(0, 3), Extent((128,)))
-    tensor([[1., 1., 1.]], dtype=torch.float64)
+    Returns:
+        Bandwidths, float64. Shape: (items, channels).
     """
     mean = extent.mean(control).double()
     level = 10.0 * torch.log10(mean.clamp_min(10.0 ** (WIDENING_SPL / 10.0)))
     share = ((level - WIDENING_SPL) / WIDENING_SPL).clamp_max(1.0)
-    return ear.bandwidth + share * (_control_bandwidth(control.device)[channels] - ear.bandwidth)
+    return cells.bandwidth + share * (
+        _control_bandwidth(control.device)[channels] - cells.bandwidth
+    )
 
 
 @dataclass(frozen=True)
 class CochlearOutput:
-    """Output of the cochlea in some channels.
+    """Response of the inner ear to a sound in some channels, before the inner hair cells.
 
     Attributes:
-        power: Power of the compressed envelope. Shape: (items, channels, padded).
-        motion: Compressed motion of the basilar membrane, or None where it was not requested.
-            Shape: (items, channels, padded).
+        power: Power of the envelope after compression. Shape: (items, channels, padded).
         bandwidth: Bandwidth of the filters, relative to normal hearing. Shape: (items, channels),
             float64.
-        mean_power: Mean power of the envelope before compression. Shape: (items, channels).
-        mean_control: Mean power of the control filters' envelope. Shape: (items, channels).
+        motion: Compressed motion of the basilar membrane. Shape: (items, channels, padded).
+        level: Long-term level in dB over threshold, 0 or more. Shape: (items, channels).
+
+    ``motion`` and ``level`` are empty unless they were requested.
 
     >>> ear = hair_cells(torch.zeros(8))
     >>> cochlea = simulate_cochlea(torch.zeros(1, 128), ear, slice(0, 3), Extent((128,)))
@@ -348,61 +287,59 @@ class CochlearOutput:
     """
 
     power: Tensor
-    motion: Tensor | None
     bandwidth: Tensor
-    mean_power: Tensor
-    mean_control: Tensor
+    motion: Tensor
+    level: Tensor
 
 
 def simulate_cochlea(
     signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, motion: bool = False
 ) -> CochlearOutput:
-    """Filter the output of the middle ear in some channels, and compress it.
+    """Filter and compress a sound in some channels, as the inner ear does.
 
     Args:
-        signal: Output of the middle ear. Shape: (items, padded).
+        signal: Sound behind the middle ear, in multiples of 20 uPa. Shape: (items, padded).
         ear: Hair cells of all channels. Shape: (items, 32) or (32,).
         channels: Channels to compute.
-        extent: Lengths of the items.
-        motion: Return the motion of the basilar membrane, too.
+        extent: Number of samples of each item.
+        motion: Return the motion of the basilar membrane and the long-term level, too.
 
     >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
     >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)
-    >>> cochlea.motion.shape
-    torch.Size([1, 3, 128])
+    >>> cochlea.motion.shape, cochlea.level
+    (torch.Size([1, 3, 128]), tensor([[0., 0., 0.]]))
     """
-    cells = ear[channels]
-    control = control_power(signal, channels)
-    width = bandwidths(control, cells, channels, extent)
-    decay = width * constant(_normal_decay, dtype=torch.float64, device=signal.device)[channels]
-    angle = _centre_angles(signal.device)[channels].expand_as(decay)
-    filters = gammatone(decay.flatten(), angle.flatten(), _filter_memory(channels), signal.dtype)
-    real, imaginary = _apply_filters(filters, signal)
-    power = _envelope_power(real, imaginary)
-    gain = compression_gain(control, cells)
-    compressed = power * gain.square()
-    if not motion:  # HASPI needs neither the motion nor the means
-        return CochlearOutput(compressed, None, width, power[..., 0], control[..., 0])
-    compressed_motion = real.flatten(-2) * gain
-    return CochlearOutput(
-        compressed, compressed_motion, width, extent.mean(power), extent.mean(control)
+    cells = ear[..., channels]
+    control = _control_power(signal, channels)
+    bandwidth = _bandwidths(control, cells, channels, extent)
+    filters = gammatone(
+        _decay(bandwidth, channels).squeeze(0),
+        _centre_angles(signal.device)[channels],
+        _filter_memory(channels),
+        signal.dtype,
     )
+    real, power = _apply_filters(filters, signal)
+    gain = _compression_gain(control, cells)
+    compressed = power * gain.square()
+    if not motion:
+        empty = compressed.new_empty(0)
+        return CochlearOutput(compressed, bandwidth, empty, empty)
+    level = _long_term_level(extent.mean(power), extent.mean(control), cells)
+    return CochlearOutput(compressed, bandwidth, real.flatten(-2) * gain, level)
 
 
-def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
+def _compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     """Return the gain of the outer hair cells on amplitudes.
 
     Args:
-        control: Power of the control filters' envelopes.
+        control: Power of the control filters' envelopes. Shape: (items, channels, padded).
         cells: Hair cells of these channels.
 
-    Shape: (..., channels, padded) -> (..., channels, padded).
-
-    >>> compression_gain(torch.zeros(1, 2, 64), hair_cells(torch.zeros(8))[0:2])[0, 0, :2]
-    tensor([0.0951, 0.2672])
+    Returns:
+        Gains. Shape: (items, channels, padded).
     """
     knee, ratio, loss = (
-        field.to(control).unsqueeze(-1) for field in (cells.knee, cells.ratio, cells.attenuation)
+        field.to(control).unsqueeze(-1) for field in (cells.knee, cells.ratio, cells.outer)
     )
     highest = knee.new_full((), 10.0 ** (CEILING_SPL / 10.0))
     level = control.clamp(10.0 ** (knee / 10.0), highest).log()
@@ -413,54 +350,71 @@ def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     return gain_lowpass(control.device, control.dtype)(gain).flatten(-2)
 
 
-def mean_level(cochlea: CochlearOutput, cells: HairCells) -> Tensor:
-    """Return the long-term level of each channel in dB over threshold.
+def _long_term_level(mean_power: Tensor, mean_control: Tensor, cells: HairCells) -> Tensor:
+    """Return the level of each channel over the whole signal, in dB over threshold.
 
     Args:
-        cochlea: Output of ``simulate_cochlea`` with ``motion=True``.
+        mean_power: Mean power of the envelopes before compression. Shape: (items, channels).
+        mean_control: Mean power of the control filters' envelopes. Shape: (items, channels).
         cells: Hair cells of these channels.
 
     Returns:
         Levels of 0 dB or more. Shape: (items, channels).
-
-    >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
-    >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)
-    >>> mean_level(cochlea, ear[0:3])
-    tensor([[0., 0., 0.]])
     """
     knee = 10.0 ** (cells.knee / 10.0)
-    control = torch.maximum(
-        cochlea.mean_control.double().clamp_max(10.0 ** (CEILING_SPL / 10.0)), knee
-    )
-    gain = -cells.attenuation - (10.0 * torch.log10(control) - cells.knee) * (
-        1.0 - 1.0 / cells.ratio
-    )
-    level = 10.0 * torch.log10(cochlea.mean_power.double().clamp_min(1.0))
-    return (level + gain - cells.inner).clamp_min(0.0).to(cochlea.power.dtype)
+    control = torch.maximum(mean_control.double().clamp_max(10.0 ** (CEILING_SPL / 10.0)), knee)
+    gain = -cells.outer - (10.0 * torch.log10(control) - cells.knee) * (1.0 - 1.0 / cells.ratio)
+    level = 10.0 * torch.log10(mean_power.double().clamp_min(1.0))
+    return (level + gain - cells.inner).clamp_min(0.0).to(mean_power.dtype)
+
+
+# -- inner hair cells ------------------------------------------------------------------------------
+
+
+def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
+    """Compute the levels that the inner hair cells pass to the auditory nerve.
+
+    They are levels over the threshold of hearing, and emphasise onsets by adaptation.
+
+    Args:
+        power: Power of the compressed envelopes, where 1 is 0 dB SPL. Shape: (items, channels,
+            padded).
+        inner: Loss of the inner hair cells in dB. Shape: (items, channels) or (channels,).
+
+    Returns:
+        Levels in dB over threshold, 0 or more. Shape: (items, channels, padded).
+
+    >>> levels = nerve_levels(torch.full((1, 1, 12800), 1e4), torch.tensor([10.0]))
+    >>> levels[0, 0, [0, -1]].round()
+    tensor([60., 30.])
+    """
+    loss = inner.to(power).unsqueeze(-1)
+    level = torch.maximum(power, 10.0 ** (loss / 10.0)).log().mul_(10.0 / math.log(10.0))
+    adapted = adaptation(power.device, power.dtype)(level.sub_(loss))
+    return adapted.flatten(-2).clamp_min(0.0)
 
 
 # -- alignment of channels -------------------------------------------------------------------------
 
 
 def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
-    """Return the spectrum of the differences of neighbouring samples, for ``channel_lags``.
+    """Return the spectrum of a clean signal's channels with which ``align_channels`` aligns others.
 
-    Near its maximum, a correlation hardly changes from lag to lag. Single precision resolves its
-    steps, but not its values.
+    It is the spectrum of the differences of neighbouring samples. Near its maximum, a correlation
+    hardly changes from lag to lag: single precision resolves its steps, but not its values.
 
     Args:
-        reference: Envelope or motion.
-        extent: Lengths of the items.
+        reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).
+        extent: Number of samples of each item.
 
-    Shape: (items, channels, padded) -> (items, channels, bins).
+    Returns:
+        Spectrum. Shape: (items, channels, frequencies).
 
     >>> lag_spectrum(torch.zeros(1, 2, 128), Extent((128,))).shape
     torch.Size([1, 2, 1297])
     """
     points = _lag_points(extent)
-    step = constant(
-        _step_response, points, dtype=reference.dtype.to_complex(), device=reference.device
-    )
+    step = constant_like(reference, _step_response, points)
     return torch.fft.rfft(extent.cut(reference), points) * step
 
 
@@ -473,45 +427,55 @@ def _lag_points(extent: Extent) -> int:
     return fft_length(extent.longest + MAX_LAG, 2)
 
 
-def channel_lags(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
-    """Return the shift of each channel that gives the largest cross-correlation with the reference.
+def align_channels(
+    signal: Tensor, envelope: Tensor, reference_spectrum: Tensor, extent: Extent
+) -> Tensor:
+    """Shift each channel of an output to where it correlates best with the clean signal.
+
+    Channels are shifted by whole samples, from -2399 to 2400. The shifts are constants for the
+    gradient.
 
     Args:
-        reference: ``lag_spectrum`` of the reference's envelope or motion.
-        processed: Envelope or motion. Shape: (items, channels, padded).
-        extent: Lengths of the items.
+        signal: Channels to shift. Shape: (items, channels, padded).
+        envelope: Envelope or motion of the same channels, from which the shifts are computed.
+            Shape: (items, channels, padded).
+        reference_spectrum: ``lag_spectrum`` of the clean signal's envelope or motion.
+        extent: Number of samples of each item.
 
     Returns:
-        Samples by which to delay each channel, from -2399 to 2400, int64. Shape: (items, channels).
+        Shifted channels. Shape: (items, channels, padded).
 
-    >>> reference = torch.zeros(1, 1, 128)
-    >>> reference[..., 50] = 1.0
-    >>> extent = Extent((128,))
-    >>> channel_lags(lag_spectrum(reference, extent), reference.roll(-7, -1), extent)
-    tensor([[7]])
+    >>> clean, extent = torch.zeros(1, 1, 128), Extent((128,))
+    >>> clean[..., 50] = 1.0
+    >>> early = clean.roll(-7, -1)
+    >>> bool((align_channels(early, early, lag_spectrum(clean, extent), extent) == clean).all())
+    True
     """
     with torch.no_grad():
         points, max_lag = _lag_points(extent), min(MAX_LAG, extent.longest)
-        spectrum = torch.fft.rfft(extent.cut(processed), points)
-        steps = torch.fft.irfft(reference * spectrum.conj(), points)
+        spectrum = torch.fft.rfft(extent.cut(envelope), points)
+        steps = torch.fft.irfft(reference_spectrum * spectrum.conj(), points)
         near = torch.cat((steps[..., points - max_lag + 1 :], steps[..., :max_lag]), -1)
         correlation = functional.pad(near.double().cumsum(-1), (1, 0))
-        return correlation.argmax(-1) - (max_lag - 1)
+        delays = correlation.argmax(-1) - (max_lag - 1)
+    return shift(signal, delays, extent.ends, extent.ends, extent.padded)
 
 
 def shift(
     signal: Tensor, delays: Tensor, ends: Sequence[int], stops: Sequence[int], size: int
 ) -> Tensor:
-    """Delay channels by whole samples.
+    """Delay each channel by a whole number of samples.
 
-    The output is ``signal[t - delay]`` before the stop of each item, and 0 elsewhere.
+    Sample t of the output is sample ``t - delay`` of the signal. Samples from outside of an item
+    are 0.
 
     Args:
         signal: Signals. Shape: (items, channels, time).
-        delays: Delays in samples; negative ones advance. Shape: (items, channels), int64.
-        ends: Number of samples of each item; later ones count as 0.
-        stops: Number of samples of each item's output; later ones are 0.
-        size: Length of the output.
+        delays: Delays in samples; negative ones advance the signal. Shape: (items, channels),
+            int64.
+        ends: Number of samples of each item of ``signal``; later samples count as 0.
+        stops: Number of samples of each item of the output; later samples are 0.
+        size: Number of samples of the output.
 
     Returns:
         Delayed signals. Shape: (items, channels, size).
@@ -576,74 +540,41 @@ def _gather_rows(
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
-    """Return the delay of each gammatone at its centre frequency in whole samples.
-
-    Channels are shifted to 0 Hz before they are filtered, so it is the group delay at 0 Hz.
+    """Return the group delay of each channel's filter at its centre frequency in whole samples.
 
     Args:
-        bandwidth: Bandwidths of the filters, relative to normal hearing.
+        bandwidth: Bandwidths of the filters, relative to normal hearing. Shape: (items, channels).
         channels: The channels.
 
-    Shape: (items, channels) -> int64 (items, channels).
+    Returns:
+        Delays in samples. Shape: (items, channels), int64.
 
     >>> group_delays(torch.ones(1, 2), slice(0, 2))
     tensor([[449, 404]])
     """
-    normal_decay = constant(_normal_decay, dtype=torch.float64, device=bandwidth.device)
-    decay = bandwidth.detach() * normal_decay[channels]
-    pole = torch.exp(-decay)
+    # the delay at 0 Hz, because pyclarity shifts each channel to 0 Hz before it filters
+    pole = torch.exp(-_decay(bandwidth.detach(), channels))
     return (4.0 * pole / (1.0 + 2.0 * pole) + 4.0 * pole / (1.0 - pole)).round().long()
 
 
 def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tensor:
-    """Return the longest group delay of all channels, to which they are delayed.
+    """Return the longest group delay of all channels, to which the scores delay every channel.
 
-    It is that of one of the first three channels: these filters widen by a factor of 1.28 at most,
+    It is that of one of the first three channels: their filters widen by a factor of 1.28 at most,
     and the fourth filter is 1.37 times as wide as the first.
 
     Args:
-        signal: Output of the middle ear.
+        signal: Sound behind the middle ear. Shape: (items, padded).
         ear: Hair cells of all channels.
-        extent: Lengths of the items.
+        extent: Number of samples of each item.
 
-    Shape: (items, padded) -> int64 (items, 1).
+    Returns:
+        Delay in samples. Shape: (items, 1), int64.
 
     >>> longest_group_delay(torch.zeros(1, 128), hair_cells(torch.zeros(8)), Extent((128,)))
     tensor([[449]])
     """
-    low = slice(0, 3)
-    width = bandwidths(control_power(signal, low), ear[low], low, extent)
-    return group_delays(width, low).amax(-1, keepdim=True)
-
-
-# -- inner hair cells ------------------------------------------------------------------------------
-
-
-def sensation(power: Tensor, inner: Tensor) -> Tensor:
-    """Return the level over the threshold in dB, 0 or more.
-
-    Args:
-        power: Power of the compressed envelopes. Shape: (items, channels, padded).
-        inner: Attenuation by the inner hair cells in dB. Shape: (items or 1, channels).
-
-    Returns:
-        Levels. Shape: (items, channels, padded).
-
-    >>> sensation(torch.full((1, 1, 2), 1e4), torch.tensor([[10.0]]))
-    tensor([[[30., 30.]]])
-    """
-    floor = 10.0 ** (inner.to(power).unsqueeze(-1) / 10.0)
-    level = torch.maximum(power, floor).log().mul_(10.0 / math.log(10.0))
-    return level.sub_(inner.to(power).unsqueeze(-1))
-
-
-def apply_adaptation(level: Tensor) -> Tensor:
-    """Apply the adaptation of the inner hair cells, which emphasises onsets.
-
-    Shape: (..., padded) -> (..., padded).
-
-    >>> levels = apply_adaptation(torch.full((1, 12800), 30.0))
-    >>> levels[0, [0, -1]].round()
-    tensor([60., 30.])
-    """
-    return adaptation(level.device, level.dtype)(level).flatten(-2).clamp_min(0.0)
+    lowest = slice(0, 3)
+    control = _control_power(signal, lowest)
+    bandwidth = _bandwidths(control, ear[..., lowest], lowest, extent)
+    return group_delays(bandwidth, lowest).amax(-1, keepdim=True)

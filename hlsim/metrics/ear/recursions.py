@@ -1,9 +1,10 @@
-"""Recursive filters of Kates' ear in blocks, by matrix products instead of loops over samples.
+"""Recursive filters of Kates' ear, computed by matrix products instead of a loop over samples.
 
-Every filter of the ear is linear and time-invariant. Within a block of 64 samples its output is a
-triangular Toeplitz product of the input. The influence of earlier blocks is a state of two to eight
-numbers, which a small matrix advances from block to block. The result is exact, fast on a GPU, too,
-and differentiable in the signal and in the bandwidths of the filters.
+A recursive filter computes each output sample from earlier outputs, which would take a loop over
+samples in Python. Here a signal is divided into blocks of 64 samples. Within a block, the output is
+a matrix times the block. All that later blocks need to know of earlier ones are one to eight
+numbers, the *state* of the filter, which a small matrix advances from block to block. The result is
+the exact output of the filter, fast on a GPU, too, and differentiable.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch.nn import functional
 from hlsim.torchtools import constant, without_modes
 
 BLOCK = 64
-"""Samples of a block. The length of a signal is a multiple of it."""
+"""Samples of a block. Signals are padded to a multiple of it."""
 
 RATE = 24000
 """Sample rate in Hz at which the ear is defined."""
@@ -33,9 +34,15 @@ Filter = TypeVar("Filter")
 
 
 def cached_filter(design: Callable[P, Filter]) -> Callable[P, Filter]:
-    """Decorate a function that designs a filter so that it designs each filter once.
+    """Decorate a function that designs a filter, so that it designs each filter once.
 
-    The filter can be used outside of inference mode even if it was first designed inside.
+    A filter that was first needed in inference mode can be used outside of it, too.
+
+    Args:
+        design: Function whose arguments are hashable.
+
+    Returns:
+        Function with the same arguments that returns a cached filter.
 
     >>> @cached_filter
     ... def ones(count):
@@ -53,18 +60,18 @@ def cached_filter(design: Callable[P, Filter]) -> Callable[P, Filter]:
 
 
 class Recursion(NamedTuple):
-    """Causal filter that processes a signal in blocks.
+    """Recursive filters as the matrices that process a signal in blocks of 64 samples.
 
-    The output of a block is ``block @ through + state @ outward``. From block to block, the state
-    changes to ``state @ step + block @ inward``.
+    The output of a block is ``block @ through + state @ outward``. The next block has the state
+    ``state @ step + block @ inward``. The state sums up all earlier blocks in a few numbers.
 
     Attributes:
-        through: Response to the same block. Shape: (..., BLOCK, BLOCK), or (..., BLOCK, 2 BLOCK)
-            with the real and the imaginary part side by side.
-        inward: Influence of a block on the state. Shape: (..., BLOCK, states).
-        outward: Response to the state. Shape: (..., states, outputs).
-        step: Change of the state from block to block. Shape: (..., states, states).
-        memory: Samples after which the influence of an input has vanished.
+        through: Matrix from a block to its output. Shape: (..., 64, outputs), where ``outputs`` is
+            64, or 128 for complex filters: the real parts, then the imaginary parts.
+        inward: Matrix from a block to its contribution to the state. Shape: (..., 64, states).
+        outward: Matrix from the state to the output. Shape: (..., states, outputs).
+        step: Matrix from the state before a block to that after it. Shape: (..., states, states).
+        memory: Number of samples after which the influence of an input sample has vanished.
 
     >>> lowpass = gain_lowpass(torch.device("cpu"), torch.float64)
     >>> lowpass(torch.ones(1, 192, dtype=torch.float64)).shape
@@ -78,9 +85,14 @@ class Recursion(NamedTuple):
     memory: int
 
     def __call__(self, signal: Tensor) -> Tensor:
-        """Return the outputs in blocks.
+        """Filter a signal.
 
-        Shape: (rows or 1, time) -> (rows, time / BLOCK, outputs).
+        Args:
+            signal: Signal whose length is a multiple of 64. Shape: (..., time), where the leading
+                dimensions broadcast with those of the filters.
+
+        Returns:
+            Output in blocks. Shape: (..., time / 64, outputs).
         """
         blocks = signal.unflatten(-1, (-1, BLOCK))
         states = _accumulate(blocks @ self.inward, self.step, self.memory // BLOCK)
@@ -88,24 +100,27 @@ class Recursion(NamedTuple):
         # These are the largest tensors of a score, therefore the addition is in place.
         return (blocks @ self.through).add_(before @ self.outward)
 
-    def repeated(self, items: int) -> Recursion:
-        """Return the same filters for each of several items."""
-        through, inward, outward, step = (part.repeat(items, 1, 1) for part in self[:4])
-        return Recursion(through, inward, outward, step, self.memory)
-
     def to(self, device: torch.device, dtype: torch.dtype) -> Recursion:
-        """Return the filter on a device, in a dtype."""
+        """Return the same filters on a device and in a dtype."""
         on_gpu = device.type != "cpu"
         through, inward, outward, step = (
-            part.to(device, dtype, non_blocking=on_gpu) for part in self[:4]
+            matrix.to(device, dtype, non_blocking=on_gpu) for matrix in self[:4]
         )
         return Recursion(through, inward, outward, step, self.memory)
 
 
 def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
-    """Compute the states after each block. The number of blocks that are summed doubles each time.
+    """Compute the state after each block.
 
-    Shape: (..., blocks, states), (..., states, states) -> (..., blocks, states).
+    In each round, the number of blocks that a state sums up doubles.
+
+    Args:
+        inputs: Contribution of each block to the state. Shape: (..., blocks, states).
+        step: Matrix from a state to the next one. Shape: (..., states, states).
+        memory: Number of blocks after which a contribution has vanished.
+
+    Returns:
+        States. Shape: (..., blocks, states).
     """
     states, reach = inputs, 1
     while reach < min(inputs.shape[-2], memory + 1):
@@ -119,9 +134,10 @@ def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
 
 
 def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion:
-    """Return the filter x' = a x + b u, y = c x + d u in blocks.
+    """Return a filter in state-space form as matrices for blocks.
 
-    Its states are balanced so that single precision suffices.
+    With the input u, the output is y = c x + d u, and the next state is a x + b u. The state is
+    balanced, so that single precision suffices.
     """
     root = scipy.linalg.cholesky(scipy.linalg.solve_discrete_lyapunov(a, b @ b.T), lower=True)
     observability = scipy.linalg.solve_discrete_lyapunov(a.T, c.T @ c)
@@ -136,16 +152,17 @@ def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion
     through = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
     inward = np.stack([(powers[BLOCK - 1 - i] @ b)[:, 0] for i in range(BLOCK)])
     outward = np.stack([(c @ powers[i])[0] for i in range(BLOCK)], -1)
-    parts = [
-        torch.from_numpy(np.ascontiguousarray(x))
-        for x in (through, inward, outward, powers[BLOCK].T)
-    ]
-    return Recursion(parts[0], parts[1], parts[2], parts[3], memory)
+
+    def tensor(matrix: Array) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(matrix))
+
+    step = powers[BLOCK].T
+    return Recursion(tensor(through), tensor(inward), tensor(outward), tensor(step), memory)
 
 
 @cached_filter
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the filter of the middle ear.
+    """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
 
     It is a low-pass of first order at 5 kHz and a high-pass of second order at 350 Hz, both
     Butterworth.
@@ -163,9 +180,9 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
 
 @cached_filter
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the filter that smooths compressive gains over 0.2 ms.
+    """Return the filter that smooths the gain of the outer hair cells over 0.2 ms.
 
-    It is a Butterworth low-pass of first order at 800 Hz.
+    It is a Butterworth low-pass of first order at 800 Hz, for gains at 24 kHz.
 
     >>> gain_lowpass(torch.device("cpu"), torch.float32).step.shape
     torch.Size([1, 1])
@@ -183,10 +200,11 @@ RAPID_SECONDS, SHORT_TERM_SECONDS = 0.002, 0.060
 
 @cached_filter
 def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the filter of the inner hair cells' rapid and short-term adaptation.
+    """Return the filter by which inner hair cells emphasise onsets, for levels in dB at 24 kHz.
 
-    It is an electrical circuit of two resistors and two capacitors, solved by backward differences.
-    Negative outputs must be set to zero.
+    The response to an onset is twice the steady response, and decays with time constants of 2 and
+    60 ms. Kates describes it by an electrical circuit of two resistors and two capacitors, which is
+    solved by backward differences. Negative outputs must be set to zero.
 
     >>> adaptation(torch.device("cpu"), torch.float32).step.shape
     torch.Size([2, 2])
@@ -207,28 +225,34 @@ GAMMATONE_ORDER = 4
 
 
 def _binomials() -> Array:
-    """Return the binomial coefficients by which the powers of a distance grow in a block: (4, 4).
+    """Return the binomial coefficients of orders 0 to 3: row e, column d holds "d choose e".
 
-    Row e and column d hold "d choose e".
+    They expand the powers of a distance that grows by one block. Shape: (4, 4).
     """
     orders = np.arange(GAMMATONE_ORDER)
     return scipy.special.comb(orders[None, :], orders[:, None])
 
 
 def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> Recursion:
-    """Return gammatone filters of fourth order as complex band-passes.
+    """Return gammatone filters of fourth order, the band-passes of the ear, with complex output.
+
+    The magnitude of the output is the envelope of the band, and its real part the motion of the
+    basilar membrane. A tone at the centre frequency keeps its amplitude.
 
     The impulse response at sample n is g p(n) exp(n (i angle - decay)) with the polynomial
-    p(n) = (n + 1)(3 n^2 + 3 n + 2) / 2. These are four poles at exp(-decay) and two zeros at
-    -2 exp(-decay). The factor g gives a tone at the centre frequency its own amplitude. The modulus
-    of the output is the envelope, its real part the motion of the basilar membrane. Shifting p by a
-    block mixes only its four powers, therefore four complex states suffice.
+    p(n) = (n + 1)(3 n^2 + 3 n + 2) / 2 and the gain g. These are four poles at exp(-decay) and two
+    zeros at -2 exp(-decay). Shifting p by a block mixes only its four powers, therefore four
+    complex numbers suffice as state.
 
     Args:
-        decay: Decay per sample, 2 pi 1.019 ERB / rate for normal bandwidth. Shape: (rows,).
-        angle: Phase per sample, 2 pi centre frequency / rate. Shape: (rows,).
-        memory: Samples after which the response has vanished, 50 over the smallest decay.
+        decay: Decay of the response per sample, 2 pi 1.019 ERB / rate for normal bandwidth. Shape:
+            (..., filters).
+        angle: Phase of the centre frequency per sample, 2 pi frequency / rate. Shape: (filters,).
+        memory: Number of samples after which the response has vanished, 50 over the smallest decay.
         dtype: Dtype of the matrices, which are computed in that of ``decay``.
+
+    Returns:
+        Filters. Shape of the matrices: (..., filters, ., .).
 
     >>> filters = gammatone(torch.tensor([0.05]), torch.tensor([0.3]), 1000, torch.float32)
     >>> filters(torch.zeros(1, 128)).shape
@@ -236,6 +260,7 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     """
     n = torch.arange(BLOCK, dtype=decay.dtype, device=decay.device)
     gain = 2.0 * torch.expm1(-decay) ** 4 / (1.0 + 2.0 * torch.exp(-decay)) ** 2
+    decay, angle = decay[..., None], angle[..., None]
     p = torch.stack(
         (
             (n + 1) * (3 * n**2 + 3 * n + 2) / 2,
@@ -244,28 +269,34 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
             torch.full_like(n, 1.5),
         )
     )
-    after = gain[:, None] * torch.exp(-decay[:, None] * n)
-    phase, phase_to_end = angle[:, None] * n, angle[:, None] * (BLOCK - n)
+    after = gain[..., None] * torch.exp(-decay * n)
+    phase, phase_to_end = angle * n, angle * (BLOCK - n)
     # within a block
-    wave = (after * p[0])[..., None] * torch.stack((phase.cos(), phase.sin()), -1)  # rows, BLOCK, 2
+    wave = (after * p[0])[..., None] * torch.stack((phase.cos(), phase.sin()), -1)
     lag = torch.arange(BLOCK, device=decay.device)
     lag = lag - lag[:, None]
-    wave = functional.pad(wave, (0, 0, 0, 1)).to(dtype)
-    through = wave[:, torch.where(lag >= 0, lag, BLOCK)]  # rows, in, out, 2
+    wave = functional.pad(wave, (0, 0, 0, 1)).to(dtype)  # ..., filters, BLOCK + 1, 2
+    through = wave[..., torch.where(lag >= 0, lag, BLOCK), :]  # ..., filters, in, out, 2
+    through = through.transpose(-1, -2).flatten(-2)
     # from block to block: powers of the distance in blocks, times the decaying carrier
-    power = torch.arange(GAMMATONE_ORDER, dtype=decay.dtype, device=decay.device)
-    distance = ((BLOCK - n) / BLOCK)[:, None] ** power
-    remainder = torch.exp(-decay[:, None] * (BLOCK - n))
+    order = torch.arange(GAMMATONE_ORDER, dtype=decay.dtype, device=decay.device)
+    distance = ((BLOCK - n) / BLOCK)[:, None] ** order
+    remainder = torch.exp(-decay * (BLOCK - n))
     inward_real = (remainder * phase_to_end.cos())[..., None] * distance
     inward_imaginary = (remainder * phase_to_end.sin())[..., None] * distance
     inward = torch.cat((inward_real, inward_imaginary), -1)
-    weight = after[:, None] * p * (float(BLOCK) ** power)[:, None]
-    real, imaginary = weight * phase.cos()[:, None], weight * phase.sin()[:, None]
-    outward = torch.cat((torch.cat((real, imaginary), -1), torch.cat((-imaginary, real), -1)), -2)
+    weight = after[..., None, :] * p * (float(BLOCK) ** order)[:, None]
+    outward = _as_real(weight * phase.cos()[..., None, :], weight * phase.sin()[..., None, :])
     binomials = constant(_binomials, dtype=decay.dtype, device=decay.device)
-    decayed = torch.exp(-BLOCK * decay)[:, None, None] * binomials
-    cosine = decayed * torch.cos(BLOCK * angle)[:, None, None]
-    sine = decayed * torch.sin(BLOCK * angle)[:, None, None]
-    step = torch.cat((torch.cat((cosine, sine), -1), torch.cat((-sine, cosine), -1)), -2)
-    through = through.transpose(-1, -2).flatten(-2)
+    decayed = torch.exp(-BLOCK * decay)[..., None] * binomials
+    step_angle = BLOCK * angle[..., None]
+    step = _as_real(decayed * torch.cos(step_angle), decayed * torch.sin(step_angle))
     return Recursion(through, inward.to(dtype), outward.to(dtype), step.to(dtype), memory)
+
+
+def _as_real(real: Tensor, imaginary: Tensor) -> Tensor:
+    """Return a complex matrix as a real one that acts on real parts, then imaginary parts.
+
+    Shape: (..., rows, columns) twice -> (..., 2 rows, 2 columns).
+    """
+    return torch.cat((torch.cat((real, imaginary), -1), torch.cat((-imaginary, real), -1)), -2)

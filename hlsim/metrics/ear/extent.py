@@ -1,0 +1,103 @@
+"""Lengths of the items of a padded batch.
+
+Items of a batch have different lengths, but share one tensor, so that all but the longest are
+padded at their end. Computations of scores must not depend on the padding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from hlsim.metrics.ear.recursions import BLOCK
+
+
+@lru_cache(maxsize=64)
+def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return integers as a cached tensor on a device, without making the host wait for the device.
+
+    Args:
+        values: The integers.
+        device: Device of the tensor.
+
+    Returns:
+        The integers, int64. Shape: (number of values,).
+
+    >>> integers((3, 5), torch.device("cpu"))
+    tensor([3, 5])
+    """
+    with torch.inference_mode(False):  # the cached tensor may serve a training later
+        return torch.tensor(values).to(device, non_blocking=device.type != "cpu")
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Number of samples, or of frames, of each item of a padded batch.
+
+    Args:
+        ends: Length of each item.
+
+    >>> extent = Extent((100, 30))
+    >>> extent.longest, extent.padded
+    (100, 128)
+    """
+
+    ends: tuple[int, ...]
+
+    def __getitem__(self, items: slice) -> Extent:
+        """Return the lengths of some of the items."""
+        return Extent(self.ends[items])
+
+    @property
+    def longest(self) -> int:
+        """Length of the longest item."""
+        return max(self.ends)
+
+    @property
+    def padded(self) -> int:
+        """Length of the longest item, rounded up to a multiple of 64 samples.
+
+        The filters of the ear process blocks of 64 samples (``recursions.BLOCK``).
+        """
+        return -(-self.longest // BLOCK) * BLOCK
+
+    @property
+    def is_even(self) -> bool:
+        """Whether all items are equally long."""
+        return min(self.ends) == self.longest
+
+    def cut(self, signal: Tensor) -> Tensor:
+        """Cut a batch to its longest item, and set the samples after the end of each item to zero.
+
+        Shape: (items, ..., time) -> (items, ..., longest), where ``time`` is ``longest`` or more.
+        """
+        signal = signal[..., : self.longest]
+        if self.is_even:
+            return signal
+        inside = self.inside(signal.device).view(-1, *[1] * (signal.ndim - 2), self.longest)
+        return torch.where(inside, signal, 0.0)
+
+    def mean(self, signal: Tensor) -> Tensor:
+        """Return the mean of each item over its own samples.
+
+        Shape: (items, ..., time) -> (items, ...).
+        """
+        ends = integers(self.ends, signal.device).to(signal.dtype)
+        return self.cut(signal).sum(-1) / ends.view(-1, *[1] * (signal.ndim - 2))
+
+    def centred(self, signal: Tensor) -> Tensor:
+        """Subtract the mean of each item, and set the samples after its end to zero.
+
+        Shape: (items, ..., time) -> (items, ..., longest).
+        """
+        return self.cut(signal[..., : self.longest] - self.mean(signal).unsqueeze(-1))
+
+    def inside(self, device: torch.device) -> Tensor:
+        """Return True for each sample before the end of its item, and False for padding.
+
+        Shape: -> bool (items, longest).
+        """
+        return torch.arange(self.longest, device=device) < integers(self.ends, device)[:, None]
