@@ -68,11 +68,7 @@ def test_a_module_and_a_file_give_the_same_plugin_and_restore_the_path(module: s
     for name in (f"{module}:half", f"{module}.py:half", f"./{module}.py:Quieter"):
         torch.testing.assert_close(WaveformPlugin(name, "teacher")(waveform), waveform / 2)
     assert sys.path == paths
-
-
-def test_a_changed_file_is_loaded_again(module: str) -> None:
-    assert load_plugin(f"{module}.py:number", "measure") == 3
-    Path(f"{module}.py").write_text("number = 4")
+    Path(f"{module}.py").write_text("number = 4")  # a changed file is loaded again
     assert load_plugin(f"{module}.py:number", "measure") == 4
 
 
@@ -97,11 +93,10 @@ def test_outputs_that_are_not_aligned_are_rejected(module: str) -> None:
         WaveformPlugin(f"{module}:late", "teacher").check_aligned(noise(), 16000)
 
 
-@pytest.mark.parametrize("name", ["msbg", "no_such_module:half", "none.py:half", ":half", "x:"])
-def test_names_that_cannot_be_loaded_are_rejected(module: str, name: str) -> None:
-    with pytest.raises(ValueError, match=name):
-        load_plugin(name, "teacher")
-    with pytest.raises(ValueError, match="nobody"):
-        load_plugin(f"{module}:nobody", "teacher")
+def test_names_that_cannot_be_loaded_are_rejected(module: str) -> None:
+    unknown = f"{module}:nobody"
+    for name in ("msbg", "no_such_module:half", "none.py:half", ":half", "x:", unknown):
+        with pytest.raises(ValueError, match=name):
+            load_plugin(name, "teacher")
     with pytest.raises(ValueError, match="to be callable"):
         WaveformPlugin(f"{module}:number", "teacher")

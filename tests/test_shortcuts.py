@@ -15,10 +15,6 @@ from hlsim.shortcuts import EXAMPLE_FILE
 SPEECH = hlsim.example_speech()[8000:24000]
 
 
-def test_example_speech_is_speech_of_conversational_level() -> None:
-    assert float(level_spl(hlsim.example_speech())) == pytest.approx(65.0, abs=1e-3)
-
-
 @pytest.mark.parametrize("function", [hlsim.simulate, hlsim.compensate])
 def test_arrays_give_arrays_with_the_values_of_tensors(function) -> None:
     result = function(SPEECH.numpy(), "n4")
@@ -35,20 +31,12 @@ def test_simulate_is_the_exact_model_and_compensate_the_hearing_aid() -> None:
         assert torch.equal(hlsim.compensate(SPEECH, ear), aid(SPEECH, ear))
 
 
-@pytest.mark.parametrize(
-    "ear",
-    [
-        "N3",
-        "n3",
-        [35, 35, 40, 50, 55, 60, 65, 65],
-        np.array([35.0, 35, 40, 50, 55, 60, 65, 65]),
-        {250: 35, 500: 35, 1000: 40, 2000: 50, 3000: 55, 4000: 60, 6000: 65, 8000: 65},
-        {"levels": [35, 35, 40, 50, 55, 60, 65, 65]},
-    ],
-)
-def test_an_ear_may_be_written_in_several_ways(ear) -> None:
-    expected = hlsim.simulate(SPEECH, hlsim.Audiogram.standard("N3"))
-    assert torch.equal(hlsim.simulate(SPEECH, ear), expected)
+def test_an_ear_may_be_written_in_several_ways() -> None:
+    ear = hlsim.Audiogram.standard("N3")
+    levels, by_frequency = list(ear.levels), dict(zip(ear.frequencies, ear.levels, strict=True))
+    expected = hlsim.simulate(SPEECH, ear)
+    for other in ("N3", "n3", levels, np.array(levels), by_frequency, {"levels": levels}):
+        assert torch.equal(hlsim.simulate(SPEECH, other), expected)
 
 
 def test_one_gain_calibrates_all_channels_of_a_file(tmp_path) -> None:
@@ -96,6 +84,7 @@ def test_info_names_the_versions_for_a_bug_report() -> None:
 
 
 def test_load_audio_can_keep_the_samples_of_the_file() -> None:
+    assert float(level_spl(hlsim.example_speech())) == pytest.approx(65.0, abs=1e-3)
     samples, rate = hlsim.load_audio(EXAMPLE_FILE, spl=None)
     expected, _ = soundfile.read(EXAMPLE_FILE, dtype="float32")
     assert rate == 16000

@@ -41,6 +41,13 @@ def build_wearable(name: str, **options: Any) -> Wearable:
     return aid
 
 
+def assert_close(output: Tensor, expected: Tensor, tolerance: float = 1e-5) -> None:
+    """Compare shapes, and values relative to the peak."""
+    assert output.shape == expected.shape
+    error = (output - expected).detach().abs().max()
+    assert float(error) < tolerance * float(expected.detach().abs().max())
+
+
 def tone(hertz: float, spl: float, seconds: float = 1.0, rate: int = 16000) -> Tensor:
     """Compute a sine in float32. Shape: -> (time,)."""
     time = torch.arange(round(rate * seconds), dtype=torch.float64) / rate

@@ -17,7 +17,7 @@ from compensators.filter_bank import (
     level_db,
     speech_band_levels,
 )
-from compensators.smoothing import _average, _weight_of_past, follow_peaks
+from compensators.smoothing import _weight_of_past, follow_peaks
 from hlsim.calibration import set_level
 from tests.compensators.aids import tone
 
@@ -64,20 +64,6 @@ def test_gains_equal_a_sum_in_float64() -> None:
     assert np.abs(apply_gains(signal, gains).numpy() - expected).max() < 1e-5
     part = apply_gains(signal[:, 10 : 2 * DELAY + 40], gains[:, :2], 10)  # from sample 10 of a hop
     assert np.abs(part.numpy() - expected[:, 10:40]).max() < 1e-5
-
-
-def test_gains_of_1_change_nothing() -> None:
-    signal = torch.randn(1, 2 * DELAY + 5 * HOP)
-    assert torch.equal(apply_gains(signal, torch.zeros(1, 6, 20)), signal[:, DELAY:-DELAY])
-
-
-@pytest.mark.parametrize("past", [0.0, 0.3, 0.96])
-def test_the_average_equals_its_recursion(past: float) -> None:
-    values, expected = torch.randn(2, 300, 3), torch.randn(2, 3)
-    averages = _average(values, expected, past)
-    for frame in range(300):
-        expected = past * expected + (1.0 - past) * values[:, frame]
-        assert (averages[:, frame] - expected).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize(("attack", "release"), [(0.005, 0.1), (0.0, 0.01), (0.02, 0.5)])

@@ -13,8 +13,6 @@ from hlsim import Audiogram, Listener
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 
-EARS = ["N2", "N4", "S2"]
-
 
 def byrne_and_dillon(ear: Audiogram) -> list[float]:
     """Compute NAL-R at 250, 500, 1000, 2000, 4000 and 6000 Hz from the printed formula."""
@@ -27,19 +25,17 @@ def byrne_and_dillon(ear: Audiogram) -> list[float]:
     return [max(0.0, common + 0.31 * loss[hz] + bias[hz]) for hz in bias]
 
 
-@pytest.mark.parametrize("ear", EARS)
-def test_nalr_has_the_gains_of_the_published_formula(ear: str) -> None:
+@pytest.mark.parametrize("ear", ["N2", "N4", "S2"])
+def test_nalr_has_the_gains_of_the_published_formula_and_compression_about_the_same(
+    ear: str,
+) -> None:
     gains = NALR().gains(ear)
     at_formula = [FREQUENCIES.index(hz) for hz in (250, 500, 1000, 2000, 4000, 6000)]
     expected = byrne_and_dillon(Audiogram.standard(ear))
     assert gains[at_formula].tolist() == pytest.approx(expected, abs=1e-5)
     assert torch.equal(NALR(ear).gains(level=80.0), gains)
-
-
-@pytest.mark.parametrize("ear", EARS)
-def test_compression_has_about_nalrs_gains_for_average_speech(ear: str) -> None:
     # The level of noise varies, and compression follows its peaks, which lowers the gain.
-    below = NALR().gains(ear) - WDRC().gains(ear)
+    below = gains - WDRC().gains(ear)
     assert float(below.min()) > -0.5
     assert float(below.max()) < 2.5
 
@@ -51,16 +47,13 @@ def speech_shaped_noise(level: float) -> Tensor:
     return set_level(torch.tensor(np.fft.irfft(spectrum)).float(), level)
 
 
-def gain_in_bands(output: Tensor, sound: Tensor) -> Tensor:
-    """Measure the gain in thirds of an octave."""
-    powers = [torch.fft.rfft(signal[16000:]).abs().square() for signal in (output, sound)]
-    frequencies = torch.fft.rfftfreq(48000, 1.0 / 16000.0)
-    gains = []
-    for hz in FREQUENCIES:
-        in_band = (frequencies / hz).log2().abs() < 1.0 / 6.0
-        output_power, sound_power = (power[in_band].sum() for power in powers)
-        gains.append(10.0 * float((output_power / sound_power).log10()))
-    return torch.tensor(gains)
+def levels_in_thirds_of_octave(signal: Tensor) -> Tensor:
+    """Measure the levels after the first second in dB. Shape: (64000,) -> (8,)."""
+    powers = torch.fft.rfft(signal[16000:]).abs().square()
+    distance = (
+        torch.fft.rfftfreq(48000, 1.0 / 16000.0)[:, None] / torch.tensor(FREQUENCIES)
+    ).log2()
+    return 10.0 * (powers @ (distance.abs() < 1.0 / 6.0).float()).log10()
 
 
 @pytest.mark.parametrize("name", ["wdrc", "hearing-aid", "compensator-general"])
@@ -71,7 +64,8 @@ def test_gains_are_those_of_the_output_for_other_noise(name: str, level: float) 
     noise = speech_shaped_noise(level)
     with torch.no_grad():
         output = aid(noise, "N3", **options)
-    difference = aid.gains("N3", level) - gain_in_bands(output, noise)
+    gains = levels_in_thirds_of_octave(output) - levels_in_thirds_of_octave(noise)
+    difference = aid.gains("N3", level) - gains
     assert float(difference.abs().max()) < 1.0
 
 

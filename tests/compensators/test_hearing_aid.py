@@ -80,18 +80,10 @@ def test_a_stream_follows_a_slider_but_not_an_ear_that_is_written_into() -> None
             setattr(stream, name, 0.0)
 
 
-BAD_SLIDERS: list[Any] = [
-    1.5,
-    -0.1,
-    float("nan"),
-    "loud",
-    torch.tensor([0.0, 2.0]),
-    torch.ones(3),
-    torch.tensor(1j),
-]
+BAD_TENSORS = [torch.tensor([0.0, 2.0]), torch.ones(3), torch.tensor(1j)]
 
 
-@pytest.mark.parametrize("slider", BAD_SLIDERS, ids=str)
+@pytest.mark.parametrize("slider", [1.5, -0.1, float("nan"), "loud", *BAD_TENSORS], ids=str)
 def test_a_bad_slider_raises_value_error(slider: Any) -> None:
     aid: Any = varied_hearing_aid()
     with pytest.raises(ValueError):

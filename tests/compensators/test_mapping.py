@@ -1,13 +1,13 @@
 """The mapping compensator starts as NAL-R, corrects smoothly, and keeps tones and phase."""
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from compensators import NALR, MappingCompensator, MappingConfig
+from compensators import NALR, MappingCompensator
+from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_levels
@@ -20,23 +20,18 @@ def bands_db(waveform: Tensor) -> Tensor:
     return 10.0 * torch.log10((10.0 ** (band_levels(waveform, 16000) / 10.0)).mean(-2))
 
 
-@pytest.mark.parametrize("name", ["NH", "N2", "N4", "S2"])
-def test_starts_as_nalr(name: str, utterance: Tensor) -> None:
-    output, prescribed = MappingCompensator()(utterance, name), NALR(name)(utterance)
-    assert (bands_db(output) - bands_db(prescribed)).abs().max() < 1.0
-    assert (level_spl(output) - level_spl(prescribed)).abs() < 0.5
+def test_starts_as_nalr_or_as_a_share_of_the_loss(utterance: Tensor) -> None:
+    standard = torch.tensor([Audiogram.standard(name).thresholds for name in ("NH", "N2", "S2")])
+    ears = torch.cat((standard, draw_thresholds(8, torch.Generator().manual_seed(1))))
+    output, prescribed = MappingCompensator()(utterance, ears), NALR(ears)(utterance)
+    difference = (bands_db(output) - bands_db(prescribed)).abs()
+    assert difference.max() < 1.5
+    assert difference[:3].max() < 1.0
+    assert difference.mean() < 0.3
+    assert (level_spl(output) - level_spl(prescribed)).abs().max() < 0.5
     correlation = torch.fft.rfft(output, 48000) * torch.fft.rfft(utterance, 48000).conj()
-    assert int(torch.fft.irfft(correlation).argmax()) == 0  # aligned
+    assert not torch.fft.irfft(correlation).argmax(-1).any()  # aligned
 
-
-def test_starts_as_nalr_on_drawn_ears(utterance: Tensor) -> None:
-    ears = draw_thresholds(8, torch.Generator().manual_seed(1))
-    difference = bands_db(MappingCompensator()(utterance, ears)) - bands_db(NALR(ears)(utterance))
-    assert difference.abs().max() < 1.5
-    assert difference.abs().mean() < 0.3
-
-
-def test_starts_as_a_share_of_the_loss() -> None:
     noise, flat_loss = set_level(torch.randn(16000), 40.0), torch.full((8,), 50.0)
     output = MappingCompensator(replace(SMALL, start=0.4))(noise, flat_loss)
     torch.testing.assert_close(output, 10.0 * noise, rtol=1e-3, atol=1e-3 * float(noise.max()))
@@ -82,11 +77,6 @@ def test_other_rates_give_the_same_band(rate: int, utterance: Tensor) -> None:
     back = resample(output, rate, 16000)[: len(utterance)]
     difference = bands_db(back) - bands_db(varied_mapping()(utterance, EAR))
     assert difference[:22].abs().max() < 0.2
-
-
-def test_a_configuration_survives_json() -> None:
-    config = MappingConfig(start=0.4, stride=(1, 2), phase="predicted")
-    assert MappingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 def sideband_ratio(model: MappingCompensator) -> float:

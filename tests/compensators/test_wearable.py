@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from compensators import HearingAid
 from compensators.wearable import Wearable
 from hlsim import Audiogram, Listener
 from hlsim.calibration import level_spl, set_level
@@ -15,11 +14,11 @@ from hlsim.metrics.interaural import interaural_change
 from tests.compensators.aids import (
     EAR,
     WEARABLES,
+    assert_close,
     build_wearable,
     tone,
     varied_hearing_aid,
 )
-from tests.compensators.test_every_aid import assert_close
 
 both_aids = pytest.mark.parametrize("name", WEARABLES)
 
@@ -38,13 +37,11 @@ def test_the_look_ahead_is_the_latency(
 ) -> None:
     aid, signal = build_wearable(name, sample_rate=rate), noise[0, 2000:6000]
     assert aid.latency == latency
-    output, look_aheads = aid(signal, EAR), []
+    output = aid(signal, EAR)
     for place in torch.linspace(100, 3900, 60).long().tolist():
         other = torch.cat((signal[:place], 0.3 * torch.randn(len(signal) - place)))
         is_changed = (aid(other, EAR) - output).abs() > rounding
-        look_aheads.append(place - int(is_changed.nonzero()[0]))
-    assert min(look_aheads) > 0
-    assert max(look_aheads) <= latency
+        assert 0 < place - int(is_changed.nonzero()[0]) <= latency
 
 
 @both_aids
@@ -64,8 +61,8 @@ def test_chunks_of_any_size_equal_the_whole_signal(
         outputs.append(stream(chunk))
         assert outputs[-1].shape == chunk.shape
         place += chunk.shape[-1]
-        for bad_chunk in (torch.full((2, 10), torch.nan), noise[:, :0], torch.randn(3, 100)):
-            if len(outputs) == 1:
+        if len(outputs) == 1:
+            for bad_chunk in (torch.full((2, 10), torch.nan), noise[:, :0], torch.randn(3, 100)):
                 with pytest.raises(ValueError):
                     stream(bad_chunk)  # which changes nothing
     whole = aid(signal, ears)
@@ -107,31 +104,27 @@ def test_sound_above_8_khz_gets_the_gain_of_the_highest_band(name: str, rate: in
     assert level_spl(in_band) < level_spl(outputs[1][middle]) - 60.0
 
 
-@pytest.mark.parametrize("rate", [17000, 22050, 44100, 48000])
+@pytest.mark.parametrize("rate", [17000, 44100])
 def test_sliders_at_0_return_all_frequencies(rate: int) -> None:
     signal = set_level(torch.randn(2, rate + 37), 65.0)
     aid = varied_hearing_aid(sample_rate=rate)
     assert_close(aid(signal, EAR, noise_reduction=0.0, amplification=0.0), signal, 1e-6)
 
 
-@both_aids
-def test_a_quiet_room_stays_quiet(name: str) -> None:
-    aid = build_wearable(name)
-    gain = float(level_spl(aid(set_level(torch.randn(32000), 25.0), EAR)[8000:]) - 25.0)
-    assert gain < (3.0 if isinstance(aid, HearingAid) else 50.0)
+def test_a_quiet_room_stays_quiet() -> None:
+    output = varied_hearing_aid()(set_level(torch.randn(32000), 25.0), EAR)
+    assert float(level_spl(output[8000:]) - 25.0) < 3.0
 
 
 @both_aids
-@pytest.mark.parametrize("sound", ["slam", "click"])
-def test_the_gain_recovers_from_a_loud_sound_within_300_ms(name: str, sound: str) -> None:
+@pytest.mark.parametrize(
+    "sound", [set_level(tone(1000.0, 65.0, 0.05).sign(), 115.0), torch.tensor([20.0])], ids=len
+)
+def test_the_gain_recovers_from_a_loud_sound_within_300_ms(name: str, sound: Tensor) -> None:
     steady = set_level(torch.randn(24000), 60.0)
     struck = steady.clone()
-    if sound == "slam":
-        struck[8000:8800] = set_level(torch.randn(800), 115.0)
-    else:
-        struck[8000] = 20.0
-    aid = build_wearable(name)
-    end = (8800 if sound == "slam" else 8001) + 4800
+    struck[8000 : 8000 + len(sound)] = sound
+    aid, end = build_wearable(name), 8000 + len(sound) + 4800
     levels = [level_spl(aid(signal, EAR)[end : end + 1600]) for signal in (steady, struck)]
     assert (levels[0] - levels[1]).abs() < 3.0
 
