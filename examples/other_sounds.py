@@ -12,7 +12,7 @@ import torch
 
 from hlsim import MSBG, Audiogram, load_pretrained
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.aid_properties import tones
+from hlsim.evaluation.aid_properties import make_tones
 from hlsim.metrics.fidelity import snr_db
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "S1", "S2", "S3")
@@ -25,7 +25,7 @@ def make_row(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]
     """Return the cells of the table for an ear."""
     row = []
     for hertz in (LOW, HIGH):
-        sound = tones(hertz, LEVELS)
+        sound = make_tones(hertz, LEVELS)
         middle = slice(RATE // 2, -RATE // 2)
         expected = level_spl(exact(sound)[:, middle])
         levels = level_spl(network(sound, ear)[:, middle])

@@ -15,7 +15,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.aid_properties import gain_curves
+from hlsim.evaluation.aid_properties import measure_aids, measure_gain_curve
 from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS, ear_name
@@ -116,7 +116,7 @@ def demo(
     shortest = min(len(item.clean) for item in items)
     utterances = torch.stack([item.clean[:shortest] for item in items])
     aids = {NAL_R: nal_r, TRAINED: trained}
-    curves = gain_curves(aids, {ear: audiogram}, utterances, INPUT_LEVELS)
+    curves = measure_aids(aids, {ear: audiogram}, measure_gain_curve, utterances, INPUT_LEVELS)
     evaluation = replace(
         evaluation,
         comparisons=[comparison for comparison in comparisons if comparison.planned],

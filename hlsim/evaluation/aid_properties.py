@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,6 @@ from hlsim.evaluation.parallel import describe_error, one_thread
 from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
 from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.clips import Clips
-
-UTTERANCES = 6
-"""Number of clips of speech, of 3 s each, with which gains are measured."""
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """Frequencies of steady tones in Hz. All but 3001 Hz have the same phase in frames that are
@@ -65,12 +60,12 @@ Results = list[dict[str, Any]]
 def measure_aids(
     aids: Aids, ears: Ears, measure: Callable[..., dict[str, Any]], *arguments: Any
 ) -> Results:
-    """Measure a property of each aid for each ear.
+    """Measure a property of several hearing aids, each for several ears.
 
     Args:
-        aids: Aids by name.
+        aids: Hearing aids by name.
         ears: Audiograms by name.
-        measure: Function ``(aid, ear, *arguments) -> values by name``, such as ``steady_tones``.
+        measure: Function ``(aid, ear, *arguments) -> values by name``, such as ``measure_steady_tones``.
         arguments: Further arguments of this function.
 
     Returns:
@@ -93,81 +88,37 @@ def measure_aids(
     return results
 
 
-def insertion_gain(
+def measure_gain_curve(
     aid: Aid, ear: Audiogram, speech: Tensor, levels: Sequence[float]
-) -> list[list[float]]:
-    """Measure the gain of an aid for speech in dB, in 24 bands, at each of several levels.
+) -> dict[str, Any]:
+    """Measure the gain of a hearing aid for speech over frequency, at each of several levels.
 
     The gain of a band is the power of the output over that of the input, over all utterances. They
     contain the pauses of speech, because an aid may treat a steady noise as noise.
 
     Args:
-        aid: The aid.
+        aid: The hearing aid.
         ear: The audiogram.
         speech: Utterances at 16 kHz. Shape: (utterances, time).
         levels: Levels in dB SPL that every utterance has in turn.
 
     Returns:
-        Gains in dB. Shape: (levels, 24).
+        ``gain_db``, gains in dB of shape (levels, 24), and its axes ``levels`` (dB SPL) and
+        ``frequencies`` (centres of 24 bands of equal width on the ERB scale, in Hz).
 
     Raises:
         ValueError: The aid fails, or its output is not a waveform.
 
-    >>> gains = insertion_gain(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
-    >>> round(gains[0][0])
+    >>> curve = measure_gain_curve(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
+    >>> round(curve["gain_db"][0][0])
     20
     """
-    curves = []
+    gains = []
     for level in levels:
         signals = set_level(speech, level)
         aided = _aid_outputs(aid, signals, ear)
-        curves.append((10.0 * (_band_powers(aided) / _band_powers(signals)).log10()).tolist())
-    return curves
-
-
-def draw_utterances(speech: str | Path, seed: int) -> Tensor:
-    """Draw six clips of 3 s from a folder of speech, for ``gain_curves``.
-
-    Args:
-        speech: Folder of recordings.
-        seed: Seed of the draw.
-
-    Returns: The clips at 16 kHz. Shape: (6, 48000).
-
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
-    >>> draw_utterances(EXAMPLE_FILE.parent, seed=0).shape
-    torch.Size([6, 48000])
-    """
-    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
-    return clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
-
-
-def gain_curves(aids: Aids, ears: Ears, utterances: Tensor, levels: Sequence[float]) -> Results:
-    """Measure the gain for speech of each aid for each ear, see ``insertion_gain``.
-
-    Args:
-        aids: Aids by name.
-        ears: Audiograms by name.
-        utterances: Speech at 16 kHz. Shape: (utterances, time).
-        levels: Levels of the speech in dB SPL.
-
-    Returns:
-        One dictionary per ear and aid with the names ``aid`` and ``ear``, ``gain_db`` of shape
-        (levels, 24), and its axes ``levels`` (dB SPL) and ``frequencies`` (Hz).
-
-    Raises:
-        ValueError: An aid fails.
-
-    >>> aids, ears = {"unaided": lambda x, _: x}, {"NH": NORMAL}
-    >>> gain_curves(aids, ears, torch.randn(1, 16000), [65.0])[0]["gain_db"][0][:2]
-    [0.0, 0.0]
-    """
-    axes = {"levels": list(levels), "frequencies": band_centres().tolist()}
-
-    def measure(aid: Aid, ear: Audiogram) -> dict[str, Any]:
-        return {**axes, "gain_db": insertion_gain(aid, ear, utterances, levels)}
-
-    return measure_aids(aids, ears, measure)
+        gains.append((10.0 * (_band_powers(aided) / _band_powers(signals)).log10()).tolist())
+    return {"levels": list(levels), "frequencies": band_centres().tolist(), "gain_db": gains}
 
 
 def mean_band_levels(signals: Sequence[Tensor], *, hearing_level: bool = False) -> list[float]:
@@ -178,7 +129,7 @@ def mean_band_levels(signals: Sequence[Tensor], *, hearing_level: bool = False) 
         hearing_level: Return levels in dB HL, relative to the threshold of a normal ear, instead
             of dB SPL.
 
-    Returns: One level per band, for the frequencies of ``gain_curves``.
+    Returns: One level per band, for the frequencies of ``measure_gain_curve``.
 
     >>> len(mean_band_levels([torch.ones(16000)]))
     24
@@ -188,7 +139,7 @@ def mean_band_levels(signals: Sequence[Tensor], *, hearing_level: bool = False) 
     return (levels - threshold_in_quiet() if hearing_level else levels).tolist()
 
 
-def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
+def make_tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
     """Compute sines of 2 s at 16 kHz in pascals, for each frequency at each level.
 
     Args:
@@ -197,7 +148,7 @@ def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
 
     Returns: The sines; those of the first frequency come first. Shape: (hertz * levels, 32000).
 
-    >>> tones([250, 1000], [50.0, 65.0, 80.0]).shape
+    >>> make_tones([250, 1000], [50.0, 65.0, 80.0]).shape
     torch.Size([6, 32000])
     """
     samples = torch.arange(2 * NEURO_RATE)
@@ -226,13 +177,13 @@ def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     return 10.0 * ratio.log10()
 
 
-def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str, Any]:
-    """Measure loudness errors and distortion of an aid for steady tones of six frequencies.
+def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str, Any]:
+    """Measure loudness errors and distortion of a hearing aid for tones of six frequencies.
 
     Speech does not reveal an aid that removes steady sounds.
 
     Args:
-        aid: The aid.
+        aid: The hearing aid.
         ear: The audiogram.
         levels: Levels of the tones in dB SPL.
 
@@ -245,10 +196,10 @@ def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str,
     Raises:
         ValueError: The aid fails.
 
-    >>> steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
+    >>> measure_steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
     0.0
     """
-    sounds = tones(TONES, levels)
+    sounds = make_tones(TONES, levels)
     hertz = torch.tensor(TONES).repeat_interleave(len(levels))
     aided = _aid_outputs(aid, sounds, ear)
     errors = _perceived_level(aided, ear) - _perceived_level(sounds, NORMAL)
@@ -257,11 +208,11 @@ def steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str,
     return {"levels": list(levels), "frequencies": list(TONES), **by_level}
 
 
-def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
-    """Measure what decides whether an aid can be worn: look-ahead, gain for quiet noise, cost.
+def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
+    """Measure whether a hearing aid can be worn: its look-ahead, gain for quiet noise, and cost.
 
     Args:
-        aid: The aid.
+        aid: The hearing aid.
         ear: The audiogram.
         speech: Utterance of 3 s at 16 kHz. Shape: (48000,).
 
@@ -273,18 +224,18 @@ def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
     Raises:
         ValueError: The aid fails.
 
-    >>> wearing(lambda x, _: x, NORMAL, torch.randn(48000))["look_ahead_ms"]
+    >>> measure_wearability(lambda x, _: x, NORMAL, torch.randn(48000))["look_ahead_ms"]
     0.0
     """
     speech = set_level(speech, 65.0)
     noise = torch.randn(len(speech), generator=torch.Generator().manual_seed(0))
     other, *quiet = (set_level(noise, level) for level in (65.0, *QUIET_LEVELS))
-    signals = [*changed_signals(speech, other, CHANGE_POSITIONS), *quiet]
+    signals = [*make_changing_signals(speech, other, CHANGE_POSITIONS), *quiet]
     with one_thread():
         start = time.process_time()
         aided = _aid_outputs(aid, signals, ear)
         seconds = time.process_time() - start
-    samples = look_ahead(aided[: -len(quiet)], CHANGE_POSITIONS)
+    samples = count_look_ahead(aided[: -len(quiet)], CHANGE_POSITIONS)
     gains = [
         float(level_spl(after[_MIDDLE]) - level_spl(before[_MIDDLE]))
         for after, before in zip(aided[-len(quiet) :], quiet, strict=True)
@@ -296,8 +247,8 @@ def wearing(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:
     }
 
 
-def changed_signals(signal: Tensor, other: Tensor, positions: Iterable[int]) -> list[Tensor]:
-    """Return the inputs with which ``look_ahead`` is measured.
+def make_changing_signals(signal: Tensor, other: Tensor, positions: Iterable[int]) -> list[Tensor]:
+    """Return the inputs whose outputs ``count_look_ahead`` compares.
 
     Args:
         signal: First sound. Shape: (..., time).
@@ -306,27 +257,27 @@ def changed_signals(signal: Tensor, other: Tensor, positions: Iterable[int]) -> 
 
     Returns: The first sound alone, and for each position a signal that changes there.
 
-    >>> [signal.tolist() for signal in changed_signals(torch.zeros(3), torch.ones(3), [2])]
+    >>> [signal.tolist() for signal in make_changing_signals(torch.zeros(3), torch.ones(3), [2])]
     [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
     changed = [torch.cat((signal[..., :p], other[..., p:]), -1) for p in positions]
     return [signal, *changed]
 
 
-def look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
+def count_look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
     """Return by how many samples an output changes before its input becomes another sound.
 
     A change is a difference of more than 1e-4 of the output's peak.
 
     Args:
-        outputs: Outputs of an aid for the signals of ``changed_signals``, in the same order. Shape
+        outputs: Outputs of an aid for the signals of ``make_changing_signals``, in the same order. Shape
             of each: (..., time).
         positions: Samples from which on the second sound replaces the first one.
 
     Returns:
         The largest number of samples at any position, 0 for an aid without look-ahead.
 
-    >>> look_ahead(changed_signals(torch.ones(9), torch.zeros(9), [3]), [5])
+    >>> count_look_ahead(make_changing_signals(torch.ones(9), torch.zeros(9), [3]), [5])
     2
     """
     unchanged, *changed = outputs
@@ -343,7 +294,7 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
     """Return the outputs of an aid for several signals, which are processed one at a time.
 
     Args:
-        aid: The aid.
+        aid: The hearing aid.
         signals: Signals of equal length. Shape of each: (time,).
         ear: The audiogram.
 

@@ -1,6 +1,6 @@
-"""Aids of the studies' conditions: no aid, an equaliser, an aid at another's level, and your own.
+"""Hearing aids as conditions: no aid, an equaliser, an aid at another's level, and your own.
 
-An aid is a function or module ``(waveform, ear) -> waveform``.
+A hearing aid is a function or module ``(waveform, ear) -> waveform``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.aid_properties import insertion_gain
+from hlsim.evaluation.aid_properties import measure_gain_curve
 from hlsim.losses.band_levels import band_centres
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
@@ -54,7 +54,7 @@ class Unaided(nn.Module):
 
 
 class AtLevelOf(nn.Module):
-    """Aid whose output is scaled to the RMS level of another aid's output for the same input.
+    """Hearing aid whose output is scaled to the RMS level of another aid's output for the same input.
 
     HASPI rewards any gain, so that aids are compared at equal level.
 
@@ -76,7 +76,7 @@ class AtLevelOf(nn.Module):
 
 
 class EqualiserLike(nn.Module):
-    """Linear filter with the mean gain that an aid has for speech, measured for each ear.
+    """Linear filter with the mean gain that a hearing aid has for speech, measured for each ear.
 
     What the aid achieves beyond this filter is not due to gain.
 
@@ -107,8 +107,8 @@ class EqualiserLike(nn.Module):
 
     def gains_db(self, audiogram: Audiogram) -> list[float]:
         """Measure the aid's mean gain in dB in 24 bands, rounded to 0.1 dB."""
-        gains = insertion_gain(self.aid, audiogram, self.utterances, self.levels)
-        mean = np.mean(gains, 0).clip(_LOWEST_GAIN_DB, None)
+        curve = measure_gain_curve(self.aid, audiogram, self.utterances, self.levels)
+        mean = np.mean(curve["gain_db"], 0).clip(_LOWEST_GAIN_DB, None)
         return [round(gain, 1) for gain in mean.tolist()]
 
 
@@ -126,7 +126,7 @@ def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
 
 
 class PluginAid(nn.Module):
-    """Aid of a user for two ears, a function ``(waveform, listener, sample_rate) -> waveform``.
+    """Hearing aid of a user for two ears, a function ``(waveform, listener, sample_rate) -> waveform``.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -155,7 +155,7 @@ class PluginAid(nn.Module):
 
 
 class Enhanced(nn.Module):
-    """Aid that receives the output of an enhancer, which reduces noise, instead of the input.
+    """Hearing aid behind an enhancer, which reduces the noise of the aid's input.
 
     Args:
         enhancer: Enhancer of signals in pascals.
@@ -188,7 +188,7 @@ class Enhanced(nn.Module):
 
 
 def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
-    """Load functions ``(waveform, sample_rate) -> waveform`` that reduce noise before an aid.
+    """Load functions ``(waveform, sample_rate) -> waveform`` that reduce noise for hearing aids.
 
     They process signals in pascals with shape (..., time), and are tried on two seconds of speech.
 
@@ -219,7 +219,7 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
 
 
 def output_limit_spl(aid: Any) -> float | None:
-    """Return the peak in dB SPL that an aid promises not to exceed, or None without a promise.
+    """Return the peak in dB SPL that a hearing aid promises not to exceed, or None.
 
     It is the attribute ``limit_spl`` of the aid or of its ``config``.
 

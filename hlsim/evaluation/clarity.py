@@ -25,7 +25,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import set_level
-from hlsim.evaluation.aid_properties import changed_signals, look_ahead
+from hlsim.evaluation.aid_properties import count_look_ahead, make_changing_signals
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import find_measures
@@ -317,13 +317,13 @@ def _measure_look_ahead(conditions: Sequence[Condition], pair: _Pair) -> dict[st
         scene = set_level(torch.randn(scene.shape, generator=generator), 65.0)
     time = scene.shape[-1]
     positions = range(time // 4, time, max(1, time // (_CHANGES + 3)))[:_CHANGES]
-    signals = changed_signals(scene, other, positions)
+    signals = make_changing_signals(scene, other, positions)
     look_ahead_ms: dict[str, float | None] = {}
     for condition in conditions:
         assert condition.process is not None
         try:
             outputs = [condition.process(signal, pair.listener) for signal in signals]
-            look_ahead_ms[condition.name] = 1000.0 * look_ahead(outputs, positions) / rate
+            look_ahead_ms[condition.name] = 1000.0 * count_look_ahead(outputs, positions) / rate
         except ValueError:
             look_ahead_ms[condition.name] = None
     return look_ahead_ms
@@ -397,9 +397,7 @@ def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: A file is broken, or has another rate or length.
     """
-    mix = _read_channels(scene.mix, rate)
-    if len(mix) != 2:
-        raise ValueError(f"{scene.mix} has one channel; expected left and right")
+    mix = _read_channels(scene.mix, rate, [2])
     reference = _read_channels(scene.reference, rate)
     if scene.in_room is None:
         return mix, reference.expand(2, -1)
@@ -412,16 +410,16 @@ def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:
         for signal in (reference, in_room)
     )
     if not bool(power.all()):
-        raise ValueError(f"a channel of {scene.reference} is silent")
+        raise ValueError(f"expected sound in each channel of {scene.reference}, got silence")
     return mix, reference * (wanted / power).sqrt()
 
 
-def _read_channels(path: Path, rate: int) -> Tensor:
-    """Read a file of one or two channels. Shape: (channels, time)."""
+def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:
+    """Read a file with one of some numbers of channels. Shape: (channels, time)."""
     waveform, file_rate = read_audio(path)
-    if file_rate != rate or len(waveform) > 2:
+    if file_rate != rate or len(waveform) not in numbers:
         raise ValueError(
-            f"{path} has {len(waveform)} channels at {file_rate} Hz; expected left and right at "
-            f"the rate of the first scene, {rate} Hz"
+            f"{path}: expected {' or '.join(map(str, numbers))} channels at the sample rate of the "
+            f"first scene, {rate} Hz, got {len(waveform)} channels at {file_rate} Hz"
         )
     return waveform

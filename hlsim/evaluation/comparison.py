@@ -17,10 +17,10 @@ from hlsim.evaluation.statistics import PairedComparison, holm, paired_compariso
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-ALPHA = 0.05
+_ALPHA = 0.05
 """p value below which a change is called significant."""
 
-LEVEL_TOLERANCE_DB = 1.0
+_LEVEL_TOLERANCE_DB = 1.0
 """Change of the level in dB that is too small to explain a change of a score."""
 
 PlannedComparison = tuple[str, str, str]
@@ -84,7 +84,7 @@ class Comparison:
     @property
     def equal_level(self) -> bool:
         """Whether the mean levels are too close to explain a change of the score."""
-        return abs(self.level_change) < LEVEL_TOLERANCE_DB
+        return abs(self.level_change) < _LEVEL_TOLERANCE_DB
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes and the sentences for ``report.json``."""
@@ -111,7 +111,7 @@ class Comparison:
             verb = "scores" if all(significant) else "may score"
             verb += " higher than" if rises else " lower than"
         text = f"{subject or self.after} {verb} {rival or self.before}"
-        if abs(self.level_change) >= LEVEL_TOLERANCE_DB:
+        if abs(self.level_change) >= _LEVEL_TOLERANCE_DB:
             direction = "softer" if self.level_change > 0 else "louder"
             text += f", which is {abs(self.level_change):.1f} dB {direction}"
         facts = f"{_count_items(c.n)}, change {c.delta:+.3f}"
@@ -144,14 +144,14 @@ class Comparison:
         return ", ".join(stated)
 
     def _significant_tests(self) -> list[bool]:
-        """Return for each test that can decide whether its p value is below ``ALPHA``.
+        """Return for each test that can decide whether its p value is below ``_ALPHA``.
 
-        With few items, Wilcoxon's p exceeds ``ALPHA`` even if all pairs change alike.
+        With few items, Wilcoxon's p exceeds ``_ALPHA`` even if all pairs change alike.
         """
-        decisions = [] if self.p_t is None else [self.p_t < ALPHA]
+        decisions = [] if self.p_t is None else [self.p_t < _ALPHA]
         lowest_p = self.family * 2.0 ** (1 - (self.overall.n - self.overall.zeros))
-        if self.p_w is not None and (self.p_w < ALPHA or lowest_p < ALPHA):
-            decisions.append(self.p_w < ALPHA)
+        if self.p_w is not None and (self.p_w < _ALPHA or lowest_p < _ALPHA):
+            decisions.append(self.p_w < _ALPHA)
         return decisions
 
     def _describe_level(self) -> str:

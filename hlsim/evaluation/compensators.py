@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from compensators.nalr import NALR
@@ -14,11 +15,10 @@ from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.evaluation.aid_properties import (
-    draw_utterances,
-    gain_curves,
     measure_aids,
-    steady_tones,
-    wearing,
+    measure_gain_curve,
+    measure_steady_tones,
+    measure_wearability,
 )
 from hlsim.evaluation.aids import (
     AtLevelOf,
@@ -37,9 +37,13 @@ from hlsim.extras import require
 from hlsim.neuro import load_pretrained
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
+from hlsim.training.clips import Clips
 
 UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
 """Names of the conditions with which every compensator is compared."""
+
+UTTERANCES = 6
+"""Number of clips of speech, of 3 s each, with which gains are measured."""
 
 HARD = 0.6
 """Unaided HASPI below which an item belongs to the group ``hard``."""
@@ -99,7 +103,8 @@ def evaluate_compensators(
 
     Returns:
         The evaluation with the groups ``clean``, ``noisy`` and ``hard`` if they have items, and the
-        details ``gain_curves``, ``steady_tones`` and ``wearing``, see ``aid_properties``.
+        details ``gain_curves``, ``steady_tones`` and ``wearing``, see the
+        ``measure_`` functions of ``aid_properties``.
 
     Raises:
         ValueError: Data or settings are not valid, or no item has all its scores.
@@ -115,8 +120,9 @@ def evaluate_compensators(
         )
     for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")
-    ears, gain_curve_ears = _choose_ears(audiograms, audiogram, gain_ears)
-    utterances = draw_utterances(speech, seed)
+    ears, ears_of_aids = _choose_ears(audiograms, audiogram, gain_ears)
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
+    utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     enhancer_plugins = load_enhancers(enhancers)
     prescriptions = {NAL_R: NALR(sample_rate=NEURO_RATE), COMPRESSION: WDRC(sample_rate=NEURO_RATE)}
     aids = {name: aid.eval() for name, aid in {**prescriptions, **compensators}.items()}
@@ -127,9 +133,9 @@ def evaluate_compensators(
     with_unaided: dict[str, Any] = {UNAIDED: Unaided(), **wearable}
     # These measurements come first, because they reject an aid that fails.
     details = {
-        "gain_curves": gain_curves(aids, gain_curve_ears, utterances, levels),
-        "steady_tones": measure_aids(with_unaided, gain_curve_ears, steady_tones, levels),
-        "wearing": measure_aids(wearable, gain_curve_ears, wearing, utterances[0]),
+        "gain_curves": measure_aids(aids, ears_of_aids, measure_gain_curve, utterances, levels),
+        "steady_tones": measure_aids(with_unaided, ears_of_aids, measure_steady_tones, levels),
+        "wearing": measure_aids(wearable, ears_of_aids, measure_wearability, utterances[0]),
     }
     settings: dict[str, Any] = {
         "items": items,
@@ -164,20 +170,21 @@ def evaluate_compensators(
 def _choose_ears(
     audiograms: str | Path | None, audiogram: Audiogram | None, gain_ears: Sequence[str]
 ) -> tuple[list[tuple[str, Audiogram]], dict[str, Audiogram]]:
-    """Return the ears of the items and those of the gain curves, by name."""
+    """Return the ears of the items and those of gain curves and tones, by name."""
     if (audiograms is None) == (audiogram is None):
         raise ValueError(
-            "give either audiograms, a CSV file of ears, or audiogram, one ear for all"
+            "expected either audiograms, a CSV file of ears, or audiogram, one ear for all items; "
+            "pass one of the two"
         )
     if audiogram is None:
-        gain_curve_ears = {name: Audiogram.standard(name) for name in gain_ears}
+        ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
         ears = read_ears(audiograms)
     else:
-        gain_curve_ears = {ear_name(audiogram): audiogram}
-        ears = list(gain_curve_ears.items())
-    for ear in gain_curve_ears.values():
+        ears_of_aids = {ear_name(audiogram): audiogram}
+        ears = list(ears_of_aids.items())
+    for ear in ears_of_aids.values():
         as_thresholds(ear)  # rejects thresholds that a simulator does not accept
-    return ears, gain_curve_ears
+    return ears, ears_of_aids
 
 
 def _make_conditions(

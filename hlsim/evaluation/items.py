@@ -27,7 +27,7 @@ SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 INPUT_LEVELS = (50.0, 65.0, 80.0)
 """Levels of the clean speech in dB SPL that items for hearing aids have in turn."""
 
-SNRS_DB = (2.5, 7.5, 12.5, 17.5)
+_SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB that noisy items have in turn, as in the paper."""
 
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
@@ -251,7 +251,7 @@ def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float,
     """
     shift = 0 if len(levels) % 2 else turn // len(levels)
     number = ear + turn
-    return levels[number % len(levels)], SNRS_DB[(number + shift) % len(SNRS_DB)], shift
+    return levels[number % len(levels)], _SNRS_DB[(number + shift) % len(_SNRS_DB)], shift
 
 
 def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor, float]:

@@ -151,7 +151,9 @@ class Recording:
         path = self._output_file(condition)
         output, output_rate = self._read_channel(path)
         if output_rate != rate:
-            raise ValueError(f"{path} has {output_rate} Hz and {self.clean} {rate} Hz")
+            raise ValueError(
+                f"{path}: expected the sample rate of {self.clean}, {rate} Hz, got {output_rate} Hz"
+            )
         return output
 
     def _read_channel(self, path: Path) -> tuple[Tensor, int]:
@@ -160,7 +162,7 @@ class Recording:
         channels = len(waveform)
         if channels > 2 or (channels == 2 and not self.ear):
             raise ValueError(
-                f"{path} has {channels} channels; one ear needs 1, or 2 and the ear's name"
+                f"{path}: expected one channel, or two and the name of the ear, got {channels}"
             )
         channel = waveform[EARS.index(self.ear) if channels == 2 else 0]
         return channel.double(), rate
@@ -199,8 +201,11 @@ def haspi_report(
         before, after: Folders of the speech before and after a treatment, such as an aid, with
             files of the same names. Without ``before``, there are scores and no comparison.
         audiogram: The ear of all files.
-        audiograms: CSV file of ears instead, see ``read_folders`` and ``read_manifest``.
-        manifest: CSV file instead of the folders, see ``read_manifest``.
+        audiograms: CSV file of ears instead, with columns ``hl_250``, ``hl_500``, ... in dB HL and
+            the column ``file`` (for folders) or ``listener`` and ``ear`` (for a manifest).
+        manifest: CSV file instead of the folders, with one row per output file and the columns
+            ``condition``, ``clean`` and ``processed``, and optionally ``listener``, ``ear``,
+            ``item``, ``snr`` (dB), and ``hl_250``, ... or ``audiogram``.
         root: Folder to which the paths in the manifest are relative; by default the manifest's.
         measures: Names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
             ``stoi``, ``pesq`` or ``package.module:name``.
@@ -231,12 +236,15 @@ def haspi_report(
     """
     settings: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl, "seed": seed}
     if manifest and not any((clean, before, after)):
-        recordings = read_manifest(manifest, root, audiogram, audiograms, **settings)
+        recordings = _read_manifest(manifest, root, audiogram, audiograms, **settings)
     elif clean and after and not manifest:
         folders = {"before": before, "after": after}
-        recordings = read_folders(clean, folders, audiogram, audiograms, **settings)
+        recordings = _read_folders(clean, folders, audiogram, audiograms, **settings)
     else:
-        raise ValueError("give either the folders clean and after (and before), or a manifest")
+        raise ValueError(
+            "expected either the folders clean and after (and before), or a manifest; pass one of "
+            "the two"
+        )
     names = list(dict.fromkeys(name for r in recordings for name in r.outputs))
     if baseline is not None:
         if baseline not in names:
@@ -299,7 +307,7 @@ def score_recordings(
     scores = evaluation.scores
     if better_ear:
         ears = {"ears": evaluation}
-        evaluation = replace(evaluation, table=better_ears(evaluation.table, scores), groups=ears)
+        evaluation = replace(evaluation, table=_better_ears(evaluation.table, scores), groups=ears)
     planned = planned or [(scores[0], evaluation.names[0], evaluation.names[-1])]
     comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
     return replace(evaluation, comparisons=comparisons)
@@ -318,7 +326,7 @@ def _check_both_ears(recordings: Iterable[Recording]) -> None:
             )
 
 
-def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
+def _better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     """Keep the better ear's score of each utterance and condition.
 
     Each measure chooses its own better ear. Values that are not scores are those of the better ear
@@ -331,13 +339,6 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     Returns:
         The table with one row per utterance and condition. Facts of the item are those of the
         better ear in the last condition, whose number is in the column ``source``.
-
-    >>> import pandas
-    >>> facts = {"listener": "L1", "utterance": "s01", "snr": 5.0, "condition": "unaided"}
-    >>> ears = {"item": [0, 1], "ear": ["left", "right"], "haspi": [0.2, 0.7]}
-    >>> better = better_ears(pandas.DataFrame(ears).assign(**facts), ["haspi"])
-    >>> better["name"].tolist(), better["ear"].tolist(), better["haspi"].tolist()
-    (['L1 s01 5 dB'], ['right'], [0.7])
     """
     numbers = table.groupby(_UTTERANCE_COLUMNS, sort=False, dropna=False).ngroup()
     table = table.assign(source=table["item"], item=numbers)
@@ -355,7 +356,7 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     return best.assign(name=[_join_name(*utterance) for utterance in utterances])
 
 
-def read_folders(
+def _read_folders(
     clean: str | Path,
     folders: Mapping[str, str | Path | None],
     audiogram: Audiogram | None = None,
@@ -375,14 +376,12 @@ def read_folders(
 
     Raises:
         ValueError: The names differ, or a file has no audiogram.
-
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
-    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
-    >>> len(read_folders(folder, {"unaided": folder}, ear))
-    10
     """
     if (audiogram is None) == (audiograms is None):
-        raise ValueError("give either audiogram, the ear of all files, or audiograms, a CSV file")
+        raise ValueError(
+            "expected either audiogram, the ear of all files, or audiograms, a CSV file of ears; "
+            "pass one of the two"
+        )
     speech = _files_by_name(clean)
     outputs = {name: _files_by_name(folder) for name, folder in folders.items() if folder}
     for condition, files in outputs.items():
@@ -403,7 +402,7 @@ def read_folders(
     return recordings
 
 
-def read_manifest(
+def _read_manifest(
     path: str | Path,
     root: str | Path | None = None,
     audiogram: Audiogram | None = None,
@@ -424,18 +423,8 @@ def read_manifest(
 
     Raises:
         ValueError: A row is not valid; the message names its line.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     manifest = Path(folder) / "study.csv"
-    ...     _ = manifest.write_text("condition,clean,processed\\nunaided,a.wav,b.wav\\n")
-    ...     recordings = read_manifest(manifest, audiogram=Audiogram.standard("N3"))
-    >>> recordings[0].utterance, list(recordings[0].outputs)
-    ('a', ['unaided'])
     """
     folder = resolve_links(Path(path).parent if root is None else root)
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder; the paths of the manifest are relative to it")
     rows = read_table(path, "the manifest")
     columns = rows[0][1].keys() if rows else set()
     if not columns >= _REQUIRED_COLUMNS or columns & _LEVEL_COLUMNS:
@@ -479,13 +468,12 @@ def _read_row(
         audiogram = Audiogram.standard(row["audiogram"])
     else:
         audiogram = _find_ear(ears, listener, ear) or audiogram
-    if audiogram is None:
+    if audiogram is None or not condition:
         raise ValueError(
-            f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... "
-            "or a column audiogram, or name a file of audiograms"
+            f"expected a condition and an audiogram of listener {listener!r}, ear {ear!r}, got "
+            f"condition {condition!r} and {audiogram}; add columns hl_250, hl_500, ... or a column "
+            "audiogram, or name a file of audiograms"
         )
-    if not condition:
-        raise ValueError("the condition has no name")
     return Recording(
         utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
         clean=_path_below(root, row["clean"]),
@@ -515,7 +503,7 @@ def _path_below(root: Path, name: str) -> Path:
     """
     path = resolve_links(root / name)
     if not name or not path.is_relative_to(root):
-        raise ValueError(f"{name!r} is not a path below {root}")
+        raise ValueError(f"expected a path below {root}, got {name!r}")
     return path
 
 
@@ -523,7 +511,7 @@ def _ear_name(row: _Row) -> str:
     """Return ``"left"``, ``"right"`` or, if the row names no ear, an empty text."""
     text = row.get("ear", "").lower()
     if text and text not in EAR_NAMES:
-        raise ValueError(f"the ear is {text!r}; expected left or right")
+        raise ValueError(f"expected left or right in the column ear, got {text!r}")
     return EAR_NAMES.get(text, "")
 
 

@@ -12,13 +12,13 @@ from scipy import stats
 RESAMPLES = 9999
 """Number of bootstrap resamples."""
 
-DRAWN_INDICES = 1_000_000
+_DRAWN_INDICES = 1_000_000
 """Number of indices that the bootstrap draws at once, which limits its memory to about 16 MB."""
 
 MIN_ITEMS_FOR_INTERVAL = 6
 """Smallest number of items with an interval. With fewer, Wilcoxon's p cannot fall below 0.05."""
 
-RELATIVE_TOLERANCE = 1e-7
+_RELATIVE_TOLERANCE = 1e-7
 """Share of the largest score up to which differences count as zero, because scores are float32."""
 
 
@@ -94,7 +94,7 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
             f"{np.isfinite(second).sum()} of {len(second)} after"
         )
     largest = max(float(np.abs(first).max()), float(np.abs(second).max()))
-    tolerance = RELATIVE_TOLERANCE * largest
+    tolerance = _RELATIVE_TOLERANCE * largest
     difference = second - first
     difference = np.where(np.abs(difference) <= tolerance, 0.0, difference)
     n = len(first)
@@ -162,7 +162,7 @@ def bootstrap_interval(
     if n < MIN_ITEMS_FOR_INTERVAL:
         raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}")
     generator = np.random.default_rng(seed)
-    at_once = max(1, DRAWN_INDICES // n)
+    at_once = max(1, _DRAWN_INDICES // n)
     sizes = [min(at_once, resamples - start) for start in range(0, resamples, at_once)]
     means = [data[generator.integers(0, n, (size, n))].mean(-1) for size in sizes]
     expanded = stats.t.ppf(0.5 + 0.5 * confidence, n - 1) * math.sqrt(n / (n - 1))

@@ -338,7 +338,7 @@ def _measure_item(task: _Task) -> list[Values | str]:
                 values = measure.compute(*pairs[condition.name])
             for name, value in values.items():
                 if isinstance(value, float) and not math.isfinite(value):
-                    raise ValueError(f"{name} is {value}, not a finite number")
+                    raise ValueError(f"expected a finite number for {name}, got {value}")
             results.append(values)
         except Exception as error:
             results.append(describe_error(error))
@@ -349,7 +349,7 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     """Process an item, and cut the item and its output to the shorter length."""
     output = condition.output(item)
     if not output.isfinite().all():
-        raise ValueError("the output has samples that are NaN or infinite")
+        raise ValueError("expected finite samples of the output, got NaN or infinite ones")
     lengths = item.clean.shape[-1], output.shape[-1]
     samples = common_length(lengths, item.sample_rate, (item.name, f"its output {condition.name}"))
     if samples < lengths[0]:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hlsim.evaluation.aid_properties import QUIET_LEVELS, UTTERANCES
-from hlsim.evaluation.compensators import COMPRESSION, HARD, NAL_R, UNAIDED
+from hlsim.evaluation.aid_properties import QUIET_LEVELS
+from hlsim.evaluation.compensators import COMPRESSION, HARD, NAL_R, UNAIDED, UTTERANCES
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
 from hlsim.report.players import listening_sections

@@ -27,10 +27,10 @@ _MANY_POINTS = 2000
 INK = "#010203"
 """Stand-in for the colour of text, which is dark on a light page and light on a dark page."""
 
-COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
+_COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
 """Colours of lines and their labels, which can be read on white and on black."""
 
-_POINTS = {"alpha": 0.6, "linewidths": 0, "color": COLOURS[0]}
+_POINTS = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0]}
 """Style of the points of items."""
 
 UNAIDED_COLOUR = "#7d828a"
@@ -66,7 +66,7 @@ Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mappin
 """Horizontal and vertical values of a curve, and keyword arguments of matplotlib for its line."""
 
 
-def draw_picture(
+def _draw_picture(
     draw: Callable[[Any], None], title: str, *, alt: str = "", note: str = "", height: float = 3.2
 ) -> Picture:
     """Return an SVG picture for a page of what a function draws on matplotlib axes.
@@ -78,7 +78,7 @@ def draw_picture(
         note: Sentence below the picture.
         height: Height in inches.
 
-    >>> draw_picture(lambda axes: axes.plot([1, 2]), "A line").alt
+    >>> _draw_picture(lambda axes: axes.plot([1, 2]), "A line").alt
     'A line'
     """
     figures = require("matplotlib.figure", "eval")
@@ -106,7 +106,7 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     names = [condition.name for condition in conditions]
     aided = [c.name for c in conditions if c.of not in names and c.kind != "unaided"]
     colours: dict[str, Any] = dict.fromkeys(names, UNAIDED_COLOUR)
-    colours |= {name: COLOURS[place % len(COLOURS)] for place, name in enumerate(aided)}
+    colours |= {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(aided)}
     for condition in conditions:
         if condition.of in names:
             colours[condition.name] = (colours[condition.of], 0.6)
@@ -169,7 +169,7 @@ def scatter_picture(
         )
 
     note = "Each point is an item; both values are equal on the dashed line."
-    return draw_picture(draw, title, note=note)
+    return _draw_picture(draw, title, note=note)
 
 
 def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Picture:
@@ -198,7 +198,7 @@ def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Pi
     title = f"{measure} by {by}"
     alt = f"{title}; medians: {', '.join(medians)}."
     note = "Box: the middle half of the items and their median. Points: all items."
-    return draw_picture(draw, title, alt=alt, note=note, height=0.9 + 0.45 * len(values))
+    return _draw_picture(draw, title, alt=alt, note=note, height=0.9 + 0.45 * len(values))
 
 
 def curves_picture(
@@ -233,7 +233,7 @@ def curves_picture(
             frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
         _label_curves(axes)
 
-    return draw_picture(draw, title, note=note)
+    return _draw_picture(draw, title, note=note)
 
 
 def gain_picture(
@@ -243,7 +243,7 @@ def gain_picture(
 
     Args:
         title: Heading above the picture.
-        results: Results of ``gain_curves`` for each aid.
+        results: Gain curve of each aid with its name ``aid``, see ``measure_gain_curve``.
         colours: Colour of each aid.
     """
     curves = {}

@@ -14,7 +14,6 @@ from hlsim.report.results import (
     GAIN_NOTE,
     LEVEL,
     comparison_table,
-    mean_verdict,
     score_columns,
     score_details,
     split_rows,
@@ -50,7 +49,7 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     tables = [summary_table("Means of all items", split_rows(evaluation.table), columns)]
     texts = [GAIN_NOTE] if "haspi" in evaluation.scores else []
     headline = evaluation.headline
-    verdict = mean_verdict(evaluation)
+    verdict = _mean_verdict(evaluation)
     if headline is not None:
         verdict = headline.verdict()
         tables.append(comparison_table([headline], "The comparison of the first sentence"))
@@ -63,6 +62,17 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     ]
     measures = ", ".join(map(title_of, evaluation.scores))
     return Page(f"{', '.join(evaluation.names)}: {measures}", verdict, sections)
+
+
+def _mean_verdict(evaluation: Evaluation) -> str:
+    """Return the verdict of a page with a single condition: its mean score in a sentence."""
+    measure = evaluation.scores[0]
+    scored = evaluation.table.dropna(subset=[measure])
+    return (
+        f"{title_of(measure)} of the condition {evaluation.names[0]} is "
+        f"{scored[measure].mean():.3f} on average ({len(scored)} items, at "
+        f"{scored['level'].mean():.1f} dB SPL)."
+    )
 
 
 def _words(evaluation: Evaluation, c: Comparison) -> list[str]:

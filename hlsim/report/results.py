@@ -142,17 +142,6 @@ def loss_name(severity: str) -> str:
     return "no loss" if severity == "none" else f"{severity} loss"
 
 
-def mean_verdict(evaluation: Evaluation) -> str:
-    """Return the verdict of a page with a single condition: its mean score in a sentence."""
-    measure = evaluation.scores[0]
-    scored = evaluation.table.dropna(subset=[measure])
-    return (
-        f"{title_of(measure)} of the condition {evaluation.names[0]} is "
-        f"{scored[measure].mean():.3f} on average ({len(scored)} items, at "
-        f"{scored['level'].mean():.1f} dB SPL)."
-    )
-
-
 def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparisons") -> Table:
     """Return a table with one row per comparison, with the p values that the sentences state."""
     rows = []

@@ -6,7 +6,6 @@ import csv
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -80,12 +79,6 @@ def make_scenes(folder: Path, rate: int) -> Path:
 @pytest.fixture(scope="module")
 def clarity(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_scenes(tmp_path_factory.mktemp("clarity"), LOW_RATE)
-
-
-@pytest.fixture
-def scenes(clarity: Path, tmp_path: Path) -> Path:
-    """Return a copy of the scenes, to be changed."""
-    return Path(shutil.copytree(clarity / "scenes", tmp_path / "scenes"))
 
 
 def options(folder: Path, **changes: Any) -> dict[str, Any]:
@@ -279,44 +272,28 @@ def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Ten
     return torch.cat((waveform, waveform[:, :220]), -1)
 
 
-def longer_by_one_second(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
-    return torch.cat((waveform, waveform), -1)
-
-
-def mono(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
-    return waveform[0]
-
-
 @pytest.mark.usefixtures("quick_scores")
 @pytest.mark.filterwarnings("ignore:.*both are cut", "ignore:scores with")
 @pytest.mark.parametrize(
-    ("aid", "kind", "change", "message"),
+    ("kind", "change", "message"),
     [
-        (longer_by_220, "mix", 0, ""),
-        (longer_by_one_second, "mix", 0, "a difference of 1 s"),
-        (mono, "mix", 0, "expected a real tensor of shape"),
-        (longer_by_220, "target_anechoic", 100, ""),
-        (longer_by_220, "target", -100, ""),
-        (longer_by_220, "mix", -100, ""),
-        (longer_by_220, "target", -8000, "S06002_target_CH1.wav 8000"),
-        (longer_by_220, "mix", -8000, "16000 samples"),
+        ("mix", 0, ""),
+        ("target_anechoic", 100, ""),
+        ("target", -100, ""),
+        ("mix", -100, ""),
+        ("target", -8000, "S06002_target_CH1.wav 8000"),
+        ("mix", -8000, "16000 samples"),
     ],
 )
 def test_lengths_may_differ_by_a_tenth_of_a_second(
-    clarity: Path,
-    tmp_path: Path,
-    scenes: Path,
-    aid: Callable[..., Tensor],
-    kind: str,
-    change: int,
-    message: str,
+    clarity: Path, tmp_path: Path, kind: str, change: int, message: str
 ) -> None:
+    scenes = Path(shutil.copytree(clarity / "scenes", tmp_path / "scenes"))
     path = scenes / f"S06002_{kind}_CH1.wav"
     signal, _ = soundfile.read(path)
     write(path, np.concatenate((signal, signal))[: len(signal) + change])
     settings = options(clarity, scenes=scenes, stride=2)
-    aids = {"mine": f"{__name__}:{aid.__name__}"}
-    study = evaluate_scenes(aids, out=tmp_path / "out", **settings)
+    study = evaluate_scenes({"mine": f"{__name__}:longer_by_220"}, out=tmp_path, **settings)
     assert study.failures.empty == (not message)
     assert message in scenes_page(study, listen=0).markdown()
 
@@ -334,27 +311,19 @@ def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(
 
 
 @pytest.mark.usefixtures("quick_scores")
-@pytest.mark.parametrize("is_csv", [False, True])
-def test_only_listeners_that_are_used_are_validated(
-    clarity: Path, tmp_path: Path, is_csv: bool
-) -> None:
-    listeners = tmp_path / f"listeners.{'csv' if is_csv else 'json'}"
-    if is_csv:
-        rows = ["listener,ear,hl_500,hl_4000", "L0001,left,20,NR", "L0002,left,20,40"]
-        listeners.write_text("\n".join([*rows, "L0002,right,20,40"]))
-    else:
-        broken = {"audiogram_cfs": CFS, "audiogram_levels_l": [10]}
-        listeners.write_text(json.dumps(LISTENERS | {"L0001": broken}))
-    pairs = tmp_path / "pairs.json"
+def test_only_listeners_that_are_used_are_validated(clarity: Path, tmp_path: Path) -> None:
+    listeners, pairs = tmp_path / "listeners.json", tmp_path / "pairs.json"
+    broken = {"audiogram_cfs": CFS, "audiogram_levels_l": [10]}
+    listeners.write_text(json.dumps(LISTENERS | {"L0001": broken}))
     settings = options(clarity, listeners=listeners, scenes_listeners=pairs)
     pairs.write_text('{"S06001": ["L0002"]}')
     assert len(evaluate_scenes({}, out=tmp_path / "out", **settings).table) == 2
     pairs.write_text('{"S06001": ["L0001"]}')
-    with pytest.raises(ValueError, match=r"L0001|line 2"):
+    with pytest.raises(ValueError, match="L0001"):
         evaluate_scenes({}, out=tmp_path / "out", **settings)
 
 
-LEFT_EAR_ONLY = "listener,ear,hl_500,hl_4000\nL0001,left,20,40\n"
+LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
 
 
 @pytest.mark.parametrize(
@@ -367,7 +336,7 @@ LEFT_EAR_ONLY = "listener,ear,hl_500,hl_4000\nL0001,left,20,40\n"
         ({"scenes_listeners": {"S9": ["L0001"]}}, "scene 'S9'"),
         ({"scenes_listeners": []}, "cannot be read"),
         ({"scenes_listeners": {}}, "no scene has a listener"),
-        ({"listeners": LEFT_EAR_ONLY}, "a right ear of listener 'L0001'"),
+        ({"listeners": LEFT_EAR_ONLY}, "L0001"),
         ({"listeners": {"../x": LISTENERS["L0001"]}}, "a name that a file can have"),
         ({"stride": 0}, "got 0"),
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
@@ -382,13 +351,9 @@ def test_invalid_settings_are_rejected_before_anything_is_written(
     settings = {**options(clarity), "aids": {"aid": "wdrc"}, **change}
     if "listeners" in change:
         settings["scenes_listeners"] = None
-    for name in ("listeners", "scenes_listeners"):
-        if isinstance(settings[name], dict | list):
-            (tmp_path / f"{name}.json").write_text(json.dumps(settings[name]))
-            settings[name] = tmp_path / f"{name}.json"
-        elif settings[name] == LEFT_EAR_ONLY:
-            (tmp_path / "ears.csv").write_text(LEFT_EAR_ONLY)
-            settings[name] = tmp_path / "ears.csv"
+    for name in change.keys() & {"listeners", "scenes_listeners"}:
+        settings[name] = tmp_path / f"{name}.json"
+        settings[name].write_text(json.dumps(change[name]))
     settings["scenes"] = clarity / settings["scenes"]
     with pytest.raises(ValueError, match=message):
         evaluate_scenes(settings.pop("aids"), out=tmp_path / "out", **settings)

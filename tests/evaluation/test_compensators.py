@@ -168,7 +168,6 @@ def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
         {"levels": (130.0,)},
         {"audiogram": Audiogram.standard("N7")},
         {"enhancers": ["no_such:module"]},
-        {"measures": ["loudness"]},
     ],
 )
 def test_invalid_settings_are_rejected(options: dict[str, Any], changes: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
-from hlsim.evaluation.recordings import read_manifest
+from hlsim.evaluation.recordings import _read_manifest
 from hlsim.evaluation.store import content_hash
 from hlsim.metrics import haspi
 
@@ -174,22 +174,22 @@ def test_the_better_ear_counts(corpus: Path) -> None:
     ("old", "new", "message"),
     [
         ("5,N3\n", "5,N9\n", "line 2: .*N9"),
-        ("A,before", "../A,before", "line 2: .*not a path below"),
+        ("A,before", "../A,before", "line 2: expected a path below"),
         ("L1,left,aided", "L1,left,unaided", "line 3: expected one row of L1 left"),
-        ("L1,left,aided", "L1,left,", "line 3: the condition has no name"),
+        ("L1,left,aided", "L1,left,", "line 3: expected a condition"),
         ("N3\nL2", "N4\nL2", "line 3: .*with the same audiogram"),
         (",5,N3", ",x,N3", "line 2: .*'x'"),
-        ("L1,left", "L1,top", "line 2: the ear is 'top'"),
+        ("L1,left", "L1,top", "line 2: .*got 'top'"),
         ("condition,", "treatment,", "expected rows with the columns clean, condition"),
         (",snr,", ",spl,", "the level as an option"),
-        (",audiogram\n", ",ear_of\n", "line 2: no audiogram of listener 'L1'"),
+        (",audiogram\n", ",ear_of\n", "line 2: .*an audiogram of listener 'L1'"),
     ],
 )
 def test_the_line_of_an_invalid_row_is_named(
     corpus: Path, old: str, new: str, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
+        _read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
 
 
 def test_audiograms_may_be_in_a_file_of_their_own(corpus: Path) -> None:
@@ -207,20 +207,19 @@ def test_audiograms_may_be_in_a_file_of_their_own(corpus: Path) -> None:
     manifest = write_manifest(corpus, MANIFEST.replace(",audiogram\n", ",remark\n"))
     names = HEADER.replace("file", "listener,ear")
     ears.write_text(f"{names}\nL1,left,{LEVELS}\nL2,,{LEVELS}\nL3,left,{unused}\n")
-    assert {r.audiogram for r in read_manifest(manifest, audiograms=ears)} == {N4}
+    assert {r.audiogram for r in _read_manifest(manifest, audiograms=ears)} == {N4}
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "give either audiogram"),
+        ({}, "expected either audiogram"),
         ({"audiogram": N4, "full_scale_spl": 300.0}, "full_scale_spl"),
-        ({"audiogram": N4, "measures": ("loudness",)}, "got loudness"),
         ({"audiogram": N4, "measures": ()}, "got none"),
         ({"audiogram": N4, "baseline": "unaided"}, "no condition 'unaided'"),
         ({"audiogram": N4, "better_ear": True}, "one left and one right ear"),
-        ({"audiogram": N4, "after": None}, "give either the folders"),
-        ({"audiogram": N4, "manifest": "study.csv"}, "give either the folders"),
+        ({"audiogram": N4, "after": None}, "expected either the folders"),
+        ({"audiogram": N4, "manifest": "study.csv"}, "expected either the folders"),
     ],
 )
 def test_invalid_settings_are_rejected_before_scoring(

@@ -34,16 +34,6 @@ def test_equals_scipy(n: int) -> None:
     assert (c.ci_low is None) == (n < MIN_ITEMS_FOR_INTERVAL)
 
 
-def test_by_hand() -> None:
-    c = paired_comparison([0.0, 0.25, 0.75, 0.125], [0.25, 0.75, 0.5, 0.875])
-    # The differences 0.25, 0.5, -0.25, 0.75 have the mean 0.3125, and their squares about it sum to
-    # 0.546875. Their ranks are 1.5, 3, -1.5, 4.
-    deviation = math.sqrt(0.546875 / 3)
-    assert (c.delta, c.w) == (0.3125, 1.5)
-    assert c.cohens_d == pytest.approx(0.3125 / deviation, rel=1e-14)
-    assert c.t == pytest.approx(2 * 0.3125 / deviation, rel=1e-14)
-
-
 def test_the_papers_row() -> None:
     """HASPI 0.428 to 0.616, |t| = 24.113, n = 1648, d = 0.594: d is t / sqrt(n)."""
     n, t = 1648, 24.113

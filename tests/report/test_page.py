@@ -36,17 +36,11 @@ def page() -> str:
         Sound("wav", 60.0, b"RIFF123"),
     ]
     inner = Section("Inner", player=Player({NASTY: sounds}, 1.0, 90.0, NASTY))
+    table = Table(NASTY, ("a", NASTY), [(NASTY, "1"), ("b", "2")])
+    pictures = [Picture(b"\x89PNG", NASTY, NASTY), Picture(b"<svg/>", "svg")]
     sections = [
-        Section(
-            NASTY,
-            paragraphs=[NASTY],
-            tables=[Table(NASTY, ("a", NASTY), [(NASTY, "1"), ("b", "2")])],
-        ),
-        Section(
-            "Pictures",
-            pictures=[Picture(b"\x89PNG", NASTY, NASTY), Picture(b"<svg/>", "svg")],
-            sections=[inner],
-        ),
+        Section(NASTY, paragraphs=[NASTY], tables=[table]),
+        Section("Pictures", pictures=pictures, sections=[inner]),
         Section("Folded", paragraphs=["text"], folded=True),
     ]
     return Page(NASTY, f"{NASTY} (5 items).", sections, [Card(NASTY, "1", NASTY, [])]).html()
@@ -69,19 +63,12 @@ def test_everything_is_escaped_and_closed() -> None:
 def test_nothing_is_fetched() -> None:
     parser = Balance()
     parser.feed(page())
-    addresses = [
-        value for _, name, value in parser.attributes if name in ("src", "href", "data", "srcset")
-    ]
+    names = ("src", "href", "data", "srcset")
+    addresses = [value for _, name, value in parser.attributes if name in names]
     assert len(addresses) == 2 + 3 + 1 + 1 + 3  # pictures, sounds, icon, skip link, sections
     assert all(value.startswith(("data:", "#")) for value in addresses)
-    assert {
-        value.split(";")[0] for value in addresses if value.startswith("data:") and ";" in value
-    } == {
-        "data:image/png",
-        "data:image/svg+xml",
-        "data:audio/flac",
-        "data:audio/wav",
-    }
+    types = {value[5:].split(";")[0] for value in addresses if ";" in value}
+    assert types == {"image/png", "image/svg+xml", "audio/flac", "audio/wav"}
     assert "url(" not in page() and "@import" not in page()
     assert "default-src 'none'" in page()
 
@@ -101,3 +88,9 @@ def test_numbers_at_the_end_of_the_verdict_are_printed_smaller() -> None:
     verdict = "Mine (new) is better: 0.9 <small>(10 items; p = 0.01).</small>"
     assert f'<p class="verdict">{verdict}</p>' in text
     assert '<p class="verdict">' not in Page("Aids", "", []).html()
+
+
+def test_columns_without_values_are_left_out_of_a_table() -> None:
+    rows = [{"Aid": "a", "SNR": "n/a", "n": "n/a"}, {"Aid": "b", "SNR": "n/a", "n": "1"}]
+    table = Table.from_rows("Scores", rows)
+    assert (table.header, table.rows) == (["Aid", "n"], [["a", "n/a"], ["b", "1"]])
