@@ -65,7 +65,8 @@ def measure_aids(
     Args:
         aids: Hearing aids by name.
         ears: Audiograms by name.
-        measure: Function ``(aid, ear, *arguments) -> values by name``, such as ``measure_steady_tones``.
+        measure: Function ``(aid, ear, *arguments) -> values by name``, such as
+            ``measure_steady_tones``.
         arguments: Further arguments of this function.
 
     Returns:
@@ -270,8 +271,8 @@ def count_look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int
     A change is a difference of more than 1e-4 of the output's peak.
 
     Args:
-        outputs: Outputs of an aid for the signals of ``make_changing_signals``, in the same order. Shape
-            of each: (..., time).
+        outputs: Outputs of an aid for the signals of ``make_changing_signals``, in the same order.
+            Shape of each: (..., time).
         positions: Samples from which on the second sound replaces the first one.
 
     Returns:

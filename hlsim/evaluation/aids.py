@@ -19,7 +19,6 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
 from hlsim.dsp.fir import filter_without_delay
-from hlsim.dsp.resample import resample
 from hlsim.evaluation.aid_properties import measure_gain_curve
 from hlsim.losses.band_levels import band_centres
 from hlsim.neuro.config import NEURO_RATE
@@ -32,7 +31,7 @@ _LOWEST_GAIN_DB = -100.0
 """Lowest gain of an equaliser in dB."""
 
 _SPEECH_FILE = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
-"""Speech on which an enhancer is tried when it is loaded."""
+"""Speech at 16 kHz on which an enhancer is tried when it is loaded."""
 
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
 """Gains in dB that equalisers have measured in this process, by equaliser and ear.
@@ -54,7 +53,7 @@ class Unaided(nn.Module):
 
 
 class AtLevelOf(nn.Module):
-    """Hearing aid whose output is scaled to the RMS level of another aid's output for the same input.
+    """Hearing aid whose output is scaled to the RMS level of another aid's output.
 
     HASPI rewards any gain, so that aids are compared at equal level.
 
@@ -126,7 +125,9 @@ def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
 
 
 class PluginAid(nn.Module):
-    """Hearing aid of a user for two ears, a function ``(waveform, listener, sample_rate) -> waveform``.
+    """Hearing aid of a user for two ears.
+
+    It is a function ``(waveform, listener, sample_rate) -> waveform``.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -205,8 +206,7 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
     >>> load_enhancers([])
     {}
     """
-    recording, rate = read_audio(_SPEECH_FILE)
-    speech = set_level(resample(recording[0], rate, NEURO_RATE)[: 2 * NEURO_RATE], 65.0)
+    speech = set_level(read_audio(_SPEECH_FILE)[0][0, : 2 * NEURO_RATE], 65.0)
     enhancers: dict[str, WaveformPlugin] = {}
     for name in names:
         enhancer = WaveformPlugin(name, "enhancer")

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from hlsim import MSBG, Audiogram, load_pretrained
 from hlsim.cli.main import main
-from hlsim.evaluation import Evaluation
 from hlsim.evaluation.simulators import agreement, evaluate_simulators, example_item
 from hlsim.metrics.fidelity import snr_db, stoi
 from hlsim.report.results import ordered
@@ -58,10 +57,6 @@ def test_values_failures_and_page(options: dict[str, Any]) -> None:
     failed = (table.condition == "none") & exceeds
     assert failed.any() and table.failure[failed].str.contains("NaN").all()
     assert table.snr[failed].isna().all() and table.snr[~failed].notna().all()
-    check_page(study)
-
-
-def check_page(study: Evaluation) -> None:
     (comparison,) = study.groups["as-is"].comparisons
     assert (comparison.before, comparison.after) == ("light", "none")
     assert comparison.overall.delta < -10.0

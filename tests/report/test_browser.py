@@ -119,15 +119,20 @@ def wait_until(page: Any, expression: str, argument: Any = None) -> None:
     raise AssertionError(f"not true after 5 s: {expression}")
 
 
-def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(report: Any) -> None:
-    widths = report.evaluate(
+def check_images(page: Any, count: int) -> None:
+    """Check that a page has some number of images, and that nothing is wider than the screen."""
+    widths = page.evaluate(
         "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
     )
-    # four of the study, and for each of two items a normal ear and three conditions
-    assert len(widths) == 4 + 2 * 4
-    inner = report.viewport_size["width"]
+    inner = page.viewport_size["width"]
+    assert len(widths) == count
     assert all(natural > 0 and 150 < width <= inner for natural, width in widths)
-    assert report.evaluate("document.documentElement.scrollWidth") <= inner
+    assert page.evaluate("document.documentElement.scrollWidth") <= inner
+
+
+def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(report: Any) -> None:
+    # four of the study, and for each of two items a normal ear and three conditions
+    check_images(report, 4 + 2 * 4)
     # the first table is whole even on a phone
     assert report.locator(".scroll").first.evaluate("e => e.scrollWidth <= e.clientWidth")
     size = "parseFloat(getComputedStyle(document.querySelector('td')).fontSize)"
@@ -164,13 +169,7 @@ def test_the_page_of_the_demo_shows_its_numbers_verdict_and_sounds(
     window: Any, demo_file: Path
 ) -> None:
     window.goto(demo_file.as_uri())
-    inner = window.viewport_size["width"]
-    assert window.evaluate("document.documentElement.scrollWidth") <= inner
-    widths = window.evaluate(
-        "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
-    )
-    assert len(widths) == 3 + 7, "pictures, and spectrograms of all sounds"
-    assert all(natural > 0 and 150 < width <= inner for natural, width in widths)
+    check_images(window, 3 + 7)  # pictures, and spectrograms of all sounds
     titles = window.locator(".card .name").all_inner_texts()
     assert titles == ["HASPI", "Words understood", "Loudness error"]
     bars = window.locator(".card .bar").evaluate_all(
@@ -240,27 +239,19 @@ def test_a_much_louder_sound_lowers_the_volume(players: Any) -> None:
     assert state["volumes"][0] < start and state["lowered"] == ""
 
 
-def test_only_one_player_of_a_page_plays(report: Any) -> None:
-    for number in range(2):
-        report.locator(".play").nth(number).click()
-        wait_until(
-            report, "n => document.querySelectorAll('.play')[n].textContent === 'Pause'", number
-        )
-    first, second = report.evaluate(STATE)
-    assert first["playing"] == [] and second["playing"] == [0]
-    assert report.locator(".hlsim-player audio[controls]").count() == 0
-
-
 def test_players_of_several_notebook_cells_work_on_one_page(window: Any, tmp_path: Path) -> None:
     speech = example_speech()[:16000]
     cells = [listen(original=speech, soft=0.5 * speech)._repr_html_() for _ in range(2)]
     path = tmp_path / "notebook.html"
     path.write_text("<!doctype html><link rel=icon href=data:,>" + "".join(cells), encoding="utf-8")
     window.goto(path.as_uri())
-    window.locator(".select").nth(3).click()
-    wait_until(window, "document.querySelectorAll('audio')[3].currentTime > 0.1")
+    for number in (0, 3):
+        window.locator(".select").nth(number).click()
+        script = "n => document.querySelectorAll('audio')[n].currentTime > 0.1"
+        wait_until(window, script, number)
     first, second = window.evaluate(STATE)
-    assert (first["playing"], second["playing"]) == ([], [1])
+    assert (first["playing"], second["playing"]) == ([], [1]), "only one player plays"
+    assert window.locator("audio[controls]").count() == 0
     window.locator(".volume").first.fill("0.25")
     first, second = window.evaluate(STATE)
     assert first["volumes"] == second["volumes"] == [0.25, 0.25]
