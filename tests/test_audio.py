@@ -76,40 +76,26 @@ def test_a_truncated_file_is_read_with_a_warning(tmp_path: Path) -> None:
 
 
 def bad_file(kind: str, path: Path) -> None:
-    samples, rate = noise(100), 16000
-    match kind:
-        case "folder":
-            path.mkdir()
-            return
-        case "text":
-            path.write_text("This is no recording.\n" * 20)
-            return
-        case "no bytes":
-            path.touch()
-            return
-        case "empty":
-            samples = samples[:0]
-        case "silent":
-            samples *= 0
-        case "NaN":
-            samples[50] = np.nan
-        case "infinite":
-            samples[50] = -np.inf
-        case "slow":
-            rate = 8000
-        case "fast":
-            rate = 96000
-    soundfile.write(path, samples, rate, subtype="FLOAT")
+    if kind == "folder":
+        path.mkdir()
+    elif kind in ("text", "no_bytes"):
+        path.write_text("This is no recording.\n" * 20 if kind == "text" else "")
+    else:
+        changed = {"NaN": np.nan, "infinite": -np.inf}
+        samples = noise({"empty": 0}.get(kind, 100)) * (kind != "silent")
+        samples[50:51] = changed.get(kind, samples[50:51])
+        rate = {"slow": 8000, "fast": 96000}.get(kind, 16000)
+        soundfile.write(path, samples, rate, subtype="FLOAT")
 
 
-@pytest.mark.parametrize(
-    "kind",
-    "missing folder text no_bytes empty silent NaN infinite slow fast".split(),
-)
+BAD_FILES = "missing folder text no_bytes empty silent NaN infinite slow fast".split()
+
+
+@pytest.mark.parametrize("kind", BAD_FILES)
 def test_a_bad_file_is_named_first(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "bad.wav"
     if kind != "missing":
-        bad_file(kind.replace("_", " "), path)
+        bad_file(kind, path)
     with pytest.raises(ValueError, match=f"^{path}: ") as caught:
         read_audio(path)
     assert "\n" not in str(caught.value)

@@ -105,10 +105,8 @@ def test_standard_audiograms_have_a_name_in_place_of_a_file() -> None:
 
 
 def test_the_example_table_has_the_standard_ears_that_simulators_take() -> None:
-    rows = read_audiograms(EARS_FILE, simulated=True)
-    assert [ear for _, ear in rows] == [
-        ear for _, ear in read_audiograms("standard", simulated=True)
-    ]
+    tables = [read_audiograms(path, simulated=True) for path in (EARS_FILE, "standard")]
+    assert [ear for _, ear in tables[0]] == [ear for _, ear in tables[1]]
 
 
 def test_one_ear_is_read_by_any_name_in_its_row(tmp_path: Path) -> None:

@@ -24,52 +24,38 @@ def test_thresholds_for_a_simulator() -> None:
     assert as_thresholds(torch.full((8,), 100)).dtype == torch.float32
 
 
-@pytest.mark.parametrize(
-    "audiogram",
-    [
-        torch.zeros(7),
-        torch.tensor(3.0),
-        torch.tensor([0.0] * 7 + [float("nan")]),
-        torch.tensor([0.0] * 7 + [100.1]),
-        torch.tensor([[0.0] * 8, [-10.1] * 8]),
-        torch.zeros(0, 8),
-        torch.zeros(8, dtype=torch.bool),
-        torch.zeros(8, dtype=torch.complex64),
-        Audiogram.standard("N7"),
-        [0.0] * 7,
-        [[0.0] * 7],
-        (torch.zeros(7), torch.zeros(7)),
-        [],
-        "loud",
-        {"levels": [torch.zeros(2)] * 8},
-        {"hl_250": "20"},
-        None,
-        np.zeros(7),
-    ],
-)
+NO_EARS: list[Any] = [
+    *(torch.zeros(7), torch.tensor(3.0), torch.tensor([0.0] * 7 + [float("nan")])),
+    *(torch.tensor([0.0] * 7 + [100.1]), torch.tensor([[0.0] * 8, [-10.1] * 8])),
+    *(torch.zeros(0, 8), torch.zeros(8, dtype=torch.bool), torch.zeros(8, dtype=torch.complex64)),
+    *([0.0] * 7, [[0.0] * 7], (torch.zeros(7), torch.zeros(7)), [], "loud", "N7", np.zeros(7)),
+    *({"levels": [torch.zeros(2)] * 8}, {"hl_250": "20"}, None),
+]
+
+
+@pytest.mark.parametrize("audiogram", NO_EARS)
 def test_values_that_are_not_ears_for_a_simulator_are_rejected(audiogram: Any) -> None:
     with pytest.raises(ValueError):
         as_thresholds(audiogram)
+
+
+@pytest.mark.parametrize("ear", [[20.0] * 6, np.zeros(6), torch.zeros(2, 6)])
+def test_another_number_of_thresholds_suggests_a_dictionary(ear: Any) -> None:
+    with pytest.raises(ValueError, match=r"pass a dictionary .* such as \{500: 20, 4000: 50\}"):
+        as_thresholds(ear)
 
 
 def test_mono_items_have_one_ear_each() -> None:
     """Waveforms of shape (batch, 1, time) take thresholds of shape (batch, 8) everywhere."""
     waveform = 0.02 * torch.randn(2, 1, 16000)
     ears = torch.tensor([20.0, 60.0]).unsqueeze(-1).expand(2, 8)
-    for module in (
-        MSBG(sample_rate=16000),
-        NALR(),
-        load_compensator("hearing-aid"),
-        load_pretrained("neuro-msbg"),
-    ):
+    mono = waveform[:, 0]
+    for module in (MSBG(), NALR(), load_compensator("hearing-aid"), load_pretrained("neuro-msbg")):
         output = module(waveform, ears)
         assert output.shape == waveform.shape
-        expected = module(waveform[:, 0], ears)
-        torch.testing.assert_close(output[:, 0], expected, atol=1e-6, rtol=1e-4)
-    assert MSBG(sample_rate=16000)(waveform, ears[:, None].expand(2, 3, 8)).shape == (2, 3, 16000)
-    assert torch.equal(
-        haspi(waveform, waveform, ears), haspi(waveform[:, 0], waveform[:, 0], ears)[:, None]
-    )
+        torch.testing.assert_close(output[:, 0], module(mono, ears), atol=1e-6, rtol=1e-4)
+    assert MSBG()(waveform, ears[:, None].expand(2, 3, 8)).shape == (2, 3, 16000)
+    assert torch.equal(haspi(waveform, waveform, ears), haspi(mono, mono, ears)[:, None])
     with pytest.raises(ValueError):
         haspi(waveform, waveform, ears.expand(2, 2, 8))
 
@@ -98,16 +84,13 @@ def test_thresholds_keep_their_gradient() -> None:
 def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
     hz = (0.0, 250.0, 251.0, 750.0, 1000.0, 2500.0, 7000.0, 8000.0, 12000.0)
     levels = draw_thresholds(6).reshape(2, 3, 8)
-    expected = np.array(
-        [np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()]
-    )
+    rows = levels.reshape(6, 8).double().numpy()
+    expected = np.array([np.interp(hz, FREQUENCIES, ear) for ear in rows])
     for ears in (levels, levels.double()):
         interpolated = interpolate(ears, hz)
         assert interpolated.shape == (2, 3, 9) and interpolated.dtype == ears.dtype
         np.testing.assert_allclose(interpolated.reshape(6, 9).numpy(), expected, rtol=1e-5)
-    np.testing.assert_allclose(
-        levels.reshape(6, 8).double().numpy() @ interpolation_weights(hz), expected, rtol=1e-12
-    )
+    np.testing.assert_allclose(rows @ interpolation_weights(hz), expected, rtol=1e-12)
 
 
 def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:

@@ -10,6 +10,8 @@ from torch import Tensor
 from hlsim.calibration import dbfs
 from hlsim.dsp.active_level import active_level_db
 
+Speech = list[tuple[Tensor, int]]
+
 
 def tone(seconds: float, rate: int = 16000) -> Tensor:
     return torch.sin(2 * torch.pi * 400 * torch.arange(round(seconds * rate)) / rate)
@@ -30,9 +32,7 @@ def test_pauses_do_not_count(pause: float) -> None:
     assert float(dbfs(signal)) < level - 3.0
 
 
-def test_a_gain_changes_the_level_and_silence_hardly_does(
-    speech: list[tuple[Tensor, int]],
-) -> None:
+def test_a_gain_changes_the_level_and_silence_hardly_does(speech: Speech) -> None:
     for waveform, rate in speech:
         level = active_level_db(waveform[0], rate)
         for gain in (1e-3, 20.0):
@@ -43,9 +43,7 @@ def test_a_gain_changes_the_level_and_silence_hardly_does(
         assert active_level_db(padded, rate) == pytest.approx(level, abs=0.3)
 
 
-def test_level_is_close_to_pyclaritys_level_of_active_frames(
-    speech: list[tuple[Tensor, int]],
-) -> None:
+def test_level_is_close_to_pyclaritys(speech: Speech) -> None:
     """pyclarity counts frames within 12 dB of the mean level, and so fewer soft frames."""
     utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
     for waveform, rate in speech:
@@ -54,10 +52,7 @@ def test_level_is_close_to_pyclaritys_level_of_active_frames(
         assert -0.5 < difference < 1.5
 
 
-@pytest.mark.parametrize(
-    "waveform",
-    [np.zeros(100), np.zeros(0), np.ones((2, 100))],
-)
+@pytest.mark.parametrize("waveform", [np.zeros(100), np.zeros(0), np.ones((2, 100))])
 def test_silence_and_several_channels_are_rejected(waveform: np.ndarray) -> None:
     with pytest.raises(ValueError):
         active_level_db(waveform, 16000)

@@ -11,13 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.dsp.resample import (
-    KAISER_BETA,
-    ROLLOFF,
-    ZERO_CROSSINGS,
-    resample,
-    sinc_kernel,
-)
+from hlsim.dsp.resample import KAISER_BETA, ROLLOFF, ZERO_CROSSINGS, resample, sinc_kernel
 
 RATES = [
     *((16000, 44100), (44100, 16000), (48000, 16000)),
@@ -67,15 +61,9 @@ def test_stop_band_keeps_69_db_where_convolutions_round_to_tf32() -> None:
 def test_equals_torchaudio(source: int, target: int, dtype: torch.dtype) -> None:
     torchaudio = pytest.importorskip("torchaudio.functional", exc_type=Exception)
     waveform = torch.randn(2, 1500, dtype=dtype)
-    theirs = torchaudio.resample(
-        waveform,
-        source,
-        target,
-        lowpass_filter_width=ZERO_CROSSINGS,
-        rolloff=ROLLOFF,
-        resampling_method="sinc_interp_kaiser",
-        beta=KAISER_BETA,
-    )
+    options = {"lowpass_filter_width": ZERO_CROSSINGS, "rolloff": ROLLOFF, "beta": KAISER_BETA}
+    method = "sinc_interp_kaiser"
+    theirs = torchaudio.resample(waveform, source, target, resampling_method=method, **options)
     torch.testing.assert_close(resample(waveform, source, target), theirs, rtol=0, atol=1e-6)
 
 
@@ -125,9 +113,8 @@ def test_low_precision_is_as_close_as_its_type_allows(dtype: torch.dtype) -> Non
 
 def test_resampling_compiles_to_one_graph() -> None:
     waveform = torch.randn(2, 500)
-    compiled = torch.compile(
-        lambda x: resample(x, 44100, 16000), backend="aot_eager", fullgraph=True
-    )
+    options = {"backend": "aot_eager", "fullgraph": True}
+    compiled = torch.compile(lambda x: resample(x, 44100, 16000), **options)
     torch.testing.assert_close(compiled(waveform), resample(waveform, 44100, 16000))
 
 

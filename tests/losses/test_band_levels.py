@@ -10,7 +10,6 @@ from scipy.signal import get_window
 from torch import Tensor
 
 from hlsim.calibration import set_level
-from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import (
     BANDS,
     DEPTH,
@@ -68,14 +67,6 @@ def test_tone_has_its_level(rate: int) -> None:
         torch.testing.assert_close(total, torch.full_like(total, 65.0), atol=0.05, rtol=0.0)
         loudest = int(levels.mean(0).argmax())
         assert band_edges()[loudest] <= frequency <= band_edges()[loudest + 1]
-
-
-def test_levels_do_not_depend_on_the_rate(voice: Tensor) -> None:
-    # The ends ring, and the slope of the resampling filter is next to the highest band.
-    low = band_levels(voice, RATE)[:, 2:-2, :-1]
-    high = band_levels(resample(voice, RATE, 48000), 48000)[:, 2:-2, :-1]
-    audible = low > 20.0
-    torch.testing.assert_close(high[audible], low[audible], atol=0.1, rtol=0.0)
 
 
 def test_leading_dimensions_and_silence() -> None:
@@ -148,15 +139,3 @@ def test_noise_in_a_pause_costs(voice: Tensor) -> None:
     (gradient,) = torch.autograd.grad(value.sum(), noisy)
     assert float((gradient * noise).sum()) > 0.0  # less noise is better
     assert max(loss(clean + noise * 1e-3, clean)) < 0.1
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_of_silence_are_finite(voice: Tensor, dtype: torch.dtype) -> None:
-    clean = voice.to(dtype)
-    silence = torch.zeros_like(clean)
-    pairs = [(silence, clean), (clean, silence), (silence, silence), (clean * 1e-12, clean)]
-    for perceived, normal in [*pairs, (silence[:, :10], clean[:, :10])]:
-        leaf = perceived.clone().requires_grad_()
-        value = band_level_loss(leaf, normal, RATE)
-        (gradient,) = torch.autograd.grad(value.sum(), leaf)
-        assert bool(value.isfinite().all()) and bool(gradient.isfinite().all())

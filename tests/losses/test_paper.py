@@ -12,11 +12,8 @@ from scipy.signal import get_window
 from torch import Tensor
 
 from hlsim.dsp.resample import resample
-from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import (
-    DEFAULT_WEIGHTS as PARTS,
-)
-from hlsim.losses.paper import (
+    DEFAULT_WEIGHTS,
     PAPER_STFT,
     anti_wrap,
     complex_loss,
@@ -53,7 +50,7 @@ def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def test_parts_equal_the_equations_in_numpy(pair: tuple[Tensor, Tensor]) -> None:
     parts = paper_parts(*pair)
-    assert parts.keys() == PARTS.keys()
+    assert parts.keys() == DEFAULT_WEIGHTS.keys()
     for item, (estimate, target) in enumerate(zip(*pair, strict=True)):
         first, second = spectrum(estimate), spectrum(target)
         error = np.angle(first) - np.angle(second)
@@ -67,12 +64,6 @@ def test_parts_equal_the_equations_in_numpy(pair: tuple[Tensor, Tensor]) -> None
         }
         for name, value in expected.items():
             assert float(parts[name][item]) == pytest.approx(value, rel=1e-6), name
-
-
-def test_total_is_the_weighted_sum_of_the_parts(pair: tuple[Tensor, Tensor]) -> None:
-    parts = paper_parts(*pair)
-    total = weighted_sum(parts, {"magnitude": 2.0, "phase": 0.0, "time": 0.5})
-    torch.testing.assert_close(total, 2.0 * parts["magnitude"] + 0.5 * parts["time"])
 
 
 def test_anti_wrap_is_the_distance_to_the_nearest_turn() -> None:
@@ -112,23 +103,14 @@ def test_gradients_of_time_criteria_are_exact(pair: tuple[Tensor, Tensor]) -> No
         assert torch.autograd.gradcheck(loss, (estimate.requires_grad_(),))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_of_silence_are_finite(pair: tuple[Tensor, Tensor], dtype: torch.dtype) -> None:
-    clean, silence = pair[1].to(dtype), torch.zeros(2, 8000, dtype=dtype)
-    criteria: list[Criterion] = [
-        *(
-            lambda estimate, target, name=name: paper_parts(estimate, target)[name]
-            for name in PARTS
-        ),
-        noise_to_signal_db,
-        log_spectral_distance_db,
-    ]
+@pytest.mark.parametrize("criterion", [noise_to_signal_db, log_spectral_distance_db])
+def test_gradients_of_silence_are_finite(pair: tuple[Tensor, Tensor], criterion: Criterion) -> None:
+    clean, silence = pair[1], torch.zeros_like(pair[1])
     for estimate, target in ((silence, clean), (silence, silence), (clean, silence)):
-        for criterion in criteria:
-            leaf = estimate.clone().requires_grad_()
-            value = criterion(leaf, target)
-            (gradient,) = torch.autograd.grad(value.sum(), leaf)
-            assert bool(value.isfinite().all()) and bool(gradient.isfinite().all())
+        leaf = estimate.float().requires_grad_()
+        value = criterion(leaf, target.float())
+        (gradient,) = torch.autograd.grad(value.sum(), leaf)
+        assert bool(value.isfinite().all()) and bool(gradient.isfinite().all())
 
 
 @pytest.mark.parametrize("pause_spl", [-20.0, 0.0, 20.0])
@@ -171,5 +153,5 @@ def test_parts_are_similar_at_another_rate(pair: tuple[Tensor, Tensor]) -> None:
     waves = [resample(waveform, 16000, 15000) for waveform in pair]  # without the band near 8 kHz
     low = paper_parts(*(resample(wave, 15000, 16000) for wave in waves), PAPER_STFT, 181)
     high = paper_parts(*(resample(wave, 15000, 48000) for wave in waves), paper_stft(48000), 181)
-    for name in PARTS:
+    for name in DEFAULT_WEIGHTS:
         torch.testing.assert_close(high[name], low[name], rtol=0.01, atol=0.0)

@@ -28,15 +28,9 @@ def test_impulse_method_gives_pyclaritys_delay(pyclarity: PyclarityOutputs) -> N
     for name in ("NH", "N2", "S1"):
         ear = Audiogram.standard(name)
         expected = pyclarity(f"delay of {name}", impulse_delay_of_reference, ear)
-        simulator = MSBG(
-            ear, sample_rate=44100, aligned=False, full_scale_spl=120.0, rescale_active=True
-        )
+        options = {"sample_rate": 44100, "aligned": False, "rescale_active": True}
+        simulator = MSBG(ear, full_scale_spl=120.0, **options)
         assert estimate_delay(simulator, level=120.0) == expected
-
-
-def test_aligned_output_has_almost_no_delay() -> None:
-    for name in ("NH", "N2"):
-        assert abs(estimate_delay(MSBG(Audiogram.standard(name), sample_rate=44100))) <= 80
 
 
 @pytest.mark.parametrize(

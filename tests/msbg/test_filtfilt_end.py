@@ -53,12 +53,5 @@ def test_correction_has_the_shape_of_the_envelopes_and_stops_behind_the_end(leng
     assert not bool(corrections[..., last_step + AHEAD + 1 :].any())
 
 
-def test_silence_adds_nothing_and_gradients_are_exact() -> None:
-    bank = BANKS["severe"]
-    assert not bool(end_correction(torch.zeros(bank.channels, 320), bank, 100).any())
-    channels = torch.randn(bank.channels, 320, dtype=torch.float64)
-    channels[:, 100:] = 0.0
-    channels.requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda c: end_correction(c, bank, 100), channels, fast_mode=True
-    )
+def test_silence_adds_nothing() -> None:
+    assert not bool(end_correction(torch.zeros(19, 320), BANKS["severe"], 100).any())
