@@ -6,7 +6,7 @@ This command writes the page with them into a folder:
     python docs/listening_page.py build/listen
     python -m http.server --directory build/listen
 
-It needs npm, and hlsim with the extra ``dev``.
+It needs npm, and hlsim with the extra ``docs``.
 """
 
 import hashlib
@@ -156,4 +156,7 @@ if __name__ == "__main__":
     if missing is not None:
         sys.exit(f"{missing} is not installed; install it to build the listening page")
     shutil.copytree(PAGE, sys.argv[1], dirs_exist_ok=True)
+    html = Path(sys.argv[1], "index.html")
+    alone = re.sub(r'<a href="\.\./[^>]*>[^<]*</a>\.?', "", html.read_text(encoding="utf-8"))
+    html.write_text(alone, encoding="utf-8")  # without links to the rest of the site
     shutil.copytree(build_assets(), Path(sys.argv[1], "assets"), dirs_exist_ok=True)

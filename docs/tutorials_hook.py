@@ -1,6 +1,8 @@
 """Hook of mkdocs that runs the notebooks in docs/tutorials and shows them as pages, with sounds and pictures.
 
-Executed notebooks are kept in build/tutorials, so that ``mkdocs serve`` runs only those whose cells have changed.
+Executed notebooks are kept in build/tutorials, and are run again if their cells have changed. ``mkdocs serve`` runs
+none, so that it starts soon: it shows the outputs that are stored. ``TUTORIALS=run mkdocs serve`` runs them, and
+``TUTORIALS=plain mkdocs build`` builds the site without running them.
 """
 
 import base64
@@ -25,12 +27,20 @@ SUFFIXES = {"audio/flac": "flac", "image/svg+xml": "svg", "image/png": "png"}
 _DATA_URI = re.compile(r'src="data:([\w/+]+);base64,([^"]+)"')
 
 
+def on_startup(command: str, dirty: bool) -> None:
+    """Run no notebook before the site is served, unless that was asked for."""
+    if command == "serve":
+        os.environ.setdefault("TUTORIALS", "plain")
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add a page for each notebook. With ``TUTORIALS=plain`` in the environment nothing is run."""
+    """Add a page for each notebook."""
     for path in sorted(TUTORIALS.glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
-        if os.environ.get("TUTORIALS") != "plain":
-            notebook = execute(notebook, EXECUTED / path.name)
+        executed = find_executed(notebook, EXECUTED / path.name)
+        if executed is None and os.environ.get("TUTORIALS") != "plain":
+            executed = execute(notebook, EXECUTED / path.name)
+        notebook = executed or notebook
         page, media = render(notebook, path.name)
         source = f"tutorials/{path.stem}"
         files.append(File.generated(config, f"{source}.md", content=page))
@@ -39,12 +49,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def find_executed(notebook: NotebookNode, stored: Path) -> NotebookNode | None:
+    """Return the stored notebook with outputs, if it has the same cells, or else None."""
+    if not stored.is_file():
+        return None
+    executed = nbformat.read(stored, as_version=4)
+    is_same = [cell.source for cell in executed.cells] == [cell.source for cell in notebook.cells]
+    return executed if is_same else None
+
+
 def execute(notebook: NotebookNode, stored: Path) -> NotebookNode:
-    """Run a notebook, unless an executed one with the same cells is stored."""
-    if stored.is_file():
-        executed = nbformat.read(stored, as_version=4)
-        if [cell.source for cell in executed.cells] == [cell.source for cell in notebook.cells]:
-            return executed
+    """Run a notebook, and store it with its outputs."""
     client = NotebookClient(notebook, timeout=TIMEOUT_SECONDS, kernel_name="python3")
     executed = client.execute(cwd=str(ROOT))
     stored.parent.mkdir(parents=True, exist_ok=True)

@@ -36,15 +36,6 @@ const yOf = (level) => TOP + ((BOTTOM - TOP) * (level - LOWEST)) / (HIGHEST - LO
 const levelAt = (y) => LOWEST + ((y - TOP) * (HIGHEST - LOWEST)) / (BOTTOM - TOP);
 const clamp = (level) => Math.min(HIGHEST, Math.max(LOWEST, level));
 
-export function describeLevel(level) {
-  if (level <= 20) return "normal";
-  if (level <= 40) return "mild loss";
-  if (level <= 55) return "moderate loss";
-  if (level <= 70) return "moderately severe loss";
-  if (level <= 90) return "severe loss";
-  return "profound loss";
-}
-
 export function parseThresholds(text) {
   const values = text.split(",").map((part) => (part.trim() === "" ? NaN : Number(part)));
   const valid = values.length === FREQUENCIES.length && values.every((value) => value >= LOWEST && value <= HIGHEST);
@@ -93,7 +84,7 @@ export class AudiogramChart extends EventTarget {
         element("text", { class: "tick", x: LEFT - 7, y: y + 4, "text-anchor": "end" }, level),
       );
     }
-    for (const hertz of [250, 500, 1000, 2000, 4000, 8000]) {
+    for (const hertz of FREQUENCIES) {
       const x = xOf(hertz);
       const label = hertz < 1000 ? hertz : `${hertz / 1000}k`;
       this.svg.append(
@@ -194,7 +185,7 @@ export class AudiogramChart extends EventTarget {
       const level = this.thresholds[i];
       point.setAttribute("transform", `translate(${places[i]})`);
       point.setAttribute("aria-valuenow", level);
-      point.setAttribute("aria-valuetext", `${level} decibels, ${describeLevel(level)}`);
+      point.setAttribute("aria-valuetext", `${level} decibels`);
     });
   }
 }

@@ -47,7 +47,10 @@ let live = null;
 
 function thresholdsOfLink() {
   const text = new URLSearchParams(location.hash.slice(1)).get("ear");
-  return text === null ? null : parseThresholds(text);
+  if (text === null) return null;
+  const thresholds = parseThresholds(text);
+  if (thresholds === null) $("shared").textContent = `The link has no ear: it needs eight levels from ${LOWEST} to ${HIGHEST} dB HL.`;
+  return thresholds;
 }
 
 function link() {
@@ -169,10 +172,10 @@ async function press(name) {
   await stopLive();
   if (player.playing === name) player.stop();
   else if (player.has(name)) player.play(name);
-  else {
+  else if (cards[name].getAttribute("aria-busy") === "true") {
     wanted = name;
     say("The sound comes as soon as it is computed …");
-  }
+  } else say("There is no sound to play. Choose one, or reload the page.");
 }
 
 player.onchange = () => {
@@ -214,6 +217,7 @@ async function setSound(promise, name) {
   } catch (error) {
     write("source-name", error.message);
     say("");
+    if (state.sound === null) for (const card of Object.values(cards)) card.setAttribute("aria-busy", "false");
   }
 }
 
@@ -286,11 +290,13 @@ function say(text) {
 
 function fail(error) {
   say(error.message);
+  for (const card of Object.values(cards)) card.setAttribute("aria-busy", "false");
   document.body.dataset.failed = error.message;
 }
 
 // Start
 
+$("unbuilt").remove(); // It is for browsers that cannot load this file.
 for (const key of Object.keys(STANDARD)) {
   const button = document.createElement("button");
   button.type = "button";
@@ -311,6 +317,7 @@ FREQUENCIES.forEach((hertz, i) => {
     thresholds[i] = Math.round(Math.min(HIGHEST, Math.max(LOWEST, level)));
     input.value = thresholds[i];
     setEar(thresholds);
+    if (thresholds[i] !== Math.round(level)) $("shared").textContent = `Levels go from ${LOWEST} to ${HIGHEST} dB HL.`;
   });
   label.append(input);
   $("numbers").append(label);
@@ -322,6 +329,11 @@ player.setRepeat($("repeat").checked);
 showEar();
 
 chart.addEventListener("change", changeEar);
+addEventListener("keydown", (event) => {
+  const name = Object.keys(VERSIONS)[Number(event.key) - 1];
+  const typing = event.target.closest?.("input, select") || event.ctrlKey || event.altKey || event.metaKey;
+  if (name !== undefined && !typing) press(name);
+});
 addEventListener("hashchange", () => {
   const thresholds = thresholdsOfLink();
   if (thresholds !== null && `${thresholds}` !== `${chart.thresholds}`) setEar(thresholds);
