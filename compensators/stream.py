@@ -12,6 +12,7 @@ from compensators.wearable import Slider, Wearable, check_slider
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_waveform
+from hlsim.torchtools import flatten_items
 
 
 class Stream:
@@ -79,8 +80,7 @@ class Stream:
         with torch.no_grad(), torch.autocast(chunk.device.type, enabled=False):
             self._prepare(chunk)
             gain = gain_to_pascals(self._aid.full_scale_spl)
-            samples = chunk.to(self._fitted.dtype).expand(*self._batch, -1)
-            samples = samples.reshape(len(self._fitted), -1) * gain
+            samples = flatten_items(chunk, self._batch, self._fitted.dtype) * gain
             outputs = []
             while samples.shape[-1] > 0:
                 time = samples.shape[-1]

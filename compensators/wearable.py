@@ -30,7 +30,6 @@ from compensators.filter_bank import (
 )
 from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
-from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     check_two_channels,
@@ -39,6 +38,7 @@ from hlsim.audiogram.thresholds import (
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform
 from hlsim.dsp.resample import resample
+from hlsim.torchtools import flatten_items
 
 Slider = float | Tensor
 """Value of a slider, 0 to 1: one number, or one value per item."""
@@ -234,7 +234,7 @@ class Wearable(MeasuredAid):
             settings = self.stack_sliders(sliders, batch, fitted)
             time = waveform.shape[-1]
             gain = gain_to_pascals(self.full_scale_spl)
-            signals = waveform.to(fitted.dtype).expand(*batch, -1).reshape(-1, time) * gain
+            signals = flatten_items(waveform, batch, fitted.dtype) * gain
             low = resample(signals, self.sample_rate, RATE)
             state = self.initial_state(settings)
             outputs = []
@@ -276,8 +276,8 @@ class Wearable(MeasuredAid):
             check_two_channels(waveform)
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         own_dtype = next((weight.dtype for weight in self.parameters()), waveform.dtype)
-        ears = thresholds.to(torch.promote_types(own_dtype, torch.float32))
-        return batch, self.fit(ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES)))
+        dtype = torch.promote_types(own_dtype, torch.float32)
+        return batch, self.fit(flatten_items(thresholds, batch, dtype))
 
     def stack_sliders(self, sliders: Sequence[Slider], batch: torch.Size, like: Tensor) -> Tensor:
         """Convert the sliders of a call to one row per item.

@@ -140,6 +140,22 @@ def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     return tensor.to(device=device, dtype=dtype.to_complex() if tensor.is_complex() else dtype)
 
 
+def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tensor:
+    """Return one row per item of a batch, in a precision.
+
+    Args:
+        tensor: Values whose leading dimensions broadcast to ``batch``, (..., n).
+        batch: Leading dimensions, whose product is the number of items.
+        dtype: Type of the result.
+
+    Shape: (..., n) -> (items, n).
+
+    >>> flatten_items(torch.zeros(3, 1, 8), torch.Size([3, 2]), torch.float64).shape
+    torch.Size([6, 8])
+    """
+    return tensor.to(dtype).expand(*batch, -1).reshape(-1, tensor.shape[-1])
+
+
 def _constant(
     function: Callable[..., Any],
     arguments: tuple[Any, ...],

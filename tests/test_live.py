@@ -10,6 +10,7 @@ from pathlib import Path
 from shutil import which
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -183,17 +184,11 @@ def test_the_output_is_limited_to_full_scale_and_levels_are_those_since_the_last
 def test_an_error_of_the_stream_stops_it(
     recording: Tensor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    samples_left = [64] * 21  # the warm-up and one block
-
-    def fail_later(samples: Tensor) -> Tensor:
-        if not samples_left:
-            raise ValueError("the stream failed")
-        samples_left.pop()
-        return samples
-
+    blocks = [torch.ones(64)] * 21  # the warm-up and one block
+    stream = Mock(side_effect=[*blocks, *[ValueError("the stream failed")] * 99], spec=[])
     devices: Any = Devices(recording)
     with pytest.raises(ValueError, match="the stream failed"):
-        play(Live(fail_later, 94.0), devices)
+        play(Live(stream, 94.0), devices)
     assert not devices.played[64:].any()
     assert "stopped" in capsys.readouterr().out
 
@@ -203,27 +198,18 @@ def test_ctrl_c_stops_and_devices_that_stop_are_started_again(
 ) -> None:
     devices: Any = Devices(recording)
 
-    def interrupt(seconds: float) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr("hlsim.live.time.sleep", interrupt)
+        patch.setattr("hlsim.live.time.sleep", Mock(side_effect=KeyboardInterrupt))
         play(Live(WDRC().stream(EAR), 94.0), devices)
     assert capsys.readouterr().out.endswith("stopped, drop-outs 0\n")
-    errors: list[Any] = [None, Devices.PortAudioError("Device unavailable [PaErrorCode -9985]")]
-
-    def start(self: OpenStream) -> None:
-        if error := errors.pop(0):
-            raise error
-
+    start = Mock(side_effect=[None, Devices.PortAudioError("Device unavailable")])
     monkeypatch.setattr(OpenStream, "active", False)
     monkeypatch.setattr(OpenStream, "start", start)
-    monkeypatch.setattr("hlsim.live.time.sleep", lambda seconds: None)
+    monkeypatch.setattr("hlsim.live.time.sleep", Mock())
     live = Live(WDRC().stream(EAR), 94.0)
     with pytest.raises(ValueError, match="stopped: Device unavailable"):
         play(live, devices)
-    assert live.drop_outs == 2
-    assert not errors
+    assert live.drop_outs == start.call_count == 2
 
 
 def test_keys_are_read_from_a_terminal_whose_settings_are_restored(
@@ -284,7 +270,7 @@ def test_bad_options_cause_one_line(
     assert message in error
 
 
-def test_unsuitable_devices_are_rejected(
+def test_unsuitable_devices_and_missing_libraries_are_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mono: Any = Devices(torch.zeros(64), headphones=1)
@@ -295,24 +281,13 @@ def test_unsuitable_devices_are_rejected(
     assert "the system's input cannot be used: Invalid sample rate" in capsys.readouterr().err
     assert main(["live", "--list-devices"]) == 0
     assert "Loopback" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("error", "fix"),
-    [
+    for error, fix in (
         (OSError("PortAudio library not found"), "apt install libportaudio2"),
         (MissingExtraError("pip install 'hlsim[live]'"), "hlsim[live]"),
-    ],
-)
-def test_missing_libraries_are_named(
-    error: Exception, fix: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(*_: object) -> None:
-        raise error
-
-    monkeypatch.setattr("hlsim.cli.live.require", fail)
-    assert main(["live", "--audiogram", "N3"]) == 2
-    assert fix in capsys.readouterr().err
+    ):
+        monkeypatch.setattr("hlsim.cli.live.require", Mock(side_effect=error))
+        assert main(["live", "--audiogram", "N3"]) == 2
+        assert fix in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
+from hlsim.torchtools import flatten_items
 
 # On a CPU, larger feature maps take time because the C library returns their memory to the system
 # after each operation. For smaller ones, the overhead of each operation exceeds its computation.
@@ -93,8 +93,8 @@ class EarNetwork(nn.Module):
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = self._dtype
             batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
-            signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
-            ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+            signals = flatten_items(waveform, batch, dtype)
+            ears = flatten_items(thresholds, batch, dtype)
             items = self._items_at_once(signals)
             outputs = [
                 self._run(item_signals, item_ears)

@@ -65,14 +65,12 @@ def selective_scan(
         delta_softplus: Apply softplus to the step sizes and their bias.
 
     Raises:
-        ValueError: The shapes do not fit together.
         RuntimeError: A second derivative is computed.
 
     >>> u = torch.ones(1, 1, 3)
     >>> selective_scan(u, delta=u, A=torch.zeros(1, 1), B=u, C=u)  # a cumulative sum
     tensor([[[1., 2., 3.]]])
     """
-    _check_shapes(u, delta, A, B, C)
     kernel = _kernel_for(u)
     if kernel is not None:
         output: Tensor = kernel(
@@ -93,20 +91,6 @@ def selective_scan(
     if z is not None:
         y = y * functional.silu(z)
     return y.to(input_dtype)
-
-
-def _check_shapes(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> None:
-    """Raise ValueError unless the shapes of ``selective_scan``'s arguments fit together."""
-    items, channels, time = u.shape
-    weights_shape = (items, A.shape[-1], time)
-    fits = delta.shape == u.shape and A.shape[0] == channels
-    if not fits or B.shape != weights_shape or C.shape != weights_shape:
-        shapes = {"u": u, "delta": delta, "A": A, "B": B, "C": C}
-        actual = ", ".join(f"{name} {tuple(tensor.shape)}" for name, tensor in shapes.items())
-        raise ValueError(
-            "expected u and delta of shape (items, channels, time), A of (channels, states), B and "
-            f"C of (items, states, time), got {actual}"
-        )
 
 
 def _recur_forward(decay: Tensor, states: Tensor, scratch: Tensor) -> None:

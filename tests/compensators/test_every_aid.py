@@ -61,7 +61,9 @@ def test_scale_and_precision_are_those_of_the_caller(
     signal = utterance[None, :5000]
     output = build()(signal, EAR)
     # RMS 1.0 at 114 dB SPL is RMS 10 at 94 dB SPL.
-    assert_close(10.0 * build(full_scale_spl=114.0)(signal / 10.0, EAR), output)
+    other_scale = build(full_scale_spl=114.0)
+    assert_close(10.0 * other_scale(signal / 10.0, EAR), output)
+    assert "full_scale_spl=114" in repr(other_scale)
     assert_close(build().double()(signal.double(), EAR).float(), output, 1e-4)
     assert build()(signal.half(), EAR).dtype == torch.float16
 

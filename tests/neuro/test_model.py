@@ -31,18 +31,14 @@ def clips(speech: list[tuple[Tensor, int]]) -> Tensor:
 
 
 @pytest.mark.parametrize("rate", [16000, 22050, 44100, 48000])
-@pytest.mark.parametrize("shape", [(1600,), (2, 4801), (2, 3, 2000)])
-def test_output_has_the_shape_of_the_input_at_any_rate(rate: int, shape: tuple[int, ...]) -> None:
+def test_output_has_the_shape_of_the_input_broadcast_over_ears(rate: int) -> None:
     model = NeuroMSBG(NeuroConfig(channels=4, blocks=1), sample_rate=rate)
-    assert model(0.02 * torch.randn(shape), "N2").shape == shape
-
-
-def test_waveform_broadcasts_over_ears(trained: NeuroMSBG) -> None:
-    waveform = 0.02 * torch.randn(8000)
-    ears = draw_thresholds(3)
-    output = trained(waveform, ears)
-    assert output.shape == (3, 8000)
-    torch.testing.assert_close(output[1], trained(waveform, ears[1]), atol=1e-7, rtol=1e-4)
+    for shape in ((1600,), (2, 4801), (2, 3, 2000)):
+        assert model(0.02 * torch.randn(shape), "N2").shape == shape
+    waveform, ears = 0.02 * torch.randn(2000), draw_thresholds(3)
+    output = model(waveform, ears)
+    torch.testing.assert_close(output[1], model(waveform, ears[1]), atol=1e-7, rtol=1e-4)
+    assert output.shape == (3, 2000)
 
 
 @pytest.mark.parametrize("rate", [16000, 44100])
