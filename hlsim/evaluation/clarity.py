@@ -117,7 +117,8 @@ def evaluate_scenes(
     The outputs are written to ``out/signals/CONDITION/SCENE_LISTENER_HA-output.wav`` (the
     challenges' names), the references to ``out/reference``, and the scores to
     ``out/scores.jsonl``. An interrupted run can be continued. The score of a scene is that of the
-    better ear. The comparison of each aid with NAL-R by HASPI is planned.
+    better ear. The comparison of each aid with NAL-R by HASPI is planned, so that its p values
+    are not adjusted for the number of comparisons.
 
     Args:
         aids: Compensators (name or folder) and aids of your own, by their label in tables. An aid
@@ -138,7 +139,9 @@ def evaluate_scenes(
         linked: Whether one level sets the gains of both ears, in compensators that support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI and HASQI add.
-        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+        running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
+            address of a Dask scheduler; and ``progress``, a function of the numbers of finished
+            and of all scores.
 
     Returns:
         The evaluation of all conditions, ``unaided`` first. Its detail ``look_ahead_ms`` is by

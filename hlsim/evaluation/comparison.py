@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.measures import MEASURES, title_of
+from hlsim.evaluation.measures import MEASURES, column_title
 from hlsim.evaluation.statistics import PairedComparison, holm, paired_comparison
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Comparison:
     @property
     def title(self) -> str:
         """Name of the measure in tables."""
-        return title_of(self.measure)
+        return column_title(self.measure)
 
     @property
     def level_change(self) -> float:
@@ -134,7 +134,7 @@ class Comparison:
     def _describe_tests(self) -> str:
         """State the p values, which are the same wherever the comparison appears."""
         tests = {"t-test": self.p_t, "Wilcoxon": self.p_w}
-        stated = [f"{name} {p_text(p)}" for name, p in tests.items() if p is not None]
+        stated = [f"{name} {format_p(p)}" for name, p in tests.items() if p is not None]
         if not stated:
             return "neither test is defined"
         if self.planned:
@@ -177,7 +177,7 @@ class Comparison:
                 "The tests treat items as independent. If several share a talker or a listener, p "
                 "is too small and the interval too narrow."
             )
-        result = "is not defined" if means.p_t is None else f"gives {p_text(means.p_t)}"
+        result = "is not defined" if means.p_t is None else f"gives {format_p(means.p_t)}"
         return (
             "The interval and the tests treat items as independent, although several share one "
             f"{self.unit}; the t-test over the means of the {means.n} {self.unit}s {result}."
@@ -290,10 +290,10 @@ def _compare_units(
     return paired_comparison(*means)
 
 
-def p_text(p: float) -> str:
+def format_p(p: float) -> str:
     """Return a p value as reports state it, with five decimals.
 
-    >>> p_text(0.0125)
+    >>> format_p(0.0125)
     'p = 0.01250'
     """
     return "p < 0.00001" if p < 1e-5 else f"p = {p:.5f}"

@@ -74,7 +74,7 @@ def evaluate_compensators(
 
     The rivals are NAL-R and an equaliser, a fixed filter for each ear with the compensator's mean
     gain for speech at ``levels``. The comparison with NAL-R at the compensator's level by HASPI is
-    planned.
+    planned, so that its p values are not adjusted for the number of comparisons.
 
     Scores are stored as they become known. An interrupted run can be continued, and a run with one
     more compensator, or with another simulator, computes only the scores that are missing. An item
@@ -99,7 +99,9 @@ def evaluate_compensators(
         levels: Levels of the clean speech in dB SPL, in turn.
         gain_ears: Names of the standard ears for gain curves and steady tones.
         seed: Seed of all random draws.
-        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+        running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
+            address of a Dask scheduler; and ``progress``, a function of the numbers of finished
+            and of all scores.
 
     Returns:
         The evaluation with the groups ``clean``, ``noisy`` and ``hard`` if they have items, and the
@@ -109,6 +111,14 @@ def evaluate_compensators(
     Raises:
         ValueError: Data or settings are not valid, or no item has all its scores.
         MissingExtraError: A package is not installed.
+
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
+    >>> evaluation = evaluate_compensators(
+    ...     {"mine": NALR()}, speech=speech, audiogram=Audiogram.standard("N3"), **settings
+    ... )
+    >>> evaluation.names[:3], evaluation.names[3:]
+    (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
     require("pandas", "eval")
     is_in_range = all(0.0 <= level <= 120.0 for level in levels)

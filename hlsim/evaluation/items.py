@@ -174,7 +174,7 @@ def ear_name(audiogram: Audiogram) -> str:
     return names[0] if names else f"{levels} dB HL"
 
 
-def treat(
+def apply_treatments(
     items: Sequence[Item], treatments: Sequence[str], compensator: nn.Module | None = None
 ) -> list[Item]:
     """Return the items with inputs that were processed in several ways, such as by an aid.
@@ -191,7 +191,7 @@ def treat(
 
     >>> clean = torch.ones(1600)
     >>> item = Item("item 1", clean, clean, Audiogram.standard("N3"))
-    >>> [float(item.signal[0]) for item in treat([item], ["as-is", "louder"])]
+    >>> [float(item.signal[0]) for item in apply_treatments([item], ["as-is", "louder"])]
     [1.0, 10.0]
     """
     three_to_one = torch.tensor([3.0])

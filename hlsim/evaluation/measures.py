@@ -164,10 +164,10 @@ def load_measure(name: str) -> Measure:
     return Measure(name, plugin, settings=fingerprint(plugin.function))
 
 
-def title_of(column: str) -> str:
+def column_title(column: str) -> str:
     """Return the title, in tables and plots, of a column with scores.
 
-    >>> title_of("haspi"), title_of("crest factor")
+    >>> column_title("haspi"), column_title("crest factor")
     ('HASPI', 'crest factor')
     """
     if column in MEASURES:

@@ -217,7 +217,9 @@ def haspi_report(
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         spl: Level of every clean file in dB SPL, which replaces ``full_scale_spl``.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
-        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+        running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
+            address of a Dask scheduler; and ``progress``, a function of the numbers of finished
+            and of all scores.
 
     Returns:
         The evaluation. The comparison of the last condition with the first counts as planned

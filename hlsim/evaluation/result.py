@@ -93,7 +93,7 @@ class Evaluation:
     def scores(self) -> list[str]:
         """Columns of the table with scores: those of hlsim's measures, then those of your own."""
         named = [measure.name for measure in self.measures if measure.name in self.table]
-        facts = self.items[0].facts
+        facts = [fact for source in self.items[:1] for fact in source.facts]
         no_scores = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
         return named + [column for column in self.table.columns if column not in no_scores]
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.fingerprint import fingerprint
-from hlsim.evaluation.items import SIMULATOR_LEVELS, draw_simulator_items, treat
+from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
 from hlsim.evaluation.measures import load_measure, perceive
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item, Measure, Values
@@ -70,7 +70,9 @@ def evaluate_simulators(
         inputs: Names of ways to process the input before the simulator, see ``TREATMENTS``.
         compensator: Module of the treatment ``"compensated"``.
         seed: Seed of all random draws.
-        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+        running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
+            address of a Dask scheduler; and ``progress``, a function of the numbers of finished
+            and of all scores.
 
     Returns:
         The evaluation with one group per name in ``inputs``. The SNR of a simulator is that of the
@@ -81,6 +83,15 @@ def evaluate_simulators(
         ValueError: Data or settings are not valid, or no item has a value.
         MissingExtraError: pandas or pystoi is not installed. Without pesq, that measure is left
             out.
+
+    >>> from hlsim import MSBG
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
+    >>> evaluation = evaluate_simulators(
+    ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
+    ... )
+    >>> evaluation.table["snr"].tolist()  # the teacher itself
+    [200.0]
     """
     require("pandas", "eval")
     require("pystoi", "eval")
@@ -99,7 +110,7 @@ def evaluate_simulators(
     }
     drawn = draw_simulator_items(speech, noise, audiograms, **settings)
     evaluation = Evaluation.run(
-        treat(drawn, inputs, compensator),
+        apply_treatments(drawn, inputs, compensator),
         [Condition(name, module, "simulator") for name, module in simulators.items()],
         [_fidelity_to(teacher), *map(load_measure, measures)],
         store=store,
@@ -201,6 +212,16 @@ def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
         evaluation: Evaluation of ``evaluate_simulators``.
 
     Returns: The item, and the output with shape (time,) at 16 kHz.
+
+    >>> from hlsim import MSBG
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
+    >>> evaluation = evaluate_simulators(
+    ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
+    ... )
+    >>> item, expected = example_item(evaluation)
+    >>> item.name, expected.shape
+    ('item 0', torch.Size([16000]))
     """
     rows = evaluation.table.dropna(subset="snr")
     rows = rows[rows["treatment"] == rows["treatment"].iloc[0]]

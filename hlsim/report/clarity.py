@@ -12,7 +12,7 @@ from hlsim.report.players import listening_sections
 from hlsim.report.plots import pictures_sections
 from hlsim.report.results import (
     LEVEL,
-    number,
+    format_number,
     score_details,
     split_rows,
     statistic,
@@ -82,5 +82,5 @@ def _conditions_table(evaluation: Evaluation) -> Table:
         within_rule = ""
         if look_ahead is not None:
             within_rule = "yes" if look_ahead <= RULE_MS else "no"
-        rows.append((*row, number(look_ahead, ".1f"), within_rule))
+        rows.append((*row, format_number(look_ahead, ".1f"), within_rule))
     return Table(caption, (*means.header, "Look-ahead (ms)", f"Within {RULE_MS:g} ms"), rows)

@@ -23,10 +23,10 @@ from hlsim.report.results import (
     STATISTICS_NOTE,
     Columns,
     comparison_table,
+    describe_software,
     detail_section,
     paired_table,
     score_columns,
-    scored_by,
     split_rows,
     statistic,
     summary_table,
@@ -138,8 +138,8 @@ def _about(evaluation: Evaluation) -> str:
     return (
         f"{settings['items']} items of {settings['seconds']:g} s; {ears} "
         f"{'ear' if ears == 1 else 'ears in turn'}; speech at {levels} dB SPL in turn; seed "
-        f"{settings['seed']}. {scored_by(evaluation)} Both compare with the clean speech, in "
-        "noise too."
+        f"{settings['seed']}. {describe_software(evaluation)} Both compare with the clean speech, "
+        "in noise too."
     )
 
 

@@ -55,6 +55,19 @@ def listening_sections(
         conditions: Names of the conditions to be played; all of them if empty.
 
     Returns: The section, or an empty list if there is no comparison or ``count`` is 0.
+
+    >>> import pandas
+    >>> from hlsim import Audiogram
+    >>> from hlsim.evaluation import Condition, Item, compare
+    >>> speech = torch.randn(8000, generator=torch.Generator().manual_seed(0))
+    >>> item = Item("s01", speech, speech, Audiogram.standard("N3"))
+    >>> conditions = [Condition(name, lambda signal, ear: signal) for name in "ab"]
+    >>> rows = [(0, "s01", "a", 0.2), (0, "s01", "b", 0.4)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "name", "condition", "haspi"])
+    >>> evaluation = Evaluation([item], conditions, [], table, compare(table, ["haspi"]))
+    >>> (section,) = listening_sections(evaluation, count=1)
+    >>> [sound.label for sound in section.sections[0].player.sounds]
+    ['normal ear (the goal)', 'a', 'b']
     """
     headline = evaluation.headline
     if headline is None or not count:

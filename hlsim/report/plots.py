@@ -19,7 +19,7 @@ from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
 from hlsim.report.page import Picture, Section
-from hlsim.report.results import ordered
+from hlsim.report.results import sort_facts
 
 _MANY_POINTS = 2000
 """Number of points above which they are drawn as pixels, so that a page stays small."""
@@ -29,9 +29,6 @@ INK = "#010203"
 
 _COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
 """Colours of lines and their labels, which can be read on white and on black."""
-
-_POINTS = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0]}
-"""Style of the points of items."""
 
 UNAIDED_COLOUR = "#7d828a"
 """Colour of the condition without an aid."""
@@ -56,6 +53,7 @@ _STYLE: dict[str, Any] = {
     "grid.color": "#9a9fa8",
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "text.parse_math": False,  # a $ in the name of a condition is a dollar
     "svg.fonttype": "none",
     "svg.hashsalt": "hlsim",  # the same plot gives the same bytes
 }
@@ -93,15 +91,13 @@ def _draw_picture(
     return Picture(svg, alt or title, title, note)
 
 
-def _plain(text: str) -> str:
-    """Return a label that matplotlib shows as it is, without interpreting $ as mathematics."""
-    return text.replace("$", r"\$")
-
-
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     """Return a colour of matplotlib for each condition, by name.
 
     A condition that belongs to another one, such as NAL-R at an aid's level, has its colour, paler.
+
+    >>> condition_colours([Condition("unaided", kind="unaided"), Condition("mine")])
+    {'unaided': '#7d828a', 'mine': '#2f7ed8'}
     """
     names = [condition.name for condition in conditions]
     aided = [c.name for c in conditions if c.of not in names and c.kind != "unaided"]
@@ -146,6 +142,12 @@ def _spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
     return places
 
 
+def _draw_points(axes: Any, x: Any, y: Any, size: float) -> None:
+    """Draw one point per item, as pixels if there are many."""
+    style = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0]}
+    axes.scatter(x, y, s=size, rasterized=len(x) > _MANY_POINTS, **style)
+
+
 def scatter_picture(
     x: Any, y: Any, axis_titles: tuple[str, str], title: str, axis_range: Any = None
 ) -> Picture:
@@ -156,14 +158,17 @@ def scatter_picture(
         axis_titles: Titles of the horizontal and of the vertical axis.
         title: Heading above the picture.
         axis_range: Lower and upper end of both axes; by default that of the values.
+
+    >>> scatter_picture([0.2, 0.4], [0.3, 0.5], ("unaided", "aid"), "HASPI of 2 items").title
+    'HASPI of 2 items'
     """
 
     def draw(axes: Any) -> None:
         axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
-        axes.scatter(x, y, s=16, rasterized=len(x) > _MANY_POINTS, **_POINTS)
+        _draw_points(axes, x, y, size=16)
         axes.set(
-            xlabel=_plain(axis_titles[0]),
-            ylabel=_plain(axis_titles[1]),
+            xlabel=axis_titles[0],
+            ylabel=axis_titles[1],
             xlim=axis_range,
             ylim=axis_range,
         )
@@ -179,18 +184,24 @@ def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Pi
         groups: Values as a pandas series, by the name of the group.
         measure: Title of the values.
         by: Noun for the groups, such as "condition".
+
+    >>> import pandas
+    >>> scores = {"unaided": pandas.Series([0.2, 0.4]), "aid": pandas.Series([0.5, 0.7])}
+    >>> distribution_picture(scores, "HASPI", "condition").alt
+    'HASPI by condition; medians: unaided 0.300, aid 0.600.'
     """
-    values = {name: group.dropna().to_numpy() for name, group in groups.items()}
-    values = {name: group for name, group in values.items() if len(group)}
+    values = {
+        name: group.dropna().to_numpy() for name, group in groups.items() if group.notna().any()
+    }
 
     def draw(axes: Any) -> None:
-        names = [_plain(fill(name, 18)) for name in values]
+        names = [fill(name, 18) for name in values]
         style = {"orientation": "horizontal", "tick_labels": names, "widths": 0.5}
         axes.boxplot(list(values.values()), whis=0.0, showfliers=False, showcaps=False, **style)
         generator = np.random.default_rng(0)
         for place, group in enumerate(values.values(), 1):
             heights = place + generator.uniform(-0.18, 0.18, len(group))
-            axes.scatter(group, heights, s=9, rasterized=len(group) > _MANY_POINTS, **_POINTS)
+            _draw_points(axes, group, heights, size=9)
         axes.invert_yaxis()
         axes.set(xlabel=measure)
 
@@ -219,12 +230,16 @@ def curves_picture(
         over: Title of the horizontal axis; by default, it is frequency in Hz.
         axis_range: Lower and upper end of the vertical axis; None is that of the curves.
         note: Sentence below the picture.
+
+    >>> curves = {"aid": ([250, 1000, 4000], [5.0, 10.0, 20.0], {"color": "#2f7ed8"})}
+    >>> curves_picture(curves, "Gain", "insertion gain (dB)").title
+    'Gain'
     """
 
     def draw(axes: Any) -> None:
         for name, (x, y, style) in curves.items():
             # A label that begins with an underscore would be hidden.
-            axes.plot(x, y, label=_plain(f" {name}"), **style)
+            axes.plot(x, y, label=f" {name}", **style)
         axes.set(ylabel=axis, ylim=axis_range)
         if over:
             axes.set(xlabel=over)
@@ -245,6 +260,10 @@ def gain_picture(
         title: Heading above the picture.
         results: Gain curve of each aid with its name ``aid``, see ``measure_gain_curve``.
         colours: Colour of each aid.
+
+    >>> curve = {"aid": "mine", "levels": [65.0], "frequencies": [250, 4000], "gain_db": [[5, 20]]}
+    >>> gain_picture("Gain, ear N3", [curve], {"mine": "#2f7ed8"}).title
+    'Gain, ear N3'
     """
     curves = {}
     for row in results:
@@ -266,12 +285,19 @@ def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, ov
         fact: Column of the fact, such as ``"snr"``.
         title: Title of the column.
         over: Title of the fact.
+
+    >>> import pandas
+    >>> rows = [(0, "aid", 5.0, 0.5), (1, "aid", 10.0, 0.7)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "snr", "haspi"])
+    >>> evaluation = Evaluation([], [Condition("aid")], [], table)
+    >>> means_picture(evaluation, "haspi", "snr", "HASPI", "SNR (dB)").title
+    'Mean HASPI by SNR (dB)'
     """
     colours = condition_colours(evaluation.conditions)
     means = evaluation.table.groupby(["condition", fact])[column].mean()
     curves = {}
     for name in means.index.unique(0).intersection(evaluation.names):
-        x = ordered(means[name].index)
+        x = sort_facts(means[name].index)
         style = {"color": colours[name], "marker": "."}
         curves[name] = (x, [means[name][value] for value in x], style)
     return curves_picture(curves, f"Mean {title} by {over}", title, over=over)
@@ -283,6 +309,15 @@ def pictures_sections(evaluation: Evaluation) -> list[Section]:
     A picture that would show a single group or item is left out.
 
     Returns: The section, or an empty list if there is no comparison.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import MEASURES, compare
+    >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
+    >>> conditions, comparisons = [Condition("a"), Condition("b")], compare(table, ["haspi"])
+    >>> evaluation = Evaluation([], conditions, [MEASURES["haspi"]], table, comparisons)
+    >>> [picture.title for picture in pictures_sections(evaluation)[0].pictures]
+    ['HASPI by condition', 'HASPI of the 2 items']
     """
     c = evaluation.headline
     if c is None or c.overall.n < 2:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.measures import title_of
+from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Section, write_page
 from hlsim.report.players import listening_sections
@@ -34,6 +34,16 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
     Raises:
         ValueError: The files cannot be written.
         MissingExtraError: matplotlib or jinja2 is not installed.
+
+    >>> import tempfile
+    >>> from hlsim import Audiogram
+    >>> from hlsim.evaluation import haspi_report
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
+    >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
+    >>> with tempfile.TemporaryDirectory() as out:
+    ...     write_report(evaluation, out).name
+    'report.html'
     """
     return write_page(report_page(evaluation, listen), evaluation.to_dict(), out)
 
@@ -44,6 +54,14 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     Args:
         evaluation: Evaluation of ``haspi_report``.
         listen: Number of items with a player.
+
+    >>> from hlsim import Audiogram
+    >>> from hlsim.evaluation import haspi_report
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
+    >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
+    >>> report_page(evaluation).title
+    'after: STOI'
     """
     columns = {**score_columns(evaluation), **LEVEL}
     tables = [summary_table("Means of all items", split_rows(evaluation.table), columns)]
@@ -60,7 +78,7 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
         *pictures_sections(evaluation),
         score_details(evaluation),
     ]
-    measures = ", ".join(map(title_of, evaluation.scores))
+    measures = ", ".join(map(column_title, evaluation.scores))
     return Page(f"{', '.join(evaluation.names)}: {measures}", verdict, sections)
 
 
@@ -69,7 +87,7 @@ def _mean_verdict(evaluation: Evaluation) -> str:
     measure = evaluation.scores[0]
     scored = evaluation.table.dropna(subset=[measure])
     return (
-        f"{title_of(measure)} of the condition {evaluation.names[0]} is "
+        f"{column_title(measure)} of the condition {evaluation.names[0]} is "
         f"{scored[measure].mean():.3f} on average ({len(scored)} items, at "
         f"{scored['level'].mean():.1f} dB SPL)."
     )

@@ -10,8 +10,8 @@ from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.comparison import Comparison, p_text
-from hlsim.evaluation.measures import title_of
+from hlsim.evaluation.comparison import Comparison, format_p
+from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.report.page import Section, Table
@@ -52,6 +52,10 @@ def statistic(column: str, name: str = "mean") -> Callable[[DataFrame], Any]:
     Args:
         column: Name of the column.
         name: Name of a method of a pandas series, such as ``"median"``, or of ``_STATISTICS``.
+
+    >>> import pandas
+    >>> float(statistic("haspi", "median")(pandas.DataFrame({"haspi": [0.2, 0.4, 0.9]})))
+    0.4
     """
     compute = _STATISTICS.get(name) or methodcaller(name)
     return lambda rows: compute(rows[column])
@@ -62,10 +66,18 @@ LEVEL: Columns = {"Level (dB SPL)": (statistic("level"), ".1f")}
 
 
 def score_columns(evaluation: Evaluation) -> Columns:
-    """Return the columns of a table of scores: number of items, and mean of each score."""
+    """Return the columns of a table of scores: number of items, and mean of each score.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import MEASURES, Condition
+    >>> table = pandas.DataFrame({"item": [0], "condition": ["aid"], "haspi": [0.5]})
+    >>> evaluation = Evaluation([], [Condition("aid")], [MEASURES["haspi"]], table)
+    >>> list(score_columns(evaluation))
+    ['n', 'HASPI (mean ± std)']
+    """
     columns: Columns = {"n": (statistic(evaluation.scores[0], "count"), "d")}
     for score in evaluation.scores:
-        columns[f"{title_of(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
+        columns[f"{column_title(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
     return columns
 
 
@@ -75,19 +87,28 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     Args:
         table: The table.
         fact: Column of a fact of the items, such as ``"snr"``, whose values are separated too.
+
+    >>> import pandas
+    >>> rows = [("unaided", 5.0), ("aid", 5.0), ("unaided", 0.0), ("aid", 0.0)]
+    >>> list(split_rows(pandas.DataFrame(rows, columns=["condition", "snr"]), "snr"))
+    ['0, unaided', '0, aid', '5, unaided', '5, aid']
     """
     if not fact:
         return {name: table[table["condition"] == name] for name in table["condition"].unique()}
     rows = {}
-    for value in ordered(table[fact].dropna().unique()):
+    for value in sort_facts(table[fact].dropna().unique()):
         heading = value if isinstance(value, str) else f"{value:g}"
         for name, part in split_rows(table[table[fact] == value]).items():
             rows[f"{heading}, {name}"] = part
     return rows
 
 
-def ordered(values: Sequence[Any]) -> list[Any]:
-    """Return the values of a fact in ascending order; degrees of loss range from none to severe."""
+def sort_facts(values: Sequence[Any]) -> list[Any]:
+    """Return the values of a fact in ascending order; degrees of loss range from none to severe.
+
+    >>> sort_facts(["severe", "mild"]), sort_facts([10.0, 5.0])
+    (['mild', 'severe'], [5.0, 10.0])
+    """
     degrees = {name: place for place, name in enumerate(SEVERITIES)}
     return sorted(values, key=lambda value: (degrees.get(value, 0), value))
 
@@ -108,18 +129,25 @@ def summary_table(
         columns: Statistics by the title of their column.
         first: Title of the first column, which contains the names.
         folded: Whether the page shows only the caption until a reader opens the table.
+
+    >>> import pandas
+    >>> rows = {"unaided": pandas.DataFrame({"haspi": [0.2, 0.4]})}
+    >>> summary_table("Means", rows, {"HASPI": (statistic("haspi"), ".2f")}).rows
+    [['unaided', '0.30']]
     """
     cells = []
     for name, part in rows.items():
-        values = {title: number(compute(part), form) for title, (compute, form) in columns.items()}
+        values = {
+            title: format_number(compute(part), form) for title, (compute, form) in columns.items()
+        }
         cells.append({first: name, **values})
     return Table.from_rows(caption, cells, folded=folded)
 
 
-def number(value: Any, form: str) -> str:
+def format_number(value: Any, form: str) -> str:
     """Format a number; return a text as it is, and "n/a" for None and NaN.
 
-    >>> number(0.25, ".0%"), number(None, ".1f")
+    >>> format_number(0.25, ".0%"), format_number(None, ".1f")
     ('25%', 'n/a')
     """
     if value is None or (not isinstance(value, str) and math.isnan(value)):
@@ -129,7 +157,7 @@ def number(value: Any, form: str) -> str:
 
 def _mean_and_deviation(mean: float, deviation: float | None) -> str:
     """Format a mean and its standard deviation, if there is one."""
-    text = number(mean, ".3f")
+    text = format_number(mean, ".3f")
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 
 
@@ -143,18 +171,31 @@ def loss_name(severity: str) -> str:
 
 
 def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparisons") -> Table:
-    """Return a table with one row per comparison, with the p values that the sentences state."""
+    """Return a table with one row per comparison, with the p values that the sentences state.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import compare
+    >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
+    >>> comparison_table(compare(table, ["haspi"])).rows[0][:2]
+    ['HASPI: a to b', '2']
+    """
     rows = []
     for c in comparisons:
         planned = " (planned)" if c.planned else ""
         row = {"Comparison": f"{c.title}: {c.before} to {c.after}{planned}"}
         row |= _paired_cells(c.overall, c.p_t, c.p_w)
-        rows.append({**row, "Level change (dB)": number(c.level_change, "+.1f")})
+        rows.append({**row, "Level change (dB)": format_number(c.level_change, "+.1f")})
     return Table.from_rows(caption, rows)
 
 
 def paired_table(caption: str, rows: Mapping[str, PairedComparison]) -> Table:
-    """Return a table with one row per paired comparison, by name, with unadjusted p values."""
+    """Return a table with one row per paired comparison, by name, with unadjusted p values.
+
+    >>> from hlsim.evaluation import paired_comparison
+    >>> paired_table("Ears", {"N3": paired_comparison([0.2, 0.4], [0.3, 0.5])}).rows[0][:2]
+    ['N3', '2']
+    """
     cells = [{"Items": name, **_paired_cells(c, c.p_t, c.p_w)} for name, c in rows.items()]
     return Table.from_rows(f"{caption}; p not adjusted", cells)
 
@@ -167,9 +208,11 @@ def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> 
         "From (mean ± std)": _mean_and_deviation(c.before_mean, c.before_std),
         "To (mean ± std)": _mean_and_deviation(c.after_mean, c.after_std),
         "Change [95 % interval]": f"{c.delta:+.3f}{interval}",
-        "t-test (paired)": "n/a" if p_t is None else f"t = {number(c.t, '+.3f')}, {p_text(p_t)}",
-        "Wilcoxon": "n/a" if p_w is None else f"W = {number(c.w, '.1f')}, {p_text(p_w)}",
-        "d": number(c.cohens_d, "+.3f"),
+        "t-test (paired)": "n/a"
+        if p_t is None
+        else f"t = {format_number(c.t, '+.3f')}, {format_p(p_t)}",
+        "Wilcoxon": "n/a" if p_w is None else f"W = {format_number(c.w, '.1f')}, {format_p(p_w)}",
+        "d": format_number(c.cohens_d, "+.3f"),
     }
 
 
@@ -217,6 +260,14 @@ def detail_section(
         notes: Sentences about the origin of the values; empty ones are left out.
         texts: Paragraphs to begin with.
         tables: Tables to begin with.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import Condition
+    >>> rows = [(0, "s01", "aid", "the file is silent")]
+    >>> table = pandas.DataFrame(rows, columns=["item", "name", "condition", "failure"])
+    >>> evaluation = Evaluation([], [Condition("aid")], [], table, settings={"seed": 0})
+    >>> [section.title for section in detail_section(evaluation, [], []).sections]
+    ['Failures', 'How the values were computed']
     """
     further = list(sections)
     failures = evaluation.failures[["name", "condition", "failure"]].to_numpy().tolist()
@@ -238,6 +289,14 @@ def score_details(
         evaluation: The evaluation of the page.
         texts: Paragraphs to begin with.
         tables: Tables to begin with.
+
+    >>> from hlsim import Audiogram
+    >>> from hlsim.evaluation import haspi_report
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
+    >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
+    >>> [section.title for section in score_details(evaluation).sections]
+    ['All items', 'How the values were computed']
     """
     item_tables = [_items_table(evaluation, "Scores and levels of every item")]
     better_ear = ""
@@ -250,7 +309,7 @@ def score_details(
     degrees = ", ".join(f"{name} {counts[name]}" for name in SEVERITIES if name in counts)
     clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
     notes = [
-        scored_by(evaluation),
+        describe_software(evaluation),
         f"Degrees of hearing loss by item: {degrees}.",
         f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for "
         f"{scale.min():.1f} to {scale.max():.1f} dB SPL.",
@@ -266,14 +325,21 @@ def _items_table(evaluation: Evaluation, caption: str) -> Table:
     columns = {"Item": facts["name"], "Loss": facts["severity"]}
     formats = {**dict.fromkeys(evaluation.scores, ".3f"), "level": ".1f"}
     for name, (column, form) in product(evaluation.names, formats.items()):
-        title = "dB SPL" if column == "level" else title_of(column)
+        title = "dB SPL" if column == "level" else column_title(column)
         values = evaluation.wide(column)[name]
-        columns[f"{title}, {name}"] = values.map(partial(number, form=form))
+        columns[f"{title}, {name}"] = values.map(partial(format_number, form=form))
     return Table(caption, list(columns), list(zip(*columns.values(), strict=True)))
 
 
-def scored_by(evaluation: Evaluation) -> str:
-    """Return a sentence that says which software computed HASPI and HASQI, if they were."""
-    names = [title_of(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
+def describe_software(evaluation: Evaluation) -> str:
+    """Return a sentence that says which software computed HASPI and HASQI, if they were.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import MEASURES
+    >>> evaluation = Evaluation([], [], [MEASURES["haspi"]], pandas.DataFrame({"haspi": [0.5]}))
+    >>> describe_software(evaluation)[:34]
+    'HASPI (version 2) are computed by '
+    """
+    names = [column_title(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
     software = f"hlsim {evaluation.versions['hlsim']}, as by pyclarity 0.9"
     return f"{' and '.join(names)} (version 2) are computed by {software}." if names else ""

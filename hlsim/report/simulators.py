@@ -19,7 +19,7 @@ from hlsim.report.results import (
     comparison_table,
     detail_section,
     loss_name,
-    ordered,
+    sort_facts,
     split_rows,
     statistic,
     summary_table,
@@ -72,6 +72,16 @@ def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
     Args:
         evaluation: Evaluation of ``evaluate_simulators``.
         listen: Whether (1) or not (0) an item has a player.
+
+    >>> from hlsim import MSBG
+    >>> from hlsim.evaluation.simulators import evaluate_simulators
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
+    >>> evaluation = evaluate_simulators(
+    ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
+    ... )
+    >>> simulators_page(evaluation, listen=0).verdict[:48]
+    'Speech as it is: exact has a median SNR of 200.0'
     """
     sections, details = [], []
     for treatment, group in evaluation.groups.items():
@@ -168,7 +178,7 @@ def _pictures(rows: DataFrame) -> Iterator[Picture]:
             axis_titles = (f"{title}, teacher", f"{title}, simulator")
             teacher, simulator = pairs.to_numpy().T
             yield scatter_picture(teacher, simulator, axis_titles, f"{title} of both outputs")
-    degrees = ordered(rows["severity"].unique())
+    degrees = sort_facts(rows["severity"].unique())
     for column, title in (("snr", "SNR (dB)"), ("band_error", "Band error (dB)")):
         groups = {degree: rows.loc[rows["severity"] == degree, column] for degree in degrees}
         if len(groups) > 1:

@@ -13,10 +13,10 @@ from hlsim.calibration import level_spl
 from hlsim.evaluation.items import (
     SIMULATOR_LEVELS,
     TREATMENTS,
+    apply_treatments,
     draw_aid_items,
     draw_simulator_items,
     read_ears,
-    treat,
 )
 
 
@@ -96,7 +96,7 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     drawn = draw_simulator_items(speech_dir / "valid", None, ears_file, **settings)
     halving = torch.nn.Module()
     halving.forward = lambda waveform, ear: 0.5 * waveform  # type: ignore[method-assign]
-    treated = treat(drawn, TREATMENTS, halving)
+    treated = apply_treatments(drawn, TREATMENTS, halving)
     assert [item.facts["treatment"] for item in treated] == list(TREATMENTS)
     as_is, louder, amplified, compressed, compensated = (item.signal for item in treated)
     assert torch.equal(as_is, drawn[0].signal) and torch.equal(compensated, 0.5 * as_is)
@@ -109,4 +109,4 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     assert float(after[loud].std()) < 0.7 * float(before[loud].std())
     for unknown in ("compensated", "softer"):
         with pytest.raises(ValueError, match=unknown):
-            treat(drawn, [unknown])
+            apply_treatments(drawn, [unknown])
