@@ -41,7 +41,8 @@ def _is_remembered(tensor: Tensor) -> bool:
 def on_device(levels: Tensor, device: torch.device) -> Tensor:
     """Return thresholds on a device, without making the CPU wait for it.
 
-    If they come from the CPU, the original is remembered, so that ``on_host`` need not wait either.
+    Reading them back would make the CPU wait. If they come from the CPU, the original is
+    remembered, so that ``on_host`` need not wait either.
 
     Args:
         levels: Thresholds of any shape.

@@ -85,7 +85,7 @@ def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
 
 
 def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
-    """Filter signals in overlapping blocks, in a quarter of the time of one Fourier transform.
+    """Filter signals block by block, which takes a quarter of the time of one Fourier transform.
 
     Shape: (..., time), (2049,) -> (..., length).
 

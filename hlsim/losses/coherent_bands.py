@@ -111,8 +111,9 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
         sample_rate: Sample rate in Hz.
 
     Returns:
-        ``incoherence``, ``misalignment``, ``levels`` and ``louder`` of each item, (items,) each, as
-        described at the top of ``hlsim.losses.coherent_bands``.
+        Four parts by name, (items,) each: ``incoherence``, from 0 for filtered speech to 1 for
+        noise; ``misalignment``, the effect of a phase shift; ``levels``, the level error in dB,
+        compressed; ``louder``, the excess level in dB.
 
     >>> speech = torch.randn(1, 16000)
     >>> parts = coherent_band_parts(0.1 * speech, speech, sample_rate=16000)  # 20 dB too low

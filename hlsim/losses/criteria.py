@@ -33,7 +33,7 @@ Shape of the function: (items, time) twice, in pascals -> (items,).
 
 
 def check_criterion(criterion: Any) -> dict[str, Any]:
-    """Return the criteria of a loss by name with their weights.
+    """Convert the criterion argument of a loss into criteria by name with their weights.
 
     Args:
         criterion: Name of a criterion, weights of several by name, or a function.
@@ -83,7 +83,7 @@ def combine_weights(
 
 
 def check_values(values: Any, items: int) -> Tensor:
-    """Validate and return what a user's function returned as a criterion.
+    """Validate the result of a user's function that serves as a criterion, and return it.
 
     Args:
         values: Return value of the function.

@@ -201,7 +201,11 @@ class FrozenSimulator:
         return int(HIGHEST * fft / self.sample_rate) + 1 if self._limits_band else None
 
     def apply(self, function: Callable[[Tensor], Tensor]) -> None:
-        """Apply a function to all tensors of the modules in place, as ``nn.Module.to`` does."""
+        """Move or convert the simulator and the normal ear, as ``nn.Module.to`` does.
+
+        Args:
+            function: Function that moves or converts a tensor.
+        """
         apply_to_module(self.simulator, function)
         apply_to_module(self.normal, function)
 
@@ -220,7 +224,7 @@ class FrozenSimulator:
 
 
 def apply_to_module(value: object, function: Callable[[Tensor], Tensor]) -> None:
-    """Apply a function to all tensors of a module in place, except conversions to half precision.
+    """Move or convert all tensors of a module in place, but never to half precision.
 
     Args:
         value: Module, or another value, which is ignored.

@@ -138,7 +138,7 @@ def paper_parts(
         stft: Short-time Fourier transform. Spectra are scaled to the magnitudes of the paper's
             transform, so that the sample rate changes no level, and the magnitude and complex
             losses to its number of frequencies, so that an empty band changes nothing.
-        frequencies: Number of frequencies to compare, from 0 Hz up; all if None.
+        frequencies: Number of frequencies of spectra to compare, from 0 Hz up; all if None.
 
     Returns:
         ``magnitude``, ``phase``, ``complex`` and ``time`` of each item, (items,) each.

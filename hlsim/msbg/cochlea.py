@@ -41,10 +41,10 @@ _MAX_COMMON_PERIOD = 10000
 
 
 def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
-    """Choose the length of the Fourier transform of a signal in the cochlea.
+    """Choose the length of the Fourier transforms with which MSBG filters a signal.
 
-    If this costs little, the duration is a whole number of samples at the sample rate of the output
-    too, so that the spectrum can be resampled.
+    If this costs little, the length spans a whole number of samples at the sample rate of the
+    output, too. Then a spectrum can be converted to that rate.
 
     Args:
         length: Number of samples of the signal at 44.1 kHz.
@@ -52,7 +52,7 @@ def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
 
     Returns:
-        Length in samples at 44.1 kHz, with silence behind the signal.
+        Length as a number of samples at 44.1 kHz, including silence behind the signal.
 
     >>> cochlea_fft_length(44100, rate=16000)
     49392
@@ -65,7 +65,11 @@ def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
 
 
 def common_period(rate: int, rate_divisor: int = 1) -> int:
-    """Return the shortest duration of a whole number of envelope steps and of samples at a rate.
+    """Return the shortest duration that is a whole number of samples at a rate and of envelope
+    steps.
+
+    An envelope step is the time between two computed values of an envelope: 24 samples at 44.1 kHz,
+    or 24.5 where signals run at 22.05 kHz.
 
     Args:
         rate: Sample rate in Hz.
@@ -93,19 +97,24 @@ def _whole_steps(rate_divisor: int) -> int:
 def simulate_cochlea(
     spectrum: Tensor, ratios: Tensor, bank: MultirateBank, corrects_kinks: bool
 ) -> Tensor:
-    """Apply the filter bank and recruitment to spectra, with each channel at its own sample rate.
+    """Simulate the cochlea of impaired ears: split signals into channels, and expand each channel.
+
+    A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
+    each channel by a gain that follows its envelope, and the channels are added up. Each channel is
+    computed at the lowest sample rate that its band allows.
 
     Shape: complex (items, bins), (items, channels) -> complex (items, bins).
 
     Args:
-        spectrum: Spectra of the signals, which are treated as periodic.
-        ratios: Expansion ratio of each channel, from ``hlsim.msbg.recruitment.expansion_ratios``.
-        bank: Filter bank for the length of the signals.
+        spectrum: Fourier transforms of the signals, which are treated as periodic.
+        ratios: dB by which each channel changes per dB of input, from ``expansion_ratios`` in
+            ``hlsim.msbg.recruitment``.
+        bank: Filter bank for signals of this length.
         corrects_kinks: Whether gains of slight losses are corrected where they change suddenly (see
             ``apply_gains``). This is not audible after smearing.
 
     Returns:
-        Spectra of the output of the cochlea.
+        Fourier transforms of the sums of the channels.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> from hlsim.msbg.multirate import multirate_bank
@@ -163,16 +172,19 @@ def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tenso
 
 
 def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
-    """Apply the filter bank and recruitment as pyclarity does, up to the last sample.
+    """Simulate the cochlea of impaired ears as pyclarity does, up to the last sample.
 
-    All channels run at 44.1 kHz, and the envelopes end as those of ``scipy.signal.filtfilt``.
+    A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
+    each channel by a gain that follows its envelope, and the channels are added up. All channels
+    run at 44.1 kHz, which is slower than ``simulate_cochlea``.
 
     Shape: (items, time), (items, channels) -> (items, time).
 
     Args:
         waveform: Signals at 44.1 kHz in Pa.
-        ratios: Expansion ratio of each channel, from ``hlsim.msbg.recruitment.expansion_ratios``.
-        bank: Filter bank.
+        ratios: dB by which each channel changes per dB of input, from ``expansion_ratios`` in
+            ``hlsim.msbg.recruitment``.
+        bank: Filter bank for the severity of the ears.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> waveform = torch.randn(1, 1000)

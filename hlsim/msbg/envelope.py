@@ -51,9 +51,11 @@ POWER_FLOOR = 1e-30
 
 
 def detect(signals: Tensor, harmonics: bool) -> Tensor:
-    """Rectify signals that are sampled too slowly for the high frequencies of a rectified signal.
+    """Compute what rectifying band-pass signals would give, at sample rates too low to rectify
+    them.
 
-    A rectified cosine is |cos a| = 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a + ...). Its slow part is
+    Rectifying a signal at a low rate would fold its harmonics back to low frequencies. A rectified
+    cosine is |cos a| = 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a + ...). Its slow part is
     2 / pi times the modulus of the analytic signal, exp(i a). Therefore the result is pi / 2 times
     the rectified real part, without its harmonics or with the first two of them.
 
@@ -61,8 +63,9 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
 
     Args:
         signals: Analytic signals, complex signals without negative frequencies.
-        harmonics: Include the terms of cos 2a and cos 4a. Wide channels with low centre frequencies
-            need them, because these terms reach down to the frequencies of the envelope.
+        harmonics: Whether the terms of cos 2a and cos 4a are included. Wide bands at low
+            frequencies need them, because these terms reach down to the frequencies of the
+            envelope.
 
     >>> detect(torch.tensor([3.0 + 4.0j]), harmonics=False)
     tensor([5.])
@@ -120,16 +123,17 @@ class _Detect(torch.autograd.Function):
 
 
 def partial_means(rectified: Tensor, weights: Tensor) -> Tensor:
-    """Compute three weighted sums of the samples of each step, the contributions to its average.
+    """Reduce rectified signals to three sums per step, from which ``smooth`` computes envelopes.
 
-    They contribute to the average of the step after, of the same step and of the step before.
-    ``smooth`` adds up the three contributions to each step.
+    A step is a group of neighbouring samples, 24 at 44.1 kHz, with one value of the envelope. This
+    value is a weighted average over three steps. The three sums are what the samples of a step
+    contribute to the averages of the step after, of the same step and of the step before.
 
     Shape: (..., time), (3, samples) -> (..., 3, steps), where time is steps * samples.
 
     Args:
-        rectified: Rectified channels.
-        weights: Weights from ``mean_weights``.
+        rectified: Rectified signals.
+        weights: Weight of each sample of a step in the three sums, from ``mean_weights``.
 
     >>> partial_means(torch.ones(1, 48), torch.from_numpy(mean_weights()).float()).shape
     torch.Size([1, 3, 2])
@@ -138,15 +142,16 @@ def partial_means(rectified: Tensor, weights: Tensor) -> Tensor:
 
 
 def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
-    """Compute envelopes from the averages of rectified channels, with the low-pass of each channel.
+    """Compute the envelopes of channels from the sums of ``partial_means``.
 
-    The signals are treated as periodic: their end is followed by their beginning.
+    The sums that belong to one step are added up, and a low-pass for each channel smooths the
+    result. The signals are treated as periodic: their end is followed by their beginning.
 
     Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
 
     Args:
         sums: Sums from ``partial_means``.
-        lowpass: Frequency responses from ``envelope_lowpass``.
+        lowpass: Frequency responses of the low-passes, from ``envelope_lowpass``.
 
     Returns:
         Envelopes at the first sample of each step.
@@ -161,17 +166,17 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
 
 
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
-    """Compute the envelopes of channels that are sampled at 44.1 kHz, at every 24th sample.
+    """Compute the envelopes of band-pass signals at 44.1 kHz, their magnitudes that vary slowly.
 
-    The channels are rectified and low-passed without delay. They are treated as periodic: their end
-    is followed by their beginning.
+    The signals are rectified and low-passed without delay. One value is computed for every 24
+    samples. The signals are treated as periodic: their end is followed by their beginning.
 
     Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), where
         time is a multiple of 24.
 
     Args:
-        channels: Band-pass signals.
-        lowpass: Frequency responses from ``envelope_lowpass``.
+        channels: Band-pass signals, the channels of a filter bank.
+        lowpass: Frequency responses of the low-passes, from ``envelope_lowpass``.
 
     >>> envelope(torch.full((1, 96), -2.0), torch.ones(1, 3)).round(decimals=3)
     tensor([[2., 2., 2., 2.]])
@@ -187,10 +192,11 @@ def envelope_lowpass(
     channels: slice = slice(None),
     step: float = STEP,
 ) -> NDArray[np.complex128]:
-    """Compute the frequency responses of the low-passes of envelopes, for ``smooth``.
+    """Compute the frequency response of the low-pass that smooths the envelope of each channel.
 
-    Each low-pass is run forwards and backwards, as by pyclarity with ``scipy.signal.filtfilt``. The
-    responses also compensate for the running means, which attenuate high frequencies and are
+    A step is a group of neighbouring samples with one value of the envelope. Each low-pass is run
+    forwards and backwards, as by pyclarity with ``scipy.signal.filtfilt``. The responses also
+    compensate for the averaging in ``partial_means``, which attenuates high frequencies and is
     centred on the middle of a step. ``hlsim.msbg.filtfilt_end`` computes the effect of ``filtfilt``
     on the end of a signal.
 
@@ -224,10 +230,10 @@ def envelope_lowpass(
 
 @lru_cache(maxsize=4)
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Design the recursive low-pass filter of each channel's envelope.
+    """Design the low-pass that smooths the envelope of each channel of a filter bank.
 
-    Its cut-off frequency is 75 Hz, or three quarters of the channel's equivalent rectangular
-    bandwidth if this is lower.
+    It is a recursive filter of second order. Its cut-off frequency is 75 Hz, or three quarters of
+    the channel's equivalent rectangular bandwidth if this is lower.
 
     Returns:
         Numerator and denominator for each channel, three coefficients each.
@@ -271,9 +277,10 @@ def _polynomial_with_roots(roots: NDArray[np.complex128]) -> NDArray[np.float64]
 
 @lru_cache(maxsize=8)
 def mean_weights(samples: int = STEP) -> NDArray[np.float64]:
-    """Compute the weights of the samples of a step in the averages of rectified channels.
+    """Compute the weights for ``partial_means``: how much each sample contributes to averages.
 
-    Three running means, each as long as a step, give the average. It covers three steps.
+    A step is a group of neighbouring samples with one value of the envelope, the average over three
+    steps. Three running means, each as long as a step, give this average.
 
     Args:
         samples: Number of samples per step.

@@ -22,8 +22,8 @@ class FilterBank:
         advances: Number of samples at 44.1 kHz by which each channel is advanced, so that the
             envelopes of all channels are aligned.
         highpass_corners: Corner frequencies of the high-passes of the upper channels, in units of
-            44100 / 8192 Hz. The high-passes are Bessel filters of second order, which attenuate the
-            channels' lower skirts. The lower channels have none.
+            44100 / 8192 Hz. The high-passes are Bessel filters of second order, which attenuate
+            frequencies far below the centre frequency. The lower channels have none.
         recombination_db: Level of the sum of all channels relative to the input in dB.
 
     >>> BANKS["severe"].channels

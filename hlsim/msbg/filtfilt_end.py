@@ -33,7 +33,11 @@ Array = NDArray[np.float64]
 
 
 def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
-    """Compute what ``filtfilt`` adds to the envelopes of channels that end abruptly.
+    """Compute what is to be added to the envelopes of a signal that ends abruptly.
+
+    pyclarity smooths envelopes with ``scipy.signal.filtfilt``, which continues a signal beyond its
+    end. ``hlsim.msbg.envelope.envelope`` lets silence follow the signal. The result is the
+    difference.
 
     Shape: (..., channels, time) -> (..., channels, time // 24).
 
@@ -43,7 +47,7 @@ def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
         length: Number of samples of the signal.
 
     Returns:
-        Summand for the envelopes from ``hlsim.msbg.envelope.envelope``.
+        Difference of the envelopes, one value for every 24 samples.
 
     >>> import torch
     >>> from hlsim.msbg.filterbank import BANKS

@@ -183,7 +183,9 @@ class MSBG(nn.Module):
             return self._simulate(waveform, thresholds, grids)
 
     def delay(self, severity: str) -> int:
-        """Return the delay of filters and frames, by which ``aligned`` advances the output.
+        """Return the delay of the model, which ``aligned=True`` removes from the output.
+
+        It is that of the filters and of the smearing, and depends on the severity of the loss only.
 
         Args:
             severity: Severity of the loss: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.

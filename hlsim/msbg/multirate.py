@@ -73,12 +73,15 @@ analytic signal, or this modulus with two harmonics."""
 
 
 class RateAssignment(NamedTuple):
-    """Choice of a sample rate and a detector for neighbouring channels.
+    """Sample rate at which neighbouring channels of a filter bank are computed.
 
     Attributes:
         channels: Indices of the channels in the filter bank.
-        samples: Number of their samples per envelope step.
-        detector: Signal from which their envelopes are computed.
+        samples: Number of samples for each value of the envelope, of which there are about 1800 per
+            second.
+        detector: Signal from which envelopes are computed: ``"itself"``, the rectified channel;
+            ``"modulus"``, the modulus of its analytic signal; or ``"harmonics"``, this modulus with
+            two harmonics.
 
     >>> RateAssignment(slice(0, 4), samples=6, detector="itself").detector
     'itself'
@@ -91,12 +94,12 @@ class RateAssignment(NamedTuple):
 
 @dataclass(frozen=True)
 class RateBand:
-    """Neighbouring channels that run at one sample rate, with what filters and expands them.
+    """Neighbouring channels of a filter bank that are computed at one sample rate.
 
     Attributes:
         channels: Indices of the channels in the filter bank.
-        points: FFT length at the sample rate of the band.
-        detector: Signal from which envelopes are computed.
+        points: FFT length at this sample rate.
+        detector: Signal from which envelopes are computed, as in ``RateAssignment``.
         response: Frequency responses of the channels, (channels, points // 2 + 1), or of their
             analytic signals, (channels, points).
         mean_weights: Weights for ``hlsim.msbg.envelope.partial_means``, (3, samples per step).
@@ -147,17 +150,19 @@ class MultirateBank:
 def assign_rates(
     bank: FilterBank, rate_divisor: int, highest: float = MSBG_RATE / 2
 ) -> list[RateAssignment]:
-    """Divide the channels of a filter bank into bands with a common sample rate and detector.
+    """Choose the sample rate at which each channel of a filter bank is computed.
 
-    Channels far above ``highest`` are left out; the last channel of the result stands for them.
+    Neighbouring channels with the same choice form one group. Channels far above ``highest`` are
+    left out; the last channel of the result stands for them.
 
     Args:
         bank: Filter bank.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: Highest frequency of interest in Hz, at most 11025 for signals at 22.05 kHz.
+        highest: Highest frequency in Hz that the output needs, at most 11025 for signals at 22.05
+            kHz.
 
     Returns:
-        Assignment of each band, the lowest channels first.
+        Choice for each group of channels, the lowest channels first.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> for band in assign_rates(BANKS["moderate"], rate_divisor=2, highest=8000.0):
@@ -216,10 +221,11 @@ def multirate_bank(
     """Build a filter bank for signals of one length, with each channel at its own sample rate.
 
     Args:
-        bank: Filter bank, whose channels are to be computed.
-        points: FFT length of the signals at 44.1 kHz, a whole number of envelope steps.
+        bank: Parameters of the filter bank.
+        points: FFT length of the signals at 44.1 kHz, from ``cochlea_fft_length`` in
+            ``hlsim.msbg.cochlea``.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: Highest frequency of interest in Hz.
+        highest: Highest frequency in Hz that the output needs.
         dtype: Precision of real tensors, and of the parts of complex ones.
         device: Device of the tensors.
 

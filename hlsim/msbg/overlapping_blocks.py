@@ -77,9 +77,8 @@ def in_blocks(
 def block_bounds(samples: int, rate: int) -> list[Block]:
     """Divide the samples of a signal into overlapping blocks of 8 s.
 
-    Each block begins at a multiple of the hop of smearing and of the step of envelopes, so that
-    frames and steps are those of the whole signal. The overlap is longer than the filters take to
-    settle.
+    Each block begins where the frames of smearing and the values of envelopes lie at the same
+    samples as in the whole signal. The overlap is longer than the filters of MSBG take to settle.
 
     Args:
         samples: Length of the signal.

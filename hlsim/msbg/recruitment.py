@@ -51,10 +51,10 @@ _DIP_RATIO = 0.3
 
 
 def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
-    """Compute how many dB the perceived level of each channel changes per dB of input.
+    """Compute how many dB the perceived level in each channel changes per dB of input.
 
-    This expansion ratio is 105 / (105 - threshold), where 105 dB SPL is the level at which an
-    impaired ear perceives sounds as loud as a normal one.
+    The channels are the bands of a filter bank. This expansion ratio is 105 / (105 - threshold),
+    where 105 dB SPL is the level at which an impaired ear perceives sounds as loud as a normal one.
 
     Shape: (..., frequencies), (frequencies, channels) -> (..., channels).
 
@@ -94,7 +94,10 @@ def threshold_weights(
 
 
 def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """Compute the gain (envelope / pressure at 105 dB SPL) ** (ratio - 1) of each channel and step.
+    """Compute the gains that make soft sounds softer, as an impaired ear perceives them.
+
+    The gain of a channel of the filter bank is (envelope / pressure at 105 dB SPL) ** (ratio - 1).
+    It is computed once per step, a group of neighbouring samples with one value of the envelope.
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
 
@@ -112,9 +115,10 @@ def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
 
 def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
-    """Interpolate values at the first sample of each step to all samples.
+    """Interpolate gains or envelopes, of which there is one value per step, to all samples.
 
-    The values are treated as periodic: the last one is followed by the first.
+    A step is a group of neighbouring samples, 24 at 44.1 kHz, and its value is that at its first
+    sample. The values are treated as periodic: the last one is followed by the first.
 
     Shape: (..., steps), (rows, columns) -> (..., time).
 
@@ -145,8 +149,9 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
 def apply_gains(
     channels: Tensor, gains: Tensor, kernel: Tensor, slight: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Interpolate gains, multiply the channels by them and add up the channels.
+    """Multiply the channels of a filter bank by gains that vary in time, and add up the channels.
 
+    There is one gain per step, a group of neighbouring samples; the gains between are interpolated.
     Where the envelope goes through zero, because its low-pass overshoots, the gain changes
     suddenly. After a slight loss this is audible, because the inverse of the middle ear amplifies
     high frequencies by up to 40 dB. There, the envelope is interpolated instead of the gain.
@@ -155,7 +160,7 @@ def apply_gains(
 
     Args:
         channels: Band-pass signals.
-        gains: Gain of each channel and step.
+        gains: Gain of each channel and step, from ``recruitment_gains``.
         kernel: Weights from ``interpolation_kernel``.
         slight: Envelopes, (..., channels, steps), and expansion ratios, (..., channels). They are
             needed if some ears have a slight loss.
@@ -255,7 +260,9 @@ def _find_dips(envelopes: Tensor) -> Tensor:
 
 
 def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """Apply recruitment to channels that are sampled at 44.1 kHz, and add up the channels.
+    """Make soft sounds in the channels of a filter bank softer, as an impaired ear perceives them.
+
+    Each channel is multiplied by a gain that follows its envelope, and the channels are added up.
 
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
 
@@ -277,10 +284,11 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 def interpolation_kernel(
     samples: int = STEP, repeats: int = 1, steps_per_window: int = 8
 ) -> NDArray[np.float64]:
-    """Compute the weights with which ``interpolate`` turns values of steps into values of samples.
+    """Compute the weights with which ``interpolate`` turns one value per step into one per sample.
 
-    The value of each sample is interpolated from those of six steps by Lagrange's polynomial of
-    fifth order. One matrix product interpolates a window of several steps.
+    A step is a group of neighbouring samples. The value of each sample is interpolated from those
+    of six steps by Lagrange's polynomial of fifth order. One matrix product interpolates a window
+    of several steps.
 
     Args:
         samples: Number of samples per step.

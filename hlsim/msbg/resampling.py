@@ -79,7 +79,7 @@ def from_spectrum(
     gain: float,
     delay: int,
 ) -> Tensor:
-    """Compute the output of MSBG from the spectrum of the output of the cochlea.
+    """Compute the output of MSBG from the spectrum of what leaves the cochlea.
 
     This applies the inverse of the outer and middle ear, the final low-pass and a gain, removes the
     delay, and resamples to the rate of the output.
@@ -121,12 +121,15 @@ def from_cochlea(
     rate_divisor: int = 1,
     delay: int = 0,
 ) -> Tensor:
-    """Compute the output of MSBG from the output of the cochlea, as ``from_spectrum`` does.
+    """Compute the output of MSBG from the signal that leaves the cochlea.
+
+    This applies the inverse of the outer and middle ear, the final low-pass and a gain, removes the
+    delay, and resamples to the rate of the output.
 
     Shape: (items, time) -> (items, samples).
 
     Args:
-        waveform: Output of the cochlea.
+        waveform: Signals that leave the cochlea.
         rate: Sample rate of the output in Hz.
         samples: Number of samples of the output.
         gain: Linear gain of the output.

@@ -35,7 +35,10 @@ _MIN_RELATIVE_MAGNITUDE = 0.1
 
 
 def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.complex128]:
-    """Compute the frequency response of aligned MSBG where the gains of all channels are 1.
+    """Compute the frequency response of MSBG for sounds that it does not make softer.
+
+    MSBG is linear where the gains of all channels of its filter bank are 1, as for a normal ear.
+    The response is that of aligned MSBG, without a delay.
 
     Args:
         bank: Filter bank of a severity, a value of ``hlsim.msbg.filterbank.BANKS``.
@@ -159,8 +162,8 @@ def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
 def half_length(rate: int) -> int:
     """Return half the length in samples of MSBG's linear impulse responses, 64 ms.
 
-    The responses of MSBG where its gains are 1 have this number of samples before time 0, and as
-    many from time 0 on.
+    These are the responses of MSBG for sounds that it does not make softer. They have this number
+    of samples before time 0, and as many from time 0 on.
 
     Args:
         rate: Sample rate in Hz.

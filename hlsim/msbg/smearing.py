@@ -128,10 +128,10 @@ def smearing_from_filters(
 def smearing_matrix(
     severity: str, rate_divisor: int = 1, highest: float = MSBG_RATE / 2.0
 ) -> NDArray[np.float64]:
-    """Compute the matrix that smears the power spectra of frames for a severity of hearing loss.
+    """Compute the matrix that blurs power spectra as an impaired ear does, for ``smear``.
 
     Args:
-        severity: ``"mild"``, ``"moderate"`` or ``"severe"``.
+        severity: Severity of the hearing loss, ``"mild"``, ``"moderate"`` or ``"severe"``.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
         highest: Highest frequency of the signals in Hz. Above it, the matrix has only the 800 Hz
             into which smearing spreads them.
@@ -159,10 +159,11 @@ def _whole_matrix(severity: str) -> NDArray[np.float64]:
 
 
 def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
-    """Smear the spectra of waveforms.
+    """Blur the spectra of waveforms, as the wide auditory filters of an impaired ear do.
 
-    At 44.1 kHz, the result equals that of pyclarity's ``smear3``, with its delay of three hops and
-    its irregular first frames.
+    The waveforms are cut into frames of 5.8 ms, one every 1.5 ms (a hop), and the power spectrum of
+    each frame is multiplied by a matrix. At 44.1 kHz, the result equals that of pyclarity's
+    ``smear3``, with its delay of three hops and its irregular first frames.
 
     Shape: (..., time), (bins, bins) -> (..., hop * (ceil(time / hop) + 3)), where hop is
         64 / rate_divisor.
@@ -217,7 +218,7 @@ def smear_spectrum(
 
     Args:
         spectrum: Spectra of pressures in Pa.
-        matrix: Smearing matrix of all items, or one per item.
+        matrix: Matrix by which power spectra are multiplied: one for all items, or one per item.
         gradient_floor: Bound of the gradients, which are computed as if smearing multiplied each
             power by this factor at least and by its reciprocal at most. With 0, gradients have no
             bound where smearing changes the sign of a power or fills an empty frequency.
