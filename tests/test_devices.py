@@ -50,14 +50,6 @@ def simulate(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave, ears)
 
 
-def simulate_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
-    return module(wave.unflatten(0, (2, 2)), ears.unflatten(0, (2, 2)))
-
-
-def simulate_host_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
-    return module(wave, EARS)
-
-
 def simulate_own_ear(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave)
 
@@ -70,37 +62,40 @@ def compare_for_own_ear(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) 
     return module(wave, clean)
 
 
-def compare_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
-    return module(wave.unflatten(0, (2, 2)), clean.unflatten(0, (2, 2)), ears.unflatten(0, (2, 2)))
+def in_pairs(call: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Return a call with signals and ears of two listeners with two ears each."""
+    return lambda module, *tensors: call(module, *(x.unflatten(0, (2, 2)) for x in tensors))
 
 
 def score(measure: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda module, wave, clean, ears: measure(wave, clean, ears, lengths=LENGTHS)
 
 
-def score_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
-    return mbstoi(wave.unflatten(0, (2, 2)), clean.unflatten(0, (2, 2)), lengths=LENGTHS[::2])
-
-
 CALLS: dict[str, Call] = {
     # the exact model reads the severity of ears that it does not know from the CPU
     "msbg": Call(partial(MSBG, sample_rate=16000), simulate, waits=1),
     "msbg at 44.1 kHz": Call(partial(MSBG, sample_rate=44100), simulate, waits=1),
-    "msbg, ears on the host": Call(partial(MSBG, sample_rate=16000), simulate_host_ears),
+    "msbg, ears on the host": Call(
+        partial(MSBG, sample_rate=16000), lambda module, wave, *_: module(wave, EARS)
+    ),
     "msbg, own ear": Call(partial(MSBG, N3, sample_rate=16000), simulate_own_ear),
     "msbg, late, own ear": Call(
         partial(MSBG, N3, aligned=False, rescale_active=True), simulate_own_ear
     ),
     "loss through msbg": Call(partial(HearingLossLoss, simulator="msbg"), compare, waits=1),
-    "interaural loss": Call(partial(HearingLossLoss, criterion="interaural"), compare_two_ears),
+    "interaural loss": Call(partial(HearingLossLoss, criterion="interaural"), in_pairs(compare)),
     "mapping": Call(MappingCompensator, simulate),
-    "linked wdrc": Call(partial(WDRC, linked=True), simulate_two_ears),
+    "linked wdrc": Call(partial(WDRC, linked=True), in_pairs(simulate)),
 }
 # the number of waits of scores does not depend on the number of items
 CALLS["haspi"] = Call(nn.Identity, score(haspi), waits=3)
 CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=4)
 CALLS["haaqi"] = Call(nn.Identity, score(haaqi), waits=4)
-CALLS["mbstoi"] = Call(nn.Identity, score_two_ears, waits=2)
+CALLS["mbstoi"] = Call(
+    nn.Identity,
+    in_pairs(lambda module, wave, clean, ears: mbstoi(wave, clean, lengths=LENGTHS[::2])),
+    waits=2,
+)
 for name in ("neuro-msbg", "neuro-msbg-mamba", "neuro-msbg-lstm", "neuro-msbg-transformer"):
     CALLS[name] = Call(partial(load_pretrained, name), simulate)
 CALLS["neuro-msbg at 44.1 kHz"] = Call(

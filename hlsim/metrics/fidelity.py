@@ -1,4 +1,7 @@
-"""Errors and scores that show how closely a simulator agrees with its teacher."""
+"""Errors and scores that compare two signals, or two lists of scores.
+
+They show how closely a network agrees with the hearing-loss simulator that it has learned.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +30,14 @@ _BAND_RANGE_DB = 50.0
 """Level of a band below that of the loudest band at which the band is ignored."""
 
 _MIN_BAND_RATIO = 1e-12
-"""Smallest power of a band relative to the loudest band, -120 dB."""
+"""Smallest power of a band, relative to the loudest band, that is distinguished: -120 dB."""
 
 _MIN_ERROR_POWER = 1e-20
 """Smallest relative power of an error, so that the SNR is finite, as JSON requires."""
 
 
 class Score(NamedTuple):
-    """A score, or the reason why it does not exist.
+    """Score of one signal, or the reason why the signal has none.
 
     Attributes:
         value: Score, or None.
@@ -49,11 +52,14 @@ class Score(NamedTuple):
 
 
 def snr_db(reference: Signal, estimate: Signal) -> float:
-    """Compute the power of the reference relative to that of the error in dB, at most 200 dB.
+    """Compute the signal-to-noise ratio: the power of the reference over that of the error, in dB.
 
     Args:
         reference: Expected samples. Shape: (time,).
         estimate: Samples to compare. Shape: (time,).
+
+    Returns:
+        Ratio in dB, at most 200.
 
     Raises:
         ValueError: The shapes differ, a sample is not finite, or the reference is silent.
@@ -65,10 +71,10 @@ def snr_db(reference: Signal, estimate: Signal) -> float:
 
 
 def raw_mse(reference: Signal, estimate: Signal) -> float:
-    """Compute the mean squared error of a waveform relative to the power of the reference.
+    """Compute the mean squared error of a waveform, divided by the mean square of the reference.
 
-    Without this normalisation, the error would be proportional to the power of the signals, so that
-    soft items would not count. The Neuro-MSBG paper does not state how it scales its RAW MSE.
+    Without the division, soft items would not count. The Neuro-MSBG paper does not state how it
+    scales this measure, which it calls RAW MSE.
 
     Args:
         reference: Expected samples. Shape: (time,).
@@ -85,11 +91,11 @@ def raw_mse(reference: Signal, estimate: Signal) -> float:
 
 
 def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int) -> float:
-    """Compute the median absolute difference of band levels in dB.
+    """Compute the median over frequency bands of the difference of two signals' levels in dB.
 
-    The bands are one-third octaves from 125 Hz to 7 kHz of the spectrum of the whole signal. Bands
-    more than 50 dB below the loudest band of the reference are ignored. Levels of the estimate
-    count as at most 120 dB below this band.
+    The bands are one-third octaves from 125 Hz to 7 kHz of the spectrum of the whole signal. Signs
+    do not count. Bands more than 50 dB below the loudest band of the reference are ignored. Levels
+    of the estimate count as at most 120 dB below this band.
 
     Args:
         reference: Expected samples. Shape: (time,).
@@ -135,7 +141,7 @@ def _band_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarra
 
 
 def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
-    """Compute the short-time objective intelligibility with pystoi.
+    """Compute the short-time objective intelligibility (STOI), about 0 to 1, with pystoi.
 
     Silence and less than 0.4 s of speech have no score.
 
@@ -159,11 +165,11 @@ def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
 
 
 def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
-    """Compute wide-band PESQ with pesq at 16 kHz, to which other rates are resampled.
+    """Compute wide-band PESQ, the quality of speech from about 1 to 4.6, with the package pesq.
 
-    Silence and signals without detectable speech have no score. Version 0.0.4 of pesq crashed on 90
-    s of noise in 90 bursts. If you score minutes of speech, use two processes or more, which
-    survive such a crash.
+    Signals are resampled to 16 kHz. Silence and signals without detectable speech have no score.
+    Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts. If you score minutes of speech, use
+    two processes or more, which survive such a crash.
 
     Source: ITU-T P.862.2.
 
@@ -192,7 +198,12 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
 def linear_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
     """Compute Pearson's correlation of scores (LCC).
 
-    Returns: correlation, or None for fewer than two scores or scores that are all equal.
+    Args:
+        expected_scores: Scores to predict. Shape: (items,).
+        scores: Scores that predict them. Shape: (items,).
+
+    Returns:
+        Correlation, or None for fewer than two scores or scores that are all equal.
 
     Raises:
         ValueError: The numbers of scores differ, or a score is not finite.
@@ -206,7 +217,12 @@ def linear_correlation(expected_scores: Iterable[float], scores: Iterable[float]
 def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
     """Compute Spearman's rank correlation of scores (SRCC), with mean ranks for equal scores.
 
-    Returns: correlation, or None for fewer than two scores or scores that are all equal.
+    Args:
+        expected_scores: Scores to predict. Shape: (items,).
+        scores: Scores that predict them. Shape: (items,).
+
+    Returns:
+        Correlation, or None for fewer than two scores or scores that are all equal.
 
     Raises:
         ValueError: The numbers of scores differ, or a score is not finite.
@@ -218,7 +234,11 @@ def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) 
 
 
 def mean_squared_error(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
-    """Compute the mean squared difference of scores, or None if there are none.
+    """Compute the mean squared difference of two lists of scores, or None if they are empty.
+
+    Args:
+        expected_scores: Scores to predict. Shape: (items,).
+        scores: Scores that predict them. Shape: (items,).
 
     Raises:
         ValueError: The numbers of scores differ, or a score is not finite.

@@ -1,4 +1,7 @@
-"""Differences of level and time between two ears, the cues by which listeners localise sounds."""
+"""Differences of level and time between two ears, by which listeners localise sounds.
+
+They are computed in five octaves around 250 Hz to 4 kHz, for reports and as a training loss.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +33,16 @@ HALF_WEIGHT_RATIO = 1e-4
 
 
 class Interaural(NamedTuple):
-    """Interaural differences in each octave, NaN where an ear is silent. Shape: (..., 5) each.
+    """Differences between the ears in each of five octaves, NaN where an ear is silent.
+
+    The octaves are those of ``OCTAVES``. Shape of each attribute: (..., 5).
 
     Attributes:
         level: Level of the left ear minus that of the right ear in dB.
-        time: Time in microseconds by which the left ear leads, from -1000 to 1000.
-        coherence: Correlation of the ears at this time difference, from 0 to 1. The time difference
-            is meaningful where it is close to 1.
+        time: Time in microseconds by which the left ear receives the sound earlier, from -1000 to
+            1000.
+        coherence: Correlation of both ears' signals after a shift by this time, from 0 to 1. The
+            time difference is meaningful where it is close to 1.
 
     >>> Interaural(torch.zeros(5), torch.zeros(5), torch.ones(5)).coherence
     tensor([1., 1., 1., 1., 1.])
@@ -48,9 +54,9 @@ class Interaural(NamedTuple):
 
 
 def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
-    """Compute the differences of level and time between two ears.
+    """Compute the differences of level and time between two ears over a whole signal.
 
-    They refer to the whole signal. The time difference is the delay with the largest
+    The time difference is the delay with the largest
     cross-correlation of the waveforms. Above 1.5 kHz, listeners perceive delays of the envelope
     instead.
 
@@ -88,14 +94,16 @@ def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
 
 
 def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000) -> Interaural:
-    """Compute the change of interaural differences by an aid.
+    """Compute how an aid changes the differences of level and time between two ears.
 
     Args:
         before: Input of the aid for the left and the right ear. Shape: (..., 2, time).
         after: Output of the aid for the left and the right ear. Shape: (..., 2, time).
         sample_rate: Sample rate in Hz.
 
-    Returns: Changes of the differences of level and time, and the coherence of the output.
+    Returns:
+        Difference of the output minus that of the input, for level and time, and the coherence of
+        the output.
 
     Raises:
         ValueError: A waveform has another shape, or the rate is out of range.
@@ -112,18 +120,19 @@ def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000
 
 
 def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
-    """Compute the error of interaural differences, which is invariant to equal gains and delays.
+    """Compute how much an aid changes the differences between the ears, as a loss for training.
 
-    The loss is a weighted mean over octaves of the error of the level difference in bels, and 1
-    minus the cosine of the error of the phase difference. Octaves in which the clean signal is soft
-    have less weight.
-
-    Shape: (..., 2, time), (..., 2, time) -> (...).
+    Gains and delays that are equal in both ears do not count. The loss of an octave is the error of
+    the level difference in bels, plus 1 minus the cosine of the error of the phase difference. The
+    result is a mean over octaves, in which octaves where clean speech is soft have less weight.
 
     Args:
-        processed: Output of an aid for the left and the right ear in Pa.
-        clean: Clean speech at the left and the right ear in Pa.
+        processed: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).
+        clean: Clean speech at the left and the right ear in Pa. Shape: (..., 2, time).
         sample_rate: Sample rate in Hz.
+
+    Returns:
+        Losses. Shape: (...).
 
     >>> noise = torch.randn(2, 16000)
     >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)

@@ -17,9 +17,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from compensators.nalr import nalr_gains_db
-from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.dsp.windows import hamming
@@ -121,29 +118,7 @@ class QualityReference(Reference):
 
     envelope_segment: ClassVar[int]
 
-    def __init__(
-        self,
-        clean: Tensor,
-        audiogram: AudiogramLike,
-        *,
-        sample_rate: int = 16000,
-        full_scale_spl: float = PASCAL_SPL,
-        lengths: Lengths | None = None,
-        whole_khz: bool = False,
-        keep: bool = True,
-    ) -> None:
-        super().__init__(
-            clean,
-            audiogram,
-            sample_rate=sample_rate,
-            full_scale_spl=full_scale_spl,
-            lengths=lengths,
-            whole_khz=whole_khz,
-            keep=keep,
-        )
-
     def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
-        assert self._audiogram is not None
         ears = signals.thresholds(self._audiogram)
         host_ears = signals.thresholds(self._audiogram, host=True).detach().double()
 

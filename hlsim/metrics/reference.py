@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_choice
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
@@ -122,11 +123,11 @@ class Reference:
         clean: Tensor,
         audiogram: AudiogramLike | None,
         *,
-        sample_rate: int,
-        full_scale_spl: float,
-        lengths: Lengths | None,
-        whole_khz: bool,
-        keep: bool,
+        sample_rate: int = 16000,
+        full_scale_spl: float = PASCAL_SPL,
+        lengths: Lengths | None = None,
+        whole_khz: bool = False,
+        keep: bool = True,
     ) -> None:
         self._audiogram = audiogram
         self._signals = CleanSpeech(

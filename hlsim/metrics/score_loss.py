@@ -1,4 +1,4 @@
-"""HASPI and HASQI as parts of a loss, for batches that may hold silence and clicks."""
+"""HASPI and HASQI as losses, for training batches that may hold silence and clicks."""
 
 from __future__ import annotations
 
@@ -24,21 +24,23 @@ def score_loss(
     ends: Sequence[int],
     sample_rate: int,
 ) -> Tensor:
-    """Compute 1 minus a score of each item, with the expected effect of the ear's internal noise.
+    """Compute 1 minus the score of each item, for training.
 
-    An item whose clean signal is hardly audible (silent, below 20 dB SPL, a click, or for HASPI
-    below the threshold of hearing) has no meaningful score. It counts 0 and has no gradient. An
-    item with NaN or infinity in ``processed`` gives NaN.
+    The ear's internal noise counts with its mean effect, so the loss is smooth. An item whose clean
+    signal is hardly audible (silent, below 20 dB SPL, a click, or for HASPI below the threshold of
+    hearing) has no meaningful score: its loss is 0 and has no gradient. An item with NaN or
+    infinity in ``processed`` has the loss NaN.
 
     Args:
-        name: Key of ``SCORES``.
-        processed: Output of the compensator in pascals.
-        clean: Clean speech in pascals, whose gradient is not followed.
-        ears: Thresholds in dB HL.
+        name: Name of the score, ``"haspi"`` or ``"hasqi"``.
+        processed: Output of the compensator in pascals. Shape: (items, time).
+        clean: Clean speech in pascals, for which no gradient is computed. Shape: (items, time).
+        ears: Thresholds of the impaired ear of each item in dB HL. Shape: (items, 8).
         ends: Number of samples of each item.
         sample_rate: Sample rate in Hz.
 
-    Shape: (items, time) twice, (items, 8) -> (items,).
+    Returns:
+        Loss of each item, 0 to 1. Shape: (items,).
 
     Raises:
         ValueError: An item is shorter than 0.7 s.
@@ -62,7 +64,7 @@ def _score_loss(
     ends: Sequence[int],
     **options: Any,
 ) -> Tensor:
-    """``score_loss`` of finite items. Shape: (items, time) twice, (items, 8) -> (items,)."""
+    """Compute ``score_loss`` of items whose samples are finite. Shape: -> (items,)."""
     try:
         return 1.0 - score(processed, clean, ears, lengths=ends, **options)
     except UnscorableError:

@@ -1,4 +1,4 @@
-"""Prediction of the words that a listener understands from HASPI, with its uncertainty.
+"""Prediction of the share of words that a listener understands, from HASPI, with its uncertainty.
 
 The model was fitted by ``examples/fit_words.py``, which describes it, to 2001 responses of 22
 hearing-impaired listeners to sentences through ten hearing aids.
@@ -32,7 +32,10 @@ DRAWS = 4000
 
 
 class Curve(NamedTuple):
-    """Parameters of the model of the words understood.
+    """Parameters of the model that predicts the share of words that a listener understands.
+
+    The logit of the share is linear in HASPI: an intercept, and slopes that differ within and
+    between aids. Intercepts and slopes differ between listeners, and intercepts between aids.
 
     Attributes:
         coefficients: Intercept of the logit at a HASPI of 0.5, slope within an aid, and slope
@@ -59,12 +62,12 @@ class Curve(NamedTuple):
 
 
 class WordsChange(NamedTuple):
-    """Proportion of words that a new listener understands with two aids, and its change.
+    """Proportion of words that a new listener understands with a first and with a second aid.
 
     Attributes:
-        before: Proportion with the first aid.
-        after: Proportion with the second aid.
-        change: Mean change over listeners.
+        before: Mean proportion with the first aid, 0 to 1.
+        after: Mean proportion with the second aid, 0 to 1.
+        change: Mean of the change from the first to the second aid over listeners.
         low: Lower end of the interval of the change.
         high: Upper end of the interval of the change.
 
@@ -81,7 +84,7 @@ class WordsChange(NamedTuple):
 
 @cache
 def load_curve() -> Curve:
-    """Load the model that was fitted to the listeners' responses.
+    """Load the parameters that were fitted to listeners' responses.
 
     >>> len(load_curve().coefficients)
     3
@@ -93,7 +96,7 @@ def load_curve() -> Curve:
 def words_change(
     before: ArrayLike, after: ArrayLike, *, interval: float = 0.9, seed: int = 0
 ) -> WordsChange:
-    """Predict the words that a new listener understands with two aids from HASPI.
+    """Predict from HASPI how many words a new listener understands with two aids.
 
     In a test with listeners that were left out of the fit, 88 to 92 of 100 changes lay in the
     interval of 0.9.
@@ -117,7 +120,7 @@ def words_change(
     if not 0.0 < interval < 1.0:
         raise ValueError(f"expected interval between 0 and 1, got {interval!r}")
     aids = [_check_scores("before", before), _check_scores("after", after)]
-    proportion_before, proportion_after = simulate_proportions(load_curve(), aids, seed)
+    proportion_before, proportion_after = _simulate_proportions(load_curve(), aids, seed)
     change = proportion_after - proportion_before
     low, high = np.quantile(change, [0.5 - interval / 2.0, 0.5 + interval / 2.0])
     return WordsChange(
@@ -145,38 +148,33 @@ def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
 
 
 def simulate_changes(curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0) -> Array:
-    """Simulate the change of the proportion of words from the first to the second of two aids.
+    """Simulate by how much listeners understand more words with the second of two aids.
 
     Args:
         curve: Parameters of the model.
-        aids: HASPI of each sentence, and mean HASPI, with each aid.
+        aids: For each aid, HASPI of each sentence and the mean HASPI of the aid.
         seed: Seed of the simulated listeners.
 
-    Returns: Change for each listener. Shape: (draws,).
+    Returns:
+        Change of the proportion of words for each listener. Shape: (4000,).
 
     >>> scores = np.full(20, 0.6)
     >>> simulate_changes(load_curve(), [(scores, 0.6), (scores, 0.6)]).shape
     (4000,)
     """
-    before, after = simulate_proportions(curve, aids, seed)
+    before, after = _simulate_proportions(curve, aids, seed)
     return after - before
 
 
-def simulate_proportions(
-    curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0
+def _simulate_proportions(
+    curve: Curve, aids: Sequence[tuple[Array, float]], seed: int
 ) -> list[Array]:
     """Simulate the proportion of words that listeners understand with each aid.
 
-    Args:
-        curve: Parameters of the model.
-        aids: HASPI of each sentence, and mean HASPI, with each aid.
-        seed: Seed of the simulated listeners.
+    The arguments are those of ``simulate_changes``.
 
-    Returns: Proportion for each listener, with each aid. Shape: (draws,) each.
-
-    >>> scores = np.full(20, 0.6)
-    >>> len(simulate_proportions(load_curve(), [(scores, 0.6), (scores, 0.6)]))
-    2
+    Returns:
+        Proportion for each listener, with each aid. Shape: (4000,) each.
     """
     random = np.random.default_rng(seed)
     coefficients = random.multivariate_normal(curve.coefficients, curve.covariance, DRAWS)

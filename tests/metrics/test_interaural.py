@@ -56,12 +56,9 @@ def test_different_gains_of_an_aid_change_the_level_difference(scene: Tensor) ->
     assert not bool(change.time.any())
 
 
-def test_differences_from_a_silent_ear_are_nan(scene: Tensor) -> None:
+def test_differences_from_a_silent_ear_are_nan_and_one_channel_is_rejected(scene: Tensor) -> None:
     one_silent_ear = torch.stack((scene[0], torch.zeros(16000)))
     assert bool(torch.stack(interaural(one_silent_ear)).isnan().all())
-
-
-def test_one_channel_is_rejected(scene: Tensor) -> None:
     with pytest.raises(ValueError):
         interaural(scene[0])
 
@@ -77,20 +74,15 @@ def test_the_loss_depends_only_on_differences_between_the_ears(scene: Tensor) ->
     assert float(loss_of_silence) == pytest.approx(0.0, abs=1e-5)
 
 
-@pytest.mark.parametrize("gain", [0.5, 0.0])
-def test_the_loss_and_its_gradient_are_finite(scene: Tensor, gain: float) -> None:
-    output = (gain * scene).requires_grad_()
+@pytest.mark.parametrize("left", [1.0, 0.0])
+@pytest.mark.parametrize("right", [0.5, 1e-3, 1e-6, 0.0])
+def test_a_nearly_silent_ear_has_a_small_gradient(scene: Tensor, left: float, right: float) -> None:
+    output = (scene * torch.tensor([[left], [right]])).requires_grad_()
     value = interaural_loss(output, scene, 16000)
     (gradient,) = torch.autograd.grad(value, output)
     assert bool(value.isfinite()) and bool(gradient.isfinite().all())
-
-
-@pytest.mark.parametrize("gain", [1e-3, 1e-6, 0.0])
-def test_a_nearly_silent_ear_has_a_small_gradient(scene: Tensor, gain: float) -> None:
-    output = (scene * torch.tensor([[1.0], [gain]])).requires_grad_()
-    (gradient,) = torch.autograd.grad(interaural_loss(output, scene, 16000), output)
-    # With a constant floor of the cross power, the norm would be 7e6.
-    assert float(gradient[1].norm()) < 1e4
+    if left:  # with a constant floor of the cross power, the norm would be 7e6
+        assert float(gradient[1].norm()) < 1e4
 
 
 def test_as_a_part_of_the_training_loss_it_restores_the_differences(scene: Tensor) -> None:

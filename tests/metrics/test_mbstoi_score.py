@@ -86,23 +86,15 @@ def test_equals_pyclarity_of_silence(
     assert float(mbstoi(y, x)) == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_a_batch_equals_its_items(scenes: tuple[Tensor, Tensor]) -> None:
-    clean, noisy = scenes
-    clean, noisy = torch.stack([clean, clean.flip(0)]), torch.stack([noisy, clean.flip(0)])
-    scores = mbstoi(noisy, clean)
-    pairs = zip(noisy.flatten(0, 1), clean.flatten(0, 1), strict=True)
-    items = torch.stack([mbstoi(y, x) for y, x in pairs]).reshape(2, 3)
-    torch.testing.assert_close(scores, items, atol=1e-12, rtol=0.0)
-
-
-def test_padded_items_equal_single_ones(scenes: tuple[Tensor, Tensor]) -> None:
-    ends = (24000, 17011, 12000)
+@pytest.mark.parametrize("ends", [(24000, 24000, 24000), (24000, 17011, 12000)])
+def test_a_batch_equals_its_items(scenes: tuple[Tensor, Tensor], ends: tuple[int, ...]) -> None:
     is_inside = torch.arange(24000) < torch.tensor(ends)[:, None, None]
     clean, noisy = (torch.where(is_inside, signal, 0.0) for signal in scenes)
     items = [
         float(mbstoi(y[:, :end], x[:, :end])) for y, x, end in zip(noisy, clean, ends, strict=True)
     ]
-    assert mbstoi(noisy, clean, lengths=ends).tolist() == pytest.approx(items, abs=1e-12)
+    scores = mbstoi(noisy[:, None], clean[:, None], lengths=torch.tensor(ends)[:, None])
+    assert scores.shape == (3, 1) and scores.flatten().tolist() == pytest.approx(items, abs=1e-12)
 
 
 def test_identical_signals_score_1_and_the_level_does_not_count(
@@ -146,20 +138,6 @@ def test_gradient_equals_finite_differences(scenes: tuple[Tensor, Tensor]) -> No
     assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-3)
 
 
-def test_steps_along_the_gradient_raise_the_score(scenes: tuple[Tensor, Tensor]) -> None:
-    clean, noisy = (signal.float() for signal in scenes)
-    processed = noisy.clone().requires_grad_()
-    optimiser = torch.optim.Adam([processed], lr=0.02 * float(noisy.std()))
-    scores = []
-    for _ in range(5):
-        optimiser.zero_grad()
-        score = mbstoi(processed, clean)
-        (1.0 - score).mean().backward()
-        optimiser.step()
-        scores.append(score.detach())
-    assert bool((torch.stack(scores).diff(dim=0) > 0.0).all())
-
-
 def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
     clean, noisy = scenes
     processed = noisy.clone()
@@ -186,6 +164,7 @@ def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
         {"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)},
         {"sample_rate": 8000},
         {"lengths": [16000, 16000]},
+        {"clean": torch.full((2, 16000), math.inf)},
     ],
 )
 def test_bad_arguments_raise_value_error(change: dict[str, Any]) -> None:

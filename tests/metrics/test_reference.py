@@ -1,6 +1,5 @@
 """Items are scored on several cores without a change of any score or setting."""
 
-from collections.abc import Iterator
 from threading import get_ident
 
 import pytest
@@ -12,14 +11,7 @@ from hlsim.metrics import haspi, hasqi
 from hlsim.metrics.reference import map_on_cores
 
 SIGNAL = torch.zeros(1)
-
-
-@pytest.fixture(autouse=True)
-def two_threads() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("two_threads")
 
 
 def test_calls_run_in_other_threads_that_compute_alone() -> None:

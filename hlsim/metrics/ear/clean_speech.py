@@ -206,7 +206,7 @@ class CleanSpeech:
             signals = CleanSpeech(clean, *self._settings, ends, self._whole_khz, self._score_name)
         return processed.reshape(-1, time), signals
 
-    def thresholds(self, audiogram: AudiogramLike, *, host: bool = False) -> Tensor:
+    def thresholds(self, audiogram: AudiogramLike | None, *, host: bool = False) -> Tensor:
         """Return the thresholds of the ear that hears each item.
 
         Args:
