@@ -231,61 +231,58 @@ def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, A
     speech = set_level(speech, 65.0)
     noise = torch.randn(len(speech), generator=torch.Generator().manual_seed(0))
     other, *quiet = (set_level(noise, level) for level in (65.0, *QUIET_LEVELS))
-    signals = [*make_changing_signals(speech, other, CHANGE_POSITIONS), *quiet]
+
+    def process(signal: Tensor, ear: Audiogram) -> Tensor:
+        return _aid_outputs(aid, [signal], ear)[0]
+
     with one_thread():
         start = time.process_time()
-        aided = _aid_outputs(aid, signals, ear)
+        samples = measure_look_ahead(process, ear, speech, other, CHANGE_POSITIONS)
+        aided = [process(signal, ear) for signal in quiet]
         seconds = time.process_time() - start
-    samples = count_look_ahead(aided[: -len(quiet)], CHANGE_POSITIONS)
     gains = [
         float(level_spl(after[_MIDDLE]) - level_spl(before[_MIDDLE]))
-        for after, before in zip(aided[-len(quiet) :], quiet, strict=True)
+        for after, before in zip(aided, quiet, strict=True)
     ]
+    signals = 1 + len(CHANGE_POSITIONS) + len(quiet)
     return {
         "look_ahead_ms": 1000.0 * samples / NEURO_RATE,
         "quiet_gain_db": gains,
-        "cpu_ms": 1000.0 * seconds * NEURO_RATE / (len(signals) * len(speech)),
+        "cpu_ms": 1000.0 * seconds * NEURO_RATE / (signals * len(speech)),
     }
 
 
-def make_changing_signals(signal: Tensor, other: Tensor, positions: Iterable[int]) -> list[Tensor]:
-    """Return the inputs whose outputs ``count_look_ahead`` compares.
-
-    Args:
-        signal: First sound. Shape: (..., time).
-        other: Second sound. Shape: (..., time).
-        positions: Samples from which on the second sound replaces the first one.
-
-    Returns: The first sound alone, and for each position a signal that changes there.
-
-    >>> [signal.tolist() for signal in make_changing_signals(torch.zeros(3), torch.ones(3), [2])]
-    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    changed = [torch.cat((signal[..., :p], other[..., p:]), -1) for p in positions]
-    return [signal, *changed]
-
-
-def count_look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
-    """Return by how many samples an output changes before its input becomes another sound.
+def measure_look_ahead(
+    aid: Callable[[Tensor, Any], Tensor],
+    ear: Any,
+    signal: Tensor,
+    other: Tensor,
+    positions: Iterable[int],
+) -> int:
+    """Return by how many samples an aid's output changes before its input becomes another sound.
 
     A change is a difference of more than 1e-4 of the output's peak.
 
     Args:
-        outputs: Outputs of an aid for the signals of ``make_changing_signals``, in the same order.
-            Shape of each: (..., time).
-        positions: Samples from which on the second sound replaces the first one.
+        aid: Hearing aid for one ear, or a pair of them.
+        ear: The audiogram, or the ``Listener`` of a pair.
+        signal: First sound. Shape: (..., time).
+        other: Second sound. Shape: (..., time).
+        positions: Samples from which on the second sound replaces the first one. Each is tried.
 
     Returns:
         The largest number of samples at any position, 0 for an aid without look-ahead.
 
-    >>> count_look_ahead(make_changing_signals(torch.ones(9), torch.zeros(9), [3]), [5])
+    >>> advance = lambda signal, ear: signal.roll(-2)  # by two samples
+    >>> measure_look_ahead(advance, NORMAL, torch.ones(9), -torch.ones(9), [5])
     2
     """
-    unchanged, *changed = outputs
+    unchanged = aid(signal, ear)
     threshold, largest = _CHANGE_THRESHOLD * float(unchanged.abs().max()), 0
-    for output, position in zip(changed, positions, strict=True):
-        difference = (output - unchanged).abs().reshape(-1, unchanged.shape[-1]).amax(0)
-        differs = difference > threshold
+    for position in positions:
+        changed = torch.cat((signal[..., :position], other[..., position:]), -1)
+        difference = (aid(changed, ear) - unchanged).abs()
+        differs = difference.reshape(-1, unchanged.shape[-1]).amax(0) > threshold
         if differs.any():
             largest = max(largest, position - int(differs.int().argmax()))
     return largest

@@ -25,7 +25,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import set_level
-from hlsim.evaluation.aid_properties import count_look_ahead, make_changing_signals
+from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import find_measures
@@ -320,13 +320,13 @@ def _measure_look_ahead(conditions: Sequence[Condition], pair: _Pair) -> dict[st
         scene = set_level(torch.randn(scene.shape, generator=generator), 65.0)
     time = scene.shape[-1]
     positions = range(time // 4, time, max(1, time // (_CHANGES + 3)))[:_CHANGES]
-    signals = make_changing_signals(scene, other, positions)
     look_ahead_ms: dict[str, float | None] = {}
     for condition in conditions:
         assert condition.process is not None
         try:
-            outputs = [condition.process(signal, pair.listener) for signal in signals]
-            look_ahead_ms[condition.name] = 1000.0 * count_look_ahead(outputs, positions) / rate
+            process = condition.process
+            samples = measure_look_ahead(process, pair.listener, scene, other, positions)
+            look_ahead_ms[condition.name] = 1000.0 * samples / rate
         except ValueError:
             look_ahead_ms[condition.name] = None
     return look_ahead_ms

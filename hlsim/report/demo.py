@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from torch import Tensor
 
@@ -36,7 +35,7 @@ _LISTEN = (
     "One utterance of a voice that the aid was not trained on. The sounds of all utterances are "
     "in the folder audio beside this page."
 )
-_PICTURES = (
+_ABOUT_PICTURES = (
     "The training adjusts the gain so that this ear perceives speech as loud as a normal ear "
     "does, in each frequency band. NAL-R has one gain for all levels. Less gain for louder "
     "speech is compression."
@@ -61,18 +60,10 @@ def demo_page(
     """
     headline = evaluation.headline
     assert headline is not None
-    colours = condition_colours(evaluation.conditions)
     items = [source.load() for source in evaluation.items]
     rate = items[0].sample_rate
     normal = [perceive(item.clean, NORMAL, rate) for item in items]
-    level = float(evaluation.table["clean_level"].iloc[0])
-    gains = evaluation.details["gain_curves"]
-    frequencies = gains[0]["frequencies"]
-    pictures = [
-        _perceived_picture({NORMAL_EAR: normal, **perceived}, colours, frequencies),
-        _ear_picture(items[0].ear, level, outputs, colours, frequencies),
-        gain_picture("Gain by input level", gains, colours),
-    ]
+    pictures = _draw_pictures(evaluation, items[0].ear, outputs, {NORMAL_EAR: normal, **perceived})
     groups = {
         "As this ear perceives it": {
             NORMAL_EAR: normal[-1],
@@ -87,7 +78,7 @@ def demo_page(
     details = score_details(evaluation, [_COMPARISON], [result_table(evaluation)])
     sections = [
         Section("Listen", [_LISTEN], player=player),
-        Section("What training changed", [_PICTURES], pictures=pictures),
+        Section("What training changed", [_ABOUT_PICTURES], pictures=pictures),
         details,
     ]
     verdict = headline.verdict("The trained aid", "NAL-R at the same level")
@@ -148,56 +139,50 @@ def _decibels(value: float) -> str:
     return f"{value:+.1f} dB".replace("-", "\N{MINUS SIGN}")
 
 
-def _ear_picture(
+def _draw_pictures(
+    evaluation: Evaluation,
     ear: Audiogram,
-    level: float,
     outputs: Mapping[str, Sequence[Tensor]],
-    colours: Mapping[str, Any],
-    frequencies: Sequence[float],
-) -> Picture:
-    """Draw the audiogram, and the levels of speech without an aid and after the trained one.
+    perceived: Mapping[str, Sequence[Tensor]],
+) -> list[Picture]:
+    """Draw the levels that the ear perceives, those of speech over its thresholds, and the gain.
 
     Args:
+        evaluation: Study of the demo's conditions.
         ear: The audiogram.
-        level: Level of the speech in dB SPL.
-        outputs: Outputs for each item, by condition.
-        colours: Colour of each condition.
-        frequencies: Centres of the 24 bands in Hz.
+        outputs: Outputs of the aid for each item, by condition.
+        perceived: Outputs as the ear perceives them, and speech as a normal ear perceives it.
     """
+    colours = condition_colours(evaluation.conditions)
+    gains = evaluation.details["gain_curves"]
+    frequencies = gains[0]["frequencies"]
+    styles = {name: {"color": colours[name]} for name in _PLAYED}
+    styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
+    perceived_curves = {
+        name: (frequencies, mean_band_levels(perceived[name]), style)
+        for name, style in styles.items()
+    }
     curves: dict[str, Curve] = {}
     for name in (UNAIDED, TRAINED):
         levels = mean_band_levels(outputs[name], hearing_level=True)
         curves[f"speech, {name}"] = (frequencies, levels, {"color": colours[name]})
     style = {"color": INK, "marker": "o"}
     curves["threshold of this ear"] = (ear.frequencies, ear.levels, style)
-    note = (
-        f"Speech at {level:g} dB SPL, mean level in each band. Where it lies above the line of the "
-        "threshold, it is inaudible on average."
-    )
-    title = "The ear, and the speech that reaches it"
-    return curves_picture(curves, title, "level (dB HL)", axis_range=(120.0, -10.0), note=note)
-
-
-def _perceived_picture(
-    perceived: Mapping[str, Sequence[Tensor]],
-    colours: Mapping[str, Any],
-    frequencies: Sequence[float],
-) -> Picture:
-    """Draw the mean level that the ear perceives in each band, beside a normal ear's.
-
-    Args:
-        perceived: Perceived signals of each item, by condition.
-        colours: Colour of each condition.
-        frequencies: Centres of the 24 bands in Hz.
-    """
-    styles = {name: {"color": colours[name]} for name in _PLAYED}
-    styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
-    curves = {
-        name: (frequencies, mean_band_levels(perceived[name]), style)
-        for name, style in styles.items()
-    }
-    note = "The closer to the dashed line, the better."
-    title = "Speech as this ear perceives it"
-    return curves_picture(
-        curves, title, "level (dB SPL per band)", axis_range=(0.0, None), note=note
-    )
+    return [
+        curves_picture(
+            perceived_curves,
+            "Speech as this ear perceives it",
+            "level (dB SPL per band)",
+            axis_range=(0.0, None),
+            note="The closer to the dashed line, the better.",
+        ),
+        curves_picture(
+            curves,
+            "The ear, and the speech that reaches it",
+            "level (dB HL)",
+            axis_range=(120.0, -10.0),
+            note=f"Speech at {evaluation.table['clean_level'].iloc[0]:g} dB SPL, mean level in "
+            "each band. Where it lies above the line of the threshold, it is inaudible on average.",
+        ),
+        gain_picture("Gain by input level", gains, colours),
+    ]

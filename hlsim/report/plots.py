@@ -41,7 +41,7 @@ _LINEAR_DB = 0.5
 
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH_INCHES = 4.2
-_LINE_INCHES = 0.17  # of a label
+_LEGEND_INCHES = 0.2  # for each row of a legend
 
 _INKED = (
     "text.color axes.edgecolor axes.labelcolor xtick.color ytick.color boxplot.boxprops.color "
@@ -107,39 +107,6 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
         if condition.of in names:
             colours[condition.name] = (colours[condition.of], 0.6)
     return colours
-
-
-def _label_curves(axes: Any) -> None:
-    """Write the name of each curve beside its right end, in its colour, without overlaps."""
-    curves = [line for line in axes.lines if not line.get_label().startswith("_")]
-    names = [fill(line.get_label(), 16) for line in curves]
-    low, high = axes.get_ylim()
-    ends = np.array([(line.get_ydata()[-1] - low) / (high - low) for line in curves])
-    line_height = _LINE_INCHES / axes.figure.get_figheight() / 0.8
-    heights = line_height * np.array([1 + name.count("\n") for name in names])
-    places = _spread_labels(ends.clip(0.0, 1.0), heights)
-    for line, name, place in zip(curves, names, places, strict=True):
-        style = {"color": line.get_color(), "alpha": line.get_alpha(), "va": "center"}
-        axes.text(1.02, place, name, transform=axes.transAxes, fontsize=9, **style)
-
-
-def _spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Move labels up and down until none covers another; they keep their order.
-
-    Args:
-        ends: Wanted middle of each label, from 0 to 1. Shape: (labels,).
-        heights: Height of each label. Shape: (labels,).
-
-    Returns: The middle of each label, at most 1. Shape: (labels,).
-    """
-    order = np.argsort(ends, kind="stable")
-    sorted_heights = heights[order]
-    # Middle of each label if all were stacked, on the ground that the lowest one stands on.
-    stacked = np.cumsum(sorted_heights) - sorted_heights / 2.0
-    sorted_places = np.maximum.accumulate(ends[order] - stacked) + stacked
-    places = np.empty(len(ends))
-    places[order] = np.minimum(sorted_places, 1.0 + stacked - stacked[-1:])
-    return places
 
 
 def _draw_points(axes: Any, x: Any, y: Any, size: float) -> None:
@@ -221,7 +188,7 @@ def curves_picture(
     axis_range: tuple[float | None, float | None] = (None, None),
     note: str = "",
 ) -> Picture:
-    """Draw curves, with their names beside them.
+    """Draw curves, with a legend below them.
 
     Args:
         curves: Curves by name.
@@ -239,16 +206,18 @@ def curves_picture(
     def draw(axes: Any) -> None:
         for name, (x, y, style) in curves.items():
             # A label that begins with an underscore would be hidden.
-            axes.plot(x, y, label=f" {name}", **style)
+            axes.plot(x, y, label=f" {fill(name, 26)}", **style)
         axes.set(ylabel=axis, ylim=axis_range)
         if over:
             axes.set(xlabel=over)
             axes.grid(alpha=0.3)
         else:
             frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
-        _label_curves(axes)
+        style = {"frameon": False, "fontsize": 9, "handlelength": 1.5, "columnspacing": 1.0}
+        axes.figure.legend(loc="outside lower left", ncols=2, **style)
 
-    return _draw_picture(draw, title, note=note)
+    height = 2.9 + _LEGEND_INCHES * ((len(curves) + 1) // 2)
+    return _draw_picture(draw, title, note=note, height=height)
 
 
 def gain_picture(

@@ -102,19 +102,6 @@ def test_a_file_that_cannot_be_scored_is_a_failure(corpus: Path, damage: str) ->
     assert report.table.stoi.notna().sum() == 3
 
 
-@pytest.mark.parametrize("samples", [-200, -2205, 256])
-def test_lengths_that_differ_by_little_are_cut_to_the_shorter(corpus: Path, samples: int) -> None:
-    path = corpus / "after/p2/c.wav"
-    signal = first_channel(path).float()
-    longer = torch.cat((signal, signal[:256]))
-    write_audio(path, longer[: len(signal) + samples], 22050)
-    with pytest.warns(UserWarning, match="both are cut"):
-        report = haspi_report(**folders(corpus), audiogram=N4, measures=("haspi", "stoi"))
-    assert report.failures.haspi.isna().all() and report.table.stoi.notna().all()
-    last = 0.8 + min(0, samples) / 22050
-    assert report.table.seconds.tolist() == pytest.approx([0.8, 0.8, 0.8, last])
-
-
 def write_manifest(corpus: Path, text: str) -> Path:
     path = corpus / "study.csv"
     path.write_text(text.replace("A,", "clean/a.b.flac,").replace("C,", "clean/p2/c.flac,"))

@@ -76,8 +76,9 @@ def test_there_is_one_row_per_item_and_condition(items: list[Item]) -> None:
     assert (progress[0], progress[-1]) == ((0, 12), (12, 12))
 
 
-def longer(samples: int) -> Callable[[Tensor, Audiogram], Tensor]:
-    return lambda signal, ear: torch.cat((signal, signal.new_ones(samples)))
+def resize(samples: int) -> Callable[[Tensor, Audiogram], Tensor]:
+    """Return a condition whose output is longer, or shorter if the number is negative."""
+    return lambda signal, ear: torch.cat((signal, torch.ones(1601)))[: len(signal) + samples]
 
 
 @pytest.mark.filterwarnings("ignore:scores with")
@@ -86,7 +87,7 @@ def longer(samples: int) -> Callable[[Tensor, Audiogram], Tensor]:
     [
         (Gain(0), "RuntimeError: no battery"),
         (lambda signal, ear: signal / 0.0, "NaN or infinite"),
-        (longer(1601), "a difference of 0.1 s"),
+        (resize(1601), "a difference of 0.1 s"),
         (None, "no output of item 0 is recorded under c"),
     ],
 )
@@ -96,10 +97,12 @@ def test_an_error_ends_only_its_output(items: list[Item], process: Any, failure:
 
 
 @pytest.mark.filterwarnings("ignore:scores with")
-@pytest.mark.parametrize("samples", [1, 1600])
-def test_a_longer_output_is_cut_with_a_warning(items: list[Item], samples: int) -> None:
+@pytest.mark.parametrize("samples", [-3, 1, 1600])
+def test_item_and_output_are_cut_to_the_shorter_length_with_a_warning(
+    items: list[Item], samples: int
+) -> None:
     with pytest.warns(UserWarning, match="both are cut to the shorter length"):
-        table = run_study(items, [Condition("c", longer(samples))], MEASURES[:1], jobs=1)
+        table = run_study(items, [Condition("c", resize(samples))], MEASURES[:1], jobs=1)
     assert table.peak.tolist() == pytest.approx([0.2, 0.4, 0.6])
 
 

@@ -1,4 +1,4 @@
-"""Plots: legible in light and dark, labels beside the curves, and no picture of a single group."""
+"""Plots: legible in light and dark, labels as they are, and no picture of a single group."""
 
 import os
 import subprocess
@@ -12,7 +12,6 @@ from hlsim.evaluation import Condition
 from hlsim.report.plots import (
     INK,
     UNAIDED_COLOUR,
-    _spread_labels,
     condition_colours,
     curves_picture,
     distribution_picture,
@@ -31,17 +30,6 @@ def test_ink_follows_the_colour_scheme_of_the_page_and_plots_are_reproducible() 
     assert INK not in text and "currentColor" in text
     assert "prefers-color-scheme: dark" in text
     assert "_a $b$" in text, "the label is shown as it is"
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_labels_keep_their_order_and_their_distance(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    ends, heights = random.uniform(0.0, 1.0, 6), random.choice([0.05, 0.1], 6)
-    places = _spread_labels(ends, heights)
-    order = np.argsort(ends)
-    distances = np.diff(places[order])
-    needed = (heights[order][1:] + heights[order][:-1]) / 2
-    assert (distances >= needed - 1e-9).all() and places.max() <= 1.0
 
 
 def test_a_linear_aid_has_one_gain_curve() -> None:

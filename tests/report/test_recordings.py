@@ -12,7 +12,6 @@ from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Condition, Evaluation, compare
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.recordings import Recording
-from hlsim.evaluation.statistics import holm
 from hlsim.report.page import write_page
 from hlsim.report.recordings import report_page
 
@@ -51,13 +50,10 @@ def evaluation(folder: Path, *, ears: tuple[str, ...] = ("N1", "N3", "N4", "S2")
 
 def test_a_comparison_has_one_p_wherever_it_appears(tmp_path: Path) -> None:
     study = evaluation(tmp_path)
-    page = report_page(study, listen=0)
-    planned, unplanned = study.headline, [c for c in study.comparisons if not c.planned]
-    assert planned is not None and planned.p_t == planned.overall.p_t
-    assert [c.p_t for c in unplanned] == holm(c.overall.p_t for c in unplanned)
-    text = page.markdown()
-    assert page.verdict == planned.verdict() and text.count(f"p = {planned.p_t:.5f}") >= 3
-    assert "Planned before the scores were known" in text
+    page, planned = report_page(study, listen=0), study.headline
+    assert planned is not None and page.verdict == planned.verdict()
+    assert page.markdown().count(f"p = {planned.overall.p_t:.5f}") >= 3
+    assert "Planned before the scores were known" in page.markdown()
 
 
 def test_verdict_and_scores_come_first_and_details_are_folded(tmp_path: Path) -> None:
