@@ -1,4 +1,4 @@
-"""Names, docstrings, comments and errors of finished folders keep the mechanical rules of the style guide."""
+"""Names, docstrings, comments and errors keep the mechanical rules of the style guide."""
 
 import ast
 import io
@@ -11,99 +11,17 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# Folders and files that keep the rules. Add yours when it is finished.
-FINISHED = [
-    "compensators",
-    "examples/auditory_nerve.py",
-    "examples/benchmark.py",
-    "examples/delay.py",
-    "examples/draw_alignment.py",
-    "examples/enhancers.py",
-    "examples/fit_words.py",
-    "examples/gradients.py",
-    "examples/haspi_study.py",
-    "examples/heard.py",
-    "examples/mbstoi_parity.py",
-    "examples/noise_reduction.py",
-    "examples/other_sounds.py",
-    "examples/paper/haspi_table.py",
-    "examples/parity.py",
-    "examples/pyclarity_teacher.py",
-    "examples/score_parity.py",
-    "examples/sliders.py",
-    "examples/train_compensator.py",
-    "examples/training/accelerate_loop.py",
-    "examples/training/conv_tasnet.py",
-    "examples/training/dead_region.py",
-    "examples/training/dead_region_aid.py",
-    "examples/training/filter_bank.py",
-    "examples/training/haspi_objective.py",
-    "examples/training/lightning_bf16.py",
-    "examples/training/networks.py",
-    "examples/training/your_criterion.py",
-    "examples/validity.py",
-    "examples/gpu.py",
-    "examples/memory.py",
-    "hlsim/audio.py",
-    "hlsim/audiogram",
-    "hlsim/calibration.py",
-    "hlsim/checks.py",
-    "hlsim/cli",
-    "hlsim/demo.py",
-    "hlsim/dsp",
-    "hlsim/evaluation",
-    "hlsim/export.py",
-    "hlsim/extras.py",
-    "hlsim/files.py",
-    "hlsim/live.py",
-    "hlsim/losses",
-    "hlsim/metrics",
-    "hlsim/msbg",
-    "hlsim/neuro",
-    "hlsim/plugins.py",
-    "hlsim/checkpoint.py",
-    "hlsim/report",
-    "hlsim/shortcuts.py",
-    "hlsim/torchtools.py",
-    "hlsim/training",
-    "tests/audiogram",
-    "tests/cli",
-    "tests/compensators",
-    "tests/dsp",
-    "tests/losses",
-    "tests/evaluation",
-    "tests/golden.py",
-    "tests/metrics",
-    "tests/msbg",
-    "tests/neuro",
-    "tests/conftest.py",
-    "tests/pretend_device.py",
-    "tests/test_calibration.py",
-    "tests/test_devices.py",
-    "tests/robustness",
-    "tests/test_audio.py",
-    "tests/test_checks.py",
-    "tests/test_export.py",
-    "tests/test_extras.py",
-    "tests/test_files.py",
-    "tests/test_live.py",
-    "tests/test_checkpoint.py",
-    "tests/test_shortcuts.py",
-    "tests/test_situations.py",
-    "tests/test_torchtools.py",
-    "tests/report",
-    "tests/test_demo.py",
-    "tests/test_doctests.py",
-    "tests/pyclarity.py",
-    "tests/test_examples.py",
-    "tests/test_layers.py",
-    "tests/test_private_names.py",
-    "tests/test_gpu_example.py",
-    "tests/test_plugins.py",
-    "tests/test_training_examples.py",
-    "tests/test_wheel.py",
-    "tests/training",
-]
+FOLDERS = ("compensators", "examples", "hlsim", "tests")
+
+# Files that need not keep the rules. Remove yours when it is finished.
+UNFINISHED = {
+    "examples/machine_listener.py",
+    "tests/test_language.py",  # It contains the phrases that it rejects.
+    "tests/test_listening_page.py",
+    "tests/test_machine_listener.py",
+    "tests/test_readme.py",
+    "tests/test_tutorials.py",
+}
 
 # Rows of (file, rule, text) that may stay. A row that is no longer needed fails the test.
 EXCEPTIONS: set[tuple[str, str, str]] = {
@@ -184,11 +102,8 @@ def _names_bound_by(node: ast.AST) -> Iterator[str]:
 
 
 def finished_files() -> list[Path]:
-    files: set[Path] = set()
-    for name in FINISHED:
-        path = ROOT / name
-        files.update([path] if path.is_file() else path.rglob("*.py"))
-    return sorted(files)
+    files = {path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    return sorted(files - {ROOT / name for name in UNFINISHED})
 
 
 @pytest.mark.parametrize("path", finished_files(), ids=lambda path: str(path.relative_to(ROOT)))
