@@ -13,26 +13,19 @@ pytest.importorskip("lightning")
 pytest.importorskip("joblib")
 
 from hlsim.demo import _name_files, _sentence, demo
-
-
-def write_short_speech(folder: Path, speech_dir: Path) -> Path:
-    """Write 24 utterances of a second, of which the demo scores eight."""
-    folder.mkdir()
-    for path in sorted(speech_dir.rglob("*.flac")):
-        samples, rate = soundfile.read(path)
-        soundfile.write(folder / path.name, samples[rate // 2 : rate // 2 + rate], rate)
-    return folder
+from tests.helpers import write_short_speech
 
 
 @pytest.fixture
 def short_speech(tmp_path: Path, speech_dir: Path) -> Path:
+    """Folder of 24 utterances of a second, of which the demo scores eight."""
     return write_short_speech(tmp_path / "speech", speech_dir)
 
 
 def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Path) -> None:
     out = tmp_path / "out"
     ear, seed = Audiogram.standard("N4"), 2**32 - 2
-    text = demo(out, ear, speech=short_speech, steps=60, seed=seed, report=lambda line: None)
+    text = demo(out, ear, speech=short_speech, steps=20, seed=seed, report=lambda line: None)
     report = json.loads((out / "report.json").read_text())
     rows = report["rows"]
     names = ["unaided", "NAL-R", "NAL-R, same level", "trained aid"]

@@ -8,6 +8,7 @@ import pytest
 from torch import nn
 
 import hlsim
+from tests.helpers import write_ears
 
 SCRIPT = """
 import importlib, pkgutil, sys
@@ -44,9 +45,7 @@ def test_simulators_are_compared_without_pesq(
     from hlsim.report.simulators import simulators_page
 
     monkeypatch.setitem(sys.modules, "pesq", None)
-    ears = tmp_path / "ears.csv"
-    row = hlsim.Audiogram.standard("N3").to_row()
-    ears.write_text(f"{','.join(row)}\n{','.join(row.values())}\n")
+    ears = write_ears(tmp_path / "ears.csv", "N3")
     simulators: dict[str, nn.Module] = {"exact": hlsim.MSBG(sample_rate=16000)}
     speech = speech_dir / "valid"
     study = evaluate_simulators(

@@ -1,8 +1,6 @@
 """The measurement of a GPU runs on a CPU, continues where it stopped and survives failing rows."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -10,18 +8,14 @@ from typing import Any
 import pytest
 from torch import Tensor, nn
 
+from tests.helpers import load_example
+
 SMALL = ["--device", "cpu", "--small", "--minutes", "5", "--out"]
 
 
 @pytest.fixture
-def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    path = Path(__file__).parents[1] / "examples" / "gpu.py"
-    spec = importlib.util.spec_from_file_location("gpu_example", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, module)
-    spec.loader.exec_module(module)
-    return module
+def example() -> ModuleType:
+    return load_example("gpu.py")
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

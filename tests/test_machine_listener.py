@@ -1,9 +1,6 @@
 """The machine listener of examples/machine_listener.py, with a recogniser that needs no Whisper."""
 
-import csv
 import doctest
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,6 +16,7 @@ from hlsim.audio import write_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.study import Item
+from tests.helpers import load_example, write_ears
 
 FILE = Path(__file__).parents[1] / "examples" / "machine_listener.py"
 TEXT = "one two three four five six seven eight"
@@ -26,12 +24,7 @@ TEXT = "one two three four five six seven eight"
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("machine_listener", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_example("machine_listener.py")
 
 
 def recognise_loud_eighths(waveform: np.ndarray) -> str:
@@ -142,11 +135,7 @@ def test_aids_are_compared_at_equal_level(
         write_audio(tmp_path / kind / "x.wav", noise, 16000)
     sentences = [f"x.wav,{start},{start + 1},{TEXT}" for start in (0.0, 0.5, 1.0)]
     (tmp_path / "s.csv").write_text("\n".join(["path,start,end,text", *sentences]))
-    rows = [{"listener": name, **Audiogram.standard(name).to_row()} for name in ("N1", "N5")]
-    with open(tmp_path / "ears.csv", "w", newline="") as file:
-        table = csv.DictWriter(file, list(rows[0]))
-        table.writeheader()
-        table.writerows(rows)
+    write_ears(tmp_path / "ears.csv", "N1", "N5")
     levels = []
 
     class Recogniser:

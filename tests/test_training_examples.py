@@ -1,25 +1,17 @@
 """The examples of training through the loss run as they stand, a few steps."""
 
-import importlib.util
+import importlib
 import math
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
 
 from hlsim.cli.main import main
+from tests.helpers import EXAMPLES, load_example
 
-EXAMPLES = Path(__file__).parents[1] / "examples" / "training"
-
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(Path(name).stem, EXAMPLES / name)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+TRAINING = EXAMPLES / "training"
 
 
 def losses(out: str) -> list[float]:
@@ -29,7 +21,9 @@ def losses(out: str) -> list[float]:
 def test_conv_tasnet_trains(
     tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    load("conv_tasnet.py").main(str(speech_dir / "train"), str(tmp_path / "out.pt"), "N3", "2", 0.3)
+    load_example("training/conv_tasnet.py").main(
+        str(speech_dir / "train"), str(tmp_path / "out.pt"), "N3", "2", 0.3
+    )
     assert all(0.0 < value < 5.0 for value in losses(capsys.readouterr().out))
     assert torch.load(tmp_path / "out.pt")
 
@@ -42,9 +36,9 @@ def test_networks_are_trained_and_judged_beside_nalr(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.syspath_prepend(TRAINING)
     folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
-    load("networks.py").main(
+    load_example("training/networks.py").main(
         [*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2", "--noisy"]
     )
     out = capsys.readouterr()
@@ -55,7 +49,7 @@ def test_networks_are_trained_and_judged_beside_nalr(
 
 
 def test_a_criterion_of_ones_own_trains(capsys: pytest.CaptureFixture[str]) -> None:
-    load("your_criterion.py").main(steps=6)
+    load_example("training/your_criterion.py").main(steps=6)
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
 
@@ -65,7 +59,7 @@ def test_criteria_of_other_packages_on_what_is_heard(
     package: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip(package.replace("-", "_"))
-    example = load("your_criterion.py")
+    example = load_example("training/your_criterion.py")
     example.main(package, steps=6)
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
@@ -80,7 +74,7 @@ def test_criteria_of_other_packages_on_what_is_heard(
 
 def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("accelerate")
-    aid = load("accelerate_loop.py").main(3)
+    aid = load_example("training/accelerate_loop.py").main(3)
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
     assert set(aid.state_dict()) == {"weight", "bias"}
@@ -96,13 +90,13 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     """docs/guide/any-teacher.md, a few steps."""
     for module in ("lightning", "yaml", "pystoi", "pesq", "pandas", "matplotlib"):
         pytest.importorskip(module)
-    monkeypatch.chdir(EXAMPLES.parents[1])
+    monkeypatch.chdir(EXAMPLES.parent)
     monkeypatch.setattr(sys, "path", [*sys.path])
     train, valid, out = speech_dir / "train", speech_dir / "valid", tmp_path / "ear"
     teacher = ("--teacher", "examples.training.dead_region:DeadRegion")
     recipe = tmp_path / "recipe.yaml"
     shorter = ("steps: 2", "batch: 2", "seconds: 0.3", "validate_every: 2", "validation_items: 8")
-    lines = (EXAMPLES.parent / "any-teacher.yaml").read_text().splitlines()
+    lines = (EXAMPLES / "any-teacher.yaml").read_text().splitlines()
     for change in shorter:
         lines = [change if line.startswith(change.split()[0]) else line for line in lines]
     recipe.write_text("\n".join(lines))
@@ -152,7 +146,7 @@ def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
     tones = torch.stack(
         [torch.sin(2 * torch.pi * hz * time) for hz in (500.0, 1000.0, 2000.0, 3500.0)]
     )
-    perceived = load("dead_region.py").DeadRegion()(tones, ear)[:, 1000:-1000]
+    perceived = load_example("training/dead_region.py").DeadRegion()(tones, ear)[:, 1000:-1000]
     levels = 20.0 * (perceived.std(-1) / tones[:, 1000:-1000].std(-1)).log10()
     torch.testing.assert_close(levels[:3], torch.tensor([-20.0, -25.0, -55.0]), atol=0.5, rtol=0.0)
     assert float(levels[3]) < -75.0
@@ -163,13 +157,13 @@ def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
 
 def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("lightning")
-    aid = load("lightning_bf16.py").main(2)
+    aid = load_example("training/lightning_bf16.py").main(2)
     assert set(aid.state_dict()) == {"network.weight", "network.bias"}
     assert float(aid.trainer.callback_metrics["loss"]) > 0.0
 
 
 def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    example = load("filter_bank.py")
+    example = load_example("training/filter_bank.py")
     ear = example.Audiogram.standard("N3")
     aid = example.train_filter_bank(str(speech_dir / "train"), example.HearingLossLoss(ear), 8)
     start, *_, end = losses(capsys.readouterr().err)
@@ -191,8 +185,8 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
 def test_haspi_trains_with_the_level_and_without(
     speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(EXAMPLES)
-    example = load("haspi_objective.py")
+    monkeypatch.syspath_prepend(TRAINING)
+    example = load_example("training/haspi_objective.py")
     ear = example.Audiogram.standard("N3")
     for name in ("HASPILoss", "HASPI alone"):
         aid = example.train_filter_bank(

@@ -6,17 +6,14 @@ from typing import Any
 
 import pytest
 
-from hlsim import Audiogram
 from hlsim.evaluation.measures import MEASURES
+from tests.helpers import write_ears
 
 
 @pytest.fixture
 def ears_file(tmp_path: Path) -> Path:
     """Return a CSV file with the ears N3, N5 and S2."""
-    rows = [Audiogram.standard(name).to_row() for name in ("N3", "N5", "S2")]
-    path = tmp_path / "ears.csv"
-    path.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
-    return path
+    return write_ears(tmp_path / "ears.csv", "N3", "N5", "S2")
 
 
 @pytest.fixture

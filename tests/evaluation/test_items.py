@@ -18,14 +18,14 @@ from hlsim.evaluation.items import (
     draw_simulator_items,
     read_ears,
 )
+from tests.helpers import write_table
 
 
 def test_all_ears_have_different_names(tmp_path: Path) -> None:
     path, names = tmp_path / "ears.csv", ("A", "B", "A", "N3", "")
     ears = [Audiogram((10.0 * i,) * 8) for i in range(5)]
     rows = [{"listener": name, **ear.to_row()} for name, ear in zip(names, ears, strict=True)]
-    path.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
-    read = read_ears(path)
+    read = read_ears(write_table(path, rows))
     assert read[0] == ("N2", Audiogram.standard("N2"))
     assert read[8:] == list(zip(["A", "B", "A, row 3", "N3, row 4", "row 5"], ears, strict=True))
 

@@ -5,8 +5,6 @@ Run with ``pytest -m browser``. The tests need playwright and a Chromium: its ow
 ``CHROMIUM``.
 """
 
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,24 +58,13 @@ def demo_file(tmp_path_factory: pytest.TempPathFactory, speech_dir: Path) -> Pat
     for package in ("lightning", "joblib"):
         pytest.importorskip(package)
     from hlsim.demo import demo
-    from tests.test_demo import write_short_speech
+    from tests.helpers import write_short_speech
 
     root = tmp_path_factory.mktemp("demo")
     speech = write_short_speech(root / "speech", speech_dir)
     ear = Audiogram.standard("N4")
     demo(root / "out", ear, speech=speech, steps=10, report=lambda line: None)
     return root / "out" / "report.html"
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    names = ("chromium", "chromium-browser", "google-chrome")
-    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(params=["390 light", "390 dark", "1400 light", "1400 dark"])

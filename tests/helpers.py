@@ -1,0 +1,45 @@
+"""Helpers of several tests: tables of ears, short speech, and the modules of examples."""
+
+import importlib.util
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+
+import soundfile
+
+from hlsim import Audiogram
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, str]]) -> Path:
+    """Write rows with equal columns as a CSV file."""
+    lines = [",".join(rows[0]), *(",".join(row.values()) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_ears(path: Path, *names: str) -> Path:
+    """Write standard ears as a table of audiograms."""
+    rows = [{"listener": name, **Audiogram.standard(name).to_row()} for name in names]
+    return write_table(path, rows)
+
+
+def write_short_speech(folder: Path, speech_dir: Path) -> Path:
+    """Write a second of each of the 24 bundled utterances."""
+    folder.mkdir()
+    for path in sorted(speech_dir.rglob("*.flac")):
+        samples, rate = soundfile.read(path)
+        soundfile.write(folder / path.name, samples[rate // 2 : rate // 2 + rate], rate)
+    return folder
+
+
+def load_example(name: str) -> ModuleType:
+    """Import a file of the folder ``examples``."""
+    spec = importlib.util.spec_from_file_location(Path(name).stem, EXAMPLES / name)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses and pickle look for it
+    spec.loader.exec_module(module)
+    return module

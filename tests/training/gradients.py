@@ -1,0 +1,15 @@
+"""Check that several tests of training share."""
+
+from hlsim.training.data_module import Batch
+from hlsim.training.module import TrainingModule
+
+
+def check_gradients(module: TrainingModule, batch: Batch) -> float:
+    """Check that loss and gradients of a batch are finite and precise, and return the loss."""
+    loss = module.training_loss(batch)
+    loss.backward()
+    assert bool(loss.isfinite())
+    for parameter in module.trained_parameters():
+        assert parameter.grad is not None and parameter.grad.dtype == parameter.dtype
+        assert bool(parameter.grad.isfinite().all())
+    return float(loss.detach())
