@@ -39,7 +39,7 @@ def test_networks_are_trained_and_judged_beside_nalr(
     monkeypatch.syspath_prepend(TRAINING)
     folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
     load_example("training/networks.py").main(
-        [*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2", "--noisy"]
+        [*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "1", "--noisy"]
     )
     out = capsys.readouterr()
     assert out.err.startswith("step 1: ")
