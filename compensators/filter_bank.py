@@ -132,15 +132,16 @@ def _filter_taps(bands: int) -> NDArray[np.float64]:
 
 
 def apply_gains(samples: Tensor, excess_gains: Tensor, position: int = 0) -> Tensor:
-    """Amplify each band of a signal, and add up the bands, with a delay of 64 samples.
+    """Divide a signal into bands, multiply each by its gain, and add them up again.
 
-    The gain of a band goes on a straight line from the beginning of a hop to its end.
+    The gain of a band goes on a straight line from the beginning to the end of each hop of 64
+    samples. The output is delayed by 64 samples.
 
     Args:
-        samples: Samples of whole hops, or of a part of one hop, after ``2 * DELAY`` earlier
-            samples that the filters need.
+        samples: ``2 * DELAY`` = 128 earlier samples, which the filters need, followed by whole hops
+            or a part of one hop.
         excess_gains: Linear gains minus 1 at the beginning of each hop and at the end of the last.
-        position: Position in its hop of the first sample after the earlier ones.
+        position: Number of samples of the hop before this part of it; 0 for whole hops.
 
     Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
 
@@ -182,7 +183,7 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
 
 
 def frame_power(samples: Tensor) -> Tensor:
-    """Compute the power spectrum of each frame: the last 16 ms at the end of each hop of 4 ms.
+    """Compute the power spectrum of the last 16 ms (a frame) at the end of every 4 ms (a hop).
 
     The sum over frequencies is the mean square of the windowed frame.
 

@@ -21,7 +21,7 @@ from hlsim.torchtools import constant_like
 
 
 class MeasuredAid(nn.Module):
-    """Base class of aids whose gains depend on the sound, and are therefore measured with noise.
+    """Base class of aids with a method ``gains``, which measures how much they amplify a noise.
 
     Subclasses implement ``_amplify_noise``.
 

@@ -168,7 +168,8 @@ class HearingAid(Wearable):
         attributes of the stream that may be set between chunks.
 
         Args:
-            audiogram: Ear or ears.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the chunks.
             noise_reduction: Share of the attenuation of noise that is applied, 0 to 1.
             amplification: Share of the amplification that is applied, 0 to 1.
 
@@ -178,9 +179,9 @@ class HearingAid(Wearable):
         return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Return the loss in each band, and then NAL-R's gain in each band, both in dB.
+        """Return the hearing loss in each band, and then NAL-R's gain in each band, both in dB.
 
-        Shape: (items, 8) -> (items, 2 bands).
+        Shape: (items, 8) in dB HL -> (items, 2 bands).
         """
         centres = band_centres(self.bands)
         loss = interpolate(thresholds, centres)

@@ -116,7 +116,8 @@ def save_compensator(
         audiogram: Ear for which the compensator was trained; None if it was trained for all ears.
 
     Raises:
-        ValueError: The model is of another kind, or the folder contains other files.
+        ValueError: The model is no ``MappingCompensator`` or ``HearingAid``, or the folder contains
+            other files.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -29,7 +29,8 @@ class Stream:
 
     Args:
         aid: Aid at 16 kHz.
-        audiogram: Ear or ears, as in a call of the aid.
+        audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the leading
+            dimensions of the chunks.
         sliders: Values from 0 to 1 by name, one number or one value per item.
 
     Raises:

@@ -31,8 +31,8 @@ class WDRC(Wearable):
             the normal ear), but at least 125 Hz, apart.
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
         release: Time constant in seconds with which it falls, 0.01 to 2.
-        knee: Distance in dB, 0 to 60, below average speech at which softer sounds stop to get more
-            gain.
+        knee: Level of a band in dB below that of average speech, 0 to 60, below which softer sounds
+            have the same gain.
         limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds. A band is not
             amplified beyond this level.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
@@ -92,7 +92,8 @@ class WDRC(Wearable):
         The output is that for the whole signal, ``latency`` samples late.
 
         Args:
-            audiogram: Ear or ears.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the chunks.
 
         Raises:
             ValueError: The sample rate is not 16000 Hz, or the audiogram is not valid.
@@ -100,7 +101,10 @@ class WDRC(Wearable):
         return Stream(self, audiogram)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Return the prescribed gain in dB and the ratio of each band. Shape as in ``Wearable``."""
+        """Return NAL-R's gain in each band in dB, and then the compression ratio in each band.
+
+        Shape: (items, 8) in dB HL -> (items, 2 bands).
+        """
         centres = band_centres(self.bands)
         prescribed = interpolate(nalr_gains_db(thresholds), centres)
         loss = interpolate(thresholds, centres)

@@ -118,17 +118,17 @@ class Wearable(MeasuredAid):
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the gain of each band at the end of each frame.
+        """Compute the gain of each band, every 4 ms.
 
         Args:
-            powers: Power spectrum of each frame from ``frame_power``.
-            fitted: Parameters from ``fit``.
-            sliders: Values of the sliders in each frame.
-            state: State before the first frame.
+            powers: Power spectrum in Pa^2 of each frame, the last 16 ms, from ``frame_power``.
+            fitted: Parameters of the aid for the ear of each item, from ``fit``.
+            sliders: Values of the sliders in each frame, such as noise reduction.
+            state: Memory of earlier frames, tensors by name.
 
         Returns:
-            The gains in dB, and the entries of the state that the subclass needs, after the last
-            frame.
+            The gains in dB, and the new values of those entries of the state that this class adds
+            to ``initial_state``.
 
         Shape: (items, frames, FRAME / 2 + 1), (items, n), (items, frames, sliders) -> (items,
             frames, bands).
@@ -136,7 +136,7 @@ class Wearable(MeasuredAid):
         raise NotImplementedError
 
     def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
-        """Return the state before the first hop, which is that after silence.
+        """Return what the aid remembers at the beginning of a signal: silence.
 
         Args:
             sliders: Values of the sliders at the beginning. Shape: (items, sliders).
@@ -150,20 +150,20 @@ class Wearable(MeasuredAid):
     def excess_gains(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the gains of whole hops of the input.
+        """Compute the gain of each band for some hops of 64 samples (4 ms) of the input.
 
-        The filters delay the signal by one hop, so the output of these hops needs gains from one
-        hop earlier on.
+        The filters delay the signal by one hop, so the output also needs the gains before.
 
         Args:
-            samples: Input in pascals.
-            fitted: Parameters from ``fit``.
-            sliders: Values to which the sliders move.
-            state: State before the first hop.
+            samples: Input in pascals at 16 kHz.
+            fitted: Parameters of the aid for the ear of each item, from ``fit``.
+            sliders: Values of the sliders, such as noise reduction, to which they move gradually.
+            state: Memory of earlier hops: ``initial_state``, or the state that the call for the
+                preceding hops returned.
 
         Returns:
-            Linear gains minus 1 at the end of each hop, after those at the ends of the two hops
-            before, and the state after the last hop.
+            Linear gains minus 1 at the end of the two hops before, and at the end of each hop; and
+            the state after the last hop.
 
         Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, 2 + hops, bands).
         """
@@ -180,16 +180,17 @@ class Wearable(MeasuredAid):
     def process_hops(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Process whole hops of the input.
+        """Compute the output for some hops of 64 samples (4 ms) of the input.
 
         Args:
-            samples: Input in pascals.
-            fitted: Parameters from ``fit``.
-            sliders: Values to which the sliders move.
-            state: State before the first hop.
+            samples: Input in pascals at 16 kHz.
+            fitted: Parameters of the aid for the ear of each item, from ``fit``.
+            sliders: Values of the sliders, such as noise reduction, to which they move gradually.
+            state: Memory of earlier hops: ``initial_state``, or the state that the call for the
+                preceding hops returned.
 
         Returns:
-            The output in pascals, 64 samples late, and the state after the last hop.
+            The output in pascals, delayed by 64 samples, and the state after the last hop.
 
         Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, hops * HOP).
         """
@@ -213,7 +214,7 @@ class Wearable(MeasuredAid):
         return self._amplify(noise, self.fit(ears), sliders, self.initial_state(sliders))[0]
 
     def limit(self, samples: Tensor) -> Tensor:
-        """Limit the peak of the output. Any shape, in pascals."""
+        """Return samples in pascals, of any shape, whose magnitude is limited to ``limit_spl``."""
         return soft_limit(samples, 10.0 ** ((self.limit_spl - PASCAL_SPL) / 20.0))
 
     def _process(

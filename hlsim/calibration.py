@@ -116,6 +116,9 @@ def dbfs(waveform: Tensor) -> Tensor:
 
     Shape: (..., time) -> (...).
 
+    Args:
+        waveform: Samples.
+
     Raises:
         ValueError: The waveform is not a floating-point tensor with time last.
 

@@ -67,8 +67,8 @@ NOISE_RMS = 0.03
 EAR = torch.linspace(20.0, 90.0, len(FREQUENCIES))
 """Thresholds in dB HL with which ONNX files are checked."""
 
-CHECKED_HOPS = 16
-"""Number of hops of noise with which the program of an aid is checked."""
+CHECKED_CALLS = 16
+"""Number of calls, with successive noise, with which the program of an aid is checked."""
 
 STATELESS_INPUTS = ("samples", "fitted", "sliders")
 """Names of the inputs of an aid's program that are not part of its state."""
@@ -169,7 +169,7 @@ def export_onnx(
     Raises:
         ValueError: The simulator or the size is unsuitable, see ``export_program``; ONNX lacks an
             operation; or the output of onnxruntime for noise at 64 dB SPL differs by more than
-            ``TOLERANCE``.
+            1e-4 of its peak.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> import hlsim
@@ -273,7 +273,7 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
-            differs by more than ``TOLERANCE`` in the last of 16 hops of noise at 64 dB SPL.
+            differs by more than 1e-4 of its peak in the last of 16 calls with noise at 64 dB SPL.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
@@ -286,7 +286,7 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
     if "sliders" in inputs:
         # Sliders that move, so that their state is checked as well.
         inputs["sliders"] = 0.2 * inputs["sliders"]
-    noise = _draw_noise(CHECKED_HOPS, items, hops * HOP, full_scale_spl=aid.full_scale_spl)
+    noise = _draw_noise(CHECKED_CALLS, items, hops * HOP, full_scale_spl=aid.full_scale_spl)
     state_names = [name for name in inputs if name not in STATELESS_INPUTS]
     with torch.no_grad():
         for samples in noise.to(inputs["samples"]):
@@ -309,8 +309,8 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
         items: Number of ears per call.
 
     Raises:
-        ValueError: The output of onnxruntime differs from that of torch by more than
-            ``TOLERANCE``.
+        ValueError: The output of onnxruntime differs from that of torch by more than 1e-4 of its
+            peak.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC

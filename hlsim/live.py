@@ -98,7 +98,12 @@ class Live:
             self.error = str(error) or type(error).__name__
 
     def press(self, key: str) -> None:
-        """Move a slider by one step. ``KEYS`` lists the keys; others have no effect."""
+        """Move a slider by 0.1.
+
+        Args:
+            key: One of ``KEYS``: n and N for less and more noise reduction, a and A for less and
+                more amplification. Other keys have no effect.
+        """
         for name, (down, up) in KEYS.items():
             if key in (down, up) and hasattr(self.stream, name):
                 step = SLIDER_STEP if key == up else -SLIDER_STEP

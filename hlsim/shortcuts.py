@@ -132,7 +132,8 @@ def compensate(
 
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
-        ear: One of the values that ``simulate`` takes.
+        ear: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
+            mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         compensator: ``"hearing-aid"``, ``"nalr"``, ``"wdrc"``, or the name or folder of another
             checkpoint.

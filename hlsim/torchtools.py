@@ -124,7 +124,7 @@ def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Convert real or complex values to a tensor of a precision.
+    """Convert real or complex values to a tensor, complex values to a complex one.
 
     Args:
         values: Array, tensor or numbers.
@@ -141,11 +141,12 @@ def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tensor:
-    """Return one row per item of a batch, in a precision.
+    """Expand a tensor to the leading dimensions of a batch, and flatten these to one dimension.
 
     Args:
-        tensor: Values whose leading dimensions broadcast to ``batch``, (..., n).
-        batch: Leading dimensions, whose product is the number of items.
+        tensor: Waveforms, thresholds or other values, (..., n), whose leading dimensions broadcast
+            to ``batch``.
+        batch: Leading dimensions, whose product is the number of items of the batch.
         dtype: Type of the result.
 
     Shape: (..., n) -> (items, n).

@@ -38,7 +38,8 @@ MAX_LOG_MASK = 4.0
 class NeuroMSBG(EarNetwork):
     """Simulator of an impaired ear: a neural network that emulates MSBG, but faster.
 
-    The output is what the ear perceives, time-aligned with the input. The network multiplies the
+    MSBG is the simulation of hearing loss by Moore, Stone, Baer and Glasberg. The output is the
+    sound that the ear perceives, time-aligned with the input. The network multiplies the
     spectrogram of the input by a complex factor at each point. Its input channels are magnitude,
     phase and the encoded audiogram. An encoder and dual-path blocks (layers along time, then along
     frequency) follow, and two decoders predict the magnitude and the phase of the factor.
