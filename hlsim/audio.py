@@ -171,28 +171,28 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     """Encode a signal as the contents of a 16-bit FLAC file, for audio players on web pages.
 
     Args:
-        waveform: Samples from -1 to 1, (time,).
+        waveform: Samples from -1 to 1, (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
 
     Returns:
         The contents of the file.
 
     Raises:
-        ValueError: The signal has channels, samples beyond full scale, or a sample rate that flac
-            does not support.
+        ValueError: The signal has another shape, samples beyond full scale, or a sample rate that
+            flac does not support.
 
     >>> encode_flac(torch.zeros(160), 16000)[:4]
     b'fLaC'
     """
     samples = check_waveform(waveform).detach().to("cpu", torch.float32)
-    if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
+    if samples.ndim > 2 or not bool((samples.abs() <= 1.0).all()):
         raise ValueError(
-            f"expected shape (time,) and samples from -1 to 1, got shape {tuple(samples.shape)} "
-            f"and a peak of {float(samples.abs().max()):.3g}"
+            "expected shape (time,) or (channels, time) and samples from -1 to 1, got shape "
+            f"{tuple(samples.shape)} and a peak of {float(samples.abs().max()):.3g}"
         )
     data = io.BytesIO()
     try:
-        soundfile.write(data, samples.numpy(), int(sample_rate), format="FLAC", subtype="PCM_16")
+        soundfile.write(data, samples.numpy().T, int(sample_rate), format="FLAC", subtype="PCM_16")
     except soundfile.LibsndfileError as error:
         raise ValueError(f"cannot encode flac at {sample_rate} Hz: {error.error_string}") from error
     return data.getvalue()

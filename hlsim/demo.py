@@ -34,7 +34,6 @@ from hlsim.report.demo import (
     result_table,
 )
 from hlsim.report.page import write_page
-from hlsim.report.results import loss_name
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
@@ -85,7 +84,7 @@ def demo(
     folder = Path(out)
     training, scored = _split(speech)
     items = _read_items(scored, speech, audiogram, seed)
-    ear = f"{ear_name(audiogram)} ({loss_name(audiogram.severity)})"
+    ear = f"{ear_name(audiogram)} (pure-tone average {audiogram.pta:.0f} dB HL)"
     report(f"Training on {len(training)} utterances for the ear {ear}, {steps} steps")
     with one_thread():  # the steps are small: on a busy machine two threads wait for each other
         checkpoint = train_compensator(

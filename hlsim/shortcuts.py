@@ -18,6 +18,7 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, set_level
 from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
+from hlsim.files import write_atomically
 from hlsim.losses.frozen_simulator import build_simulator
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.version import __version__
@@ -87,8 +88,8 @@ def example_speech() -> Tensor:
 def simulate(
     audio: Audio,
     ear: AudiogramLike,
-    *,
     sample_rate: int = NEURO_RATE,
+    *,
     simulator: str | Path | torch.nn.Module = "msbg",
     full_scale_spl: float = PASCAL_SPL,
 ) -> Audio:
@@ -123,8 +124,8 @@ def simulate(
 def compensate(
     audio: Audio,
     ear: AudiogramLike,
-    *,
     sample_rate: int = NEURO_RATE,
+    *,
     compensator: str | Path = "hearing-aid",
     full_scale_spl: float = PASCAL_SPL,
 ) -> Audio:
@@ -171,14 +172,14 @@ def listen(
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
-        signals: Mono signals by the label to show, ``(time,)`` each.
+        signals: Signals by the label to show, ``(time,)``, or ``(2, time)`` in stereo.
 
     Returns:
         A player that a notebook displays; its ``save`` method writes a page for a browser.
 
     Raises:
-        ValueError: There is no signal, all signals are silent, one is not mono, or the sample rate
-            is not valid.
+        ValueError: There is no signal, all signals are silent, one has another shape, or the
+            sample rate is not valid.
 
     Example:
         >>> import hlsim
@@ -193,10 +194,10 @@ def listen(
     pascals = {}
     for label, signal in signals.items():
         tensor = _as_tensor(signal).detach().cpu()
-        if tensor.ndim != 1:
+        if tensor.ndim != 1 and tensor.shape[:-1] != (2,):
             raise ValueError(
-                f"expected mono signals of shape (time,), got {tuple(tensor.shape)} for {label!r}; "
-                "pass one channel, such as x[0]"
+                f"expected shape (time,) or (2, time), got {tuple(tensor.shape)} for {label!r}; "
+                "pass one item, such as x[0]"
             )
         pascals[label.replace("_", " ")] = tensor * gain
     return Players(pascals, check_rate(sample_rate))
@@ -206,7 +207,7 @@ class Players:
     """A player of several signals, displayed by a notebook or saved as a page.
 
     Args:
-        signals: Signals in pascals by their labels, ``(time,)`` each.
+        signals: Signals in pascals by their labels, ``(time,)`` or ``(2, time)``.
         sample_rate: Sample rate in Hz of all signals.
 
     >>> Players({"original": example_speech()}, 16000)
@@ -236,11 +237,15 @@ class Players:
 
         Args:
             path: File to write.
+
+        Raises:
+            ValueError: The file cannot be written.
         """
         from hlsim.report.page import Page, Section
 
-        page = Page("Listen", "", [Section("Sounds", player=self._player)])
-        Path(path).write_text(page.html(), encoding="utf-8")
+        title = ", ".join(self.labels).capitalize()
+        page = Page(title, "", [Section("Listen", player=self._player)])
+        write_atomically(Path(path), page.html())
 
 
 def info() -> str:

@@ -169,6 +169,6 @@ def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
     (tmp_path / "x.flac").write_bytes(encode_flac(signal, 16000))
     back, rate = read_audio(tmp_path / "x.flac")
     assert rate == 16000 and float((back[0] - signal).abs().max()) <= 2**-15
-    for bad in (signal * 2, torch.zeros(2, 10), signal / 0):
+    for bad in (signal * 2, torch.zeros(1, 2, 10), signal / 0):
         with pytest.raises(ValueError, match="expected shape"):
             encode_flac(bad, 16000)

@@ -50,7 +50,7 @@ def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Pa
     assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 10
     evidence = text.splitlines()[1].rpartition(" (")[2]
     assert f"({evidence}</small>" in page and page.count("t-test p = ") == 1
-    assert page.count("<audio") == 7 and "N4 (severe loss)" in page
+    assert page.count("<audio") == 9 and "N4 (pure-tone average" in page
     for name in names:
         assert f">{means[name]:.3f}</td>" in page
     assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0

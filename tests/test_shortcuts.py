@@ -1,6 +1,7 @@
 """The functions for a notebook give what the modules behind them give, for tensors and arrays."""
 
 import inspect
+import math
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,7 @@ def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
         lambda: hlsim.load_audio("missing.wav"),
         lambda: hlsim.listen(),
         lambda: hlsim.listen(original=SPEECH, sample_rate="16000"),
-        lambda: hlsim.listen(stereo=torch.stack([SPEECH, SPEECH])),
+        lambda: hlsim.listen(batch=torch.stack([SPEECH, SPEECH, SPEECH])),
     ],
 )
 def test_bad_input_is_rejected(call) -> None:
@@ -110,3 +111,13 @@ def test_samples_that_are_not_finite_are_rejected(process: Any, value: float) ->
     speech[100] = value
     with pytest.raises(ValueError, match="1 of 8000"):
         process(speech, "N3")
+
+
+def test_a_stereo_file_can_be_played_beside_a_mono_one(tmp_path) -> None:
+    players = hlsim.listen(stereo=torch.stack([SPEECH, 0.1 * SPEECH]), mono=SPEECH)
+    left, right = (float(level_spl(SPEECH)) - drop for drop in (0.0, 20.0))
+    power = (10 ** (left / 10) + 10 ** (right / 10)) / 2
+    level = 10 * math.log10(power)
+    assert repr(players) == f"Players(stereo {level:.0f} dB SPL, mono {left:.0f} dB SPL)"
+    players.save(tmp_path / "new folder" / "players.html")
+    assert (tmp_path / "new folder" / "players.html").read_text().count("<audio") == 2

@@ -75,6 +75,7 @@ def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
         frequencies = sorted(levels, key=float)
     except (TypeError, ValueError):
         raise ValueError(
-            f"expected a dictionary of frequencies in Hz to thresholds in dB HL, got {levels!r}"
+            f"expected a dictionary of frequencies in Hz to thresholds in dB HL, got {levels!r}; "
+            "for two ears, pass Listener(left, right)"
         ) from None
     return Audiogram(tuple(levels[frequency] for frequency in frequencies), tuple(frequencies))

@@ -187,7 +187,8 @@ def resolve_thresholds(
     """
     if audiogram is None and stored is None:
         raise ValueError(
-            "no audiogram; pass one with the call, or to MSBG or NALR when building it"
+            "expected an ear, got None; pass an audiogram, such as 'N3', with the signal or to the "
+            "module's constructor"
         )
     thresholds = stored if audiogram is None else as_thresholds(audiogram, **options)
     assert thresholds is not None

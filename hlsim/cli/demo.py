@@ -34,6 +34,6 @@ def _demo(options: argparse.Namespace) -> None:
         steps=options.steps,
         seed=options.seed,
         jobs=None,
-        progress=show_progress("values"),
+        progress=show_progress("scores"),
     )
     print(summary)

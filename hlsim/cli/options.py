@@ -14,6 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
+TypedEar = str | tuple[float, ...] | dict[float, float]
+"""An ear of a command line: its name, its eight levels, or its levels by frequency."""
+
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
 """Names of the standard ears, as in ``hlsim.audiogram``."""
 
@@ -132,8 +135,9 @@ class Parser(argparse.ArgumentParser):
     def audiogram(self, default: str | None = None, text: str = "", group: Any = None) -> None:
         """Declare ``--audiogram``, one ear. The help text ends with ``text``."""
         help_ = (
-            "NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, "
-            f"4000, 6000 and 8000 Hz, separated by commas{text}"
+            "NH, N1 to N7, S1 to S3; eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, "
+            "6000 and 8000 Hz, separated by commas; or levels by frequency in Hz, such as "
+            f"500:30,1000:40,4000:60{text}"
         )
         self.option("--audiogram", ear, help_, default, group=group)
 
@@ -221,17 +225,24 @@ def checked_type(
     return read_value
 
 
-def _read_ear(text: str) -> str | tuple[float, ...]:
-    """Return the name of a standard ear, or levels that are separated by commas or blanks."""
+def _read_ear(text: str) -> TypedEar:
+    """Return the name of a standard ear, eight levels, or a dictionary of levels by frequency."""
     if text.upper() in STANDARD_EARS:
         return text.upper()
-    return tuple(float(part) for part in re.split(r"[,\s]+", text.strip()))
+    parts = re.split(r"[,\s]+", text.strip())
+    if ":" in text:
+        points = [part.split(":") for part in parts]
+        return {float(frequency): float(level) for frequency, level in points}
+    return tuple(float(part) for part in parts)
 
 
-def _is_ear(value: str | tuple[float, ...]) -> bool:
-    """Return whether a value is a name, or eight levels in the range of an audiogram."""
-    is_name = isinstance(value, str)
-    return is_name or (len(value) == 8 and all(-10.0 <= float(level) <= 120.0 for level in value))
+def _is_ear(value: TypedEar) -> bool:
+    """Return whether a value is a name, or levels in the range of an audiogram."""
+    if isinstance(value, str):
+        return True
+    levels = value.values() if isinstance(value, dict) else value
+    is_complete = isinstance(value, dict) or len(value) == 8
+    return is_complete and all(-10.0 <= level <= 120.0 for level in levels)
 
 
 def _can_be_created(path: Path) -> bool:
@@ -251,7 +262,10 @@ integer = checked_type(int, lambda value: True, "a whole number")
 count = checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
 count_or_zero = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
 ear = checked_type(
-    _read_ear, _is_ear, f"{', '.join(STANDARD_EARS)}, or eight levels from -10 to 120 dB HL"
+    _read_ear,
+    _is_ear,
+    f"{', '.join(STANDARD_EARS)}, eight levels from -10 to 120 dB HL, or levels by frequency in Hz "
+    "such as 500:30,1000:40,4000:60",
 )
 plugin_name = checked_type(
     str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name or path/to/file.py:name"

@@ -10,6 +10,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.evaluation.aid_properties import mean_band_levels
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation
+from hlsim.metrics.words import words_change
 from hlsim.report.page import Card, Page, Picture, Section, Table
 from hlsim.report.players import NORMAL_EAR, make_player
 from hlsim.report.plots import (
@@ -24,12 +25,13 @@ from hlsim.report.results import Columns, score_details, split_rows, statistic, 
 UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED = "unaided", "NAL-R", "NAL-R, same level", "trained aid"
 """Names of the demo's conditions."""
 
-_PLAYED = (UNAIDED, NAL_R, TRAINED)
+_SOUND_NAMES = (UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED)
+_CURVE_NAMES = (UNAIDED, NAL_R, TRAINED)
 
 _COMPARISON = (
     "HASPI rewards any gain. The trained aid is therefore compared with NAL-R, the prescription "
     "that clinics know, amplified to the same output level. This comparison was planned before "
-    "the scores were known and is the only test on this page."
+    "the scores were known."
 )
 _LISTEN = (
     "One utterance of a voice that the aid was not trained on. The sounds of all utterances are "
@@ -65,13 +67,13 @@ def demo_page(
     normal = [perceive(item.clean, NORMAL, rate) for item in items]
     pictures = _draw_pictures(evaluation, items[0].ear, outputs, {NORMAL_EAR: normal, **perceived})
     groups = {
-        "As this ear perceives it": {
+        "Perceived by this ear, beside a normal ear": {
             NORMAL_EAR: normal[-1],
-            **{name: perceived[name][-1] for name in _PLAYED},
+            **{name: perceived[name][-1] for name in _SOUND_NAMES},
         },
-        "What comes out of the aid": {
+        "Output of the aids": {
             "original speech": items[-1].clean,
-            **{name: outputs[name][-1] for name in (NAL_R, TRAINED)},
+            **{name: outputs[name][-1] for name in _SOUND_NAMES[1:]},
         },
     }
     player = make_player(groups, rate, sentence)
@@ -112,23 +114,27 @@ def _cards(evaluation: Evaluation) -> list[Card]:
     means = evaluation.table.groupby("condition", sort=False)[["haspi", "loudness_error"]].mean()
     haspi, errors = means["haspi"], means["loudness_error"]
     words = {name: _predict_words(evaluation, name) for name in means.index}
+    fewest_words, most_words = (words_change([score], [score]).before for score in (0.0, 1.0))
     return [
         Card(
             "HASPI",
             f"{haspi[TRAINED]:.3f}",
-            "Predicted intelligibility, from 0 to 1. It rewards any gain, however loud.",
+            "Predicted intelligibility, from 0 to 1. It rewards any gain, so compare the last two, "
+            "which have the same output level.",
             [(name, f"{value:.3f}", value) for name, value in haspi.items()],
         ),
         Card(
             "Words understood",
             f"{words[TRAINED]:.0%}",
-            "Predicted from HASPI, for listeners with a hearing loss.",
+            "Predicted from HASPI for listeners with a hearing loss: "
+            f"{fewest_words:.0%} at a HASPI of 0, {most_words:.0%} at 1.",
             [(name, f"{value:.0%}", value) for name, value in words.items()],
         ),
         Card(
             "Loudness error",
             _decibels(errors[TRAINED]),
-            "Perceived level minus that of a normal ear. At 0 dB, speech is as loud as normal.",
+            "Overall perceived level minus that of a normal ear. A picture below shows each "
+            "frequency band, in which the error may be larger.",
             [(name, _decibels(e), abs(e) / errors.abs().max()) for name, e in errors.items()],
         ),
     ]
@@ -156,7 +162,7 @@ def _draw_pictures(
     colours = condition_colours(evaluation.conditions)
     gains = evaluation.details["gain_curves"]
     frequencies = gains[0]["frequencies"]
-    styles = {name: {"color": colours[name]} for name in _PLAYED}
+    styles = {name: {"color": colours[name]} for name in _CURVE_NAMES}
     styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
     perceived_curves = {
         name: (frequencies, mean_band_levels(perceived[name]), style)

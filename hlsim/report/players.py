@@ -126,7 +126,7 @@ def make_player(
 
     Args:
         groups: Signals in pascals by the label of their button, for each heading of a group, which
-            may be empty. Shape of each signal: (time,).
+            may be empty. Shape of each signal: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
         sentence: Words that are spoken, shown above the sounds.
 
@@ -143,11 +143,13 @@ def make_player(
     for heading, group in groups.items():
         peak = _peak(group)
         softer = 20.0 * math.log10(peak / first_peak)
-        title = heading + (f", played {softer:.0f} dB softer" if softer > 0.5 else "")
+        title = heading + (
+            f", played {softer:.0f} dB softer than the first row" if softer > 0.5 else ""
+        )
         sounds[title] = [
             _make_sound(label, signal, sample_rate, peak) for label, signal in group.items()
         ]
-    samples = max(len(signal) for group in groups.values() for signal in group.values())
+    samples = max(signal.shape[-1] for group in groups.values() for signal in group.values())
     return Player(
         groups=sounds,
         seconds=samples / sample_rate,
@@ -161,11 +163,11 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
 
     Args:
         label: Name on the button.
-        signal: The signal. Shape: (time,).
+        signal: The signal. Shape: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
         peak: Largest sample of all signals of the group, which is played as 0.9.
     """
-    level = float(level_spl(signal))
+    level = float(level_spl(signal.flatten()))
     levels = spectrogram_levels(signal, sample_rate)
     lowest = SPECTROGRAM_LEVELS[0]
     is_empty = float((levels > lowest).float().mean()) < _EMPTY_SHARE
@@ -195,8 +197,10 @@ def _full_scale(peak: float) -> float:
 def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     """Compute the spectrogram of a signal up to 8 kHz, in windows of 20 ms every 10 ms.
 
+    The powers of several channels are averaged.
+
     Args:
-        signal: Signal in pascals. Shape: (time,).
+        signal: Signal in pascals. Shape: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
 
     Returns: Levels in dB SPL in bins of 50 Hz, at least -46. Shape: (bins, frames).
@@ -209,7 +213,8 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     spectrum = torch.stft(
         signal.float().cpu(), points, points // 2, window=window, return_complex=True
     )
-    levels = 20.0 * torch.log10(spectrum.abs() * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
+    magnitude = spectrum.abs().reshape(-1, *spectrum.shape[-2:]).square().mean(0).sqrt()
+    levels = 20.0 * torch.log10(magnitude * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
     return levels[: round(_HIGHEST_HZ * points / sample_rate) + 1]
 
 

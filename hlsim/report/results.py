@@ -308,11 +308,12 @@ def score_details(
     counts = evaluation.table.drop_duplicates("item")["severity"].value_counts()
     degrees = ", ".join(f"{name} {counts[name]}" for name in SEVERITIES if name in counts)
     clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
+    scales = " to ".join(f"{level:.1f}" for level in sorted({scale.min(), scale.max()}))
     notes = [
         describe_software(evaluation),
         f"Degrees of hearing loss by item: {degrees}.",
-        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for "
-        f"{scale.min():.1f} to {scale.max():.1f} dB SPL.",
+        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for {scales} "
+        "dB SPL.",
         better_ear,
         STATISTICS_NOTE,
     ]
@@ -337,9 +338,10 @@ def describe_software(evaluation: Evaluation) -> str:
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES
     >>> evaluation = Evaluation([], [], [MEASURES["haspi"]], pandas.DataFrame({"haspi": [0.5]}))
-    >>> describe_software(evaluation)[:34]
-    'HASPI (version 2) are computed by '
+    >>> describe_software(evaluation)[-50:]
+    ' computes HASPI (version 2) as pyclarity 0.9 does.'
     """
     names = [column_title(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
-    software = f"hlsim {evaluation.versions['hlsim']}, as by pyclarity 0.9"
-    return f"{' and '.join(names)} (version 2) are computed by {software}." if names else ""
+    software = f"hlsim {evaluation.versions['hlsim']}"
+    scores = " and ".join(names)
+    return f"{software} computes {scores} (version 2) as pyclarity 0.9 does." if names else ""

@@ -111,7 +111,7 @@ class TrainingModule(L.LightningModule):
         if self.trainer.progress_bar_callback is None:  # a progress bar shows the measures
             measures = remove_score(self.validation)
             texts = [f"{name} {value:.3f}" for name, value in measures.items()]
-            self.print(f"step {self.global_step}: {', '.join(texts)}")
+            self.print(f"step {self.global_step} of {self.trainer.max_steps}: {', '.join(texts)}")
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["start_validation"] = self.start_validation

@@ -156,7 +156,7 @@ def test_the_page_of_the_demo_shows_its_numbers_verdict_and_sounds(
     window: Any, demo_file: Path
 ) -> None:
     window.goto(demo_file.as_uri())
-    check_images(window, 3 + 7)  # pictures, and spectrograms of all sounds
+    check_images(window, 3 + 9)  # pictures, and spectrograms of all sounds
     titles = window.locator(".card .name").all_inner_texts()
     assert titles == ["HASPI", "Words understood", "Loudness error"]
     bars = window.locator(".card .bar").evaluate_all(
@@ -169,8 +169,11 @@ def test_the_page_of_the_demo_shows_its_numbers_verdict_and_sounds(
     )
     assert order == sorted(order)
     labels = window.locator(".select span").all_inner_texts()
-    assert labels[:4] == ["normal ear (the goal)", "unaided", "NAL-R", "trained aid"]
-    assert labels[4:] == ["original speech", "NAL-R", "trained aid"]
+    aids = ["NAL-R", "NAL-R, same level", "trained aid"]
+    assert labels == ["normal ear (the goal)", "unaided", *aids, "original speech", *aids]
+    window.keyboard.press("2")  # on the fresh page, before any click
+    (state,) = window.evaluate(STATE)
+    assert state["pressed"] == 1
     window.locator(".play").click()
     window.locator(".select").nth(3).click()
     wait_until(window, "document.querySelectorAll('audio')[3].currentTime > 0.1")

@@ -35,7 +35,7 @@ def test_a_tone_has_its_level_in_one_bin() -> None:
 def test_sounds_of_a_group_have_one_gain_and_groups_are_not_louder_than_others() -> None:
     groups = {"perceived": {"a": tone(60.0), "b": tone(50.0)}, "output": {"c": tone(90.0)}}
     player = make_player(groups, 16000, "Some words.")
-    assert list(player.groups) == ["perceived", "output, played 30 dB softer"]
+    assert list(player.groups) == ["perceived", "output, played 30 dB softer than the first row"]
     first, second, third = player.sounds
     ratio = samples(first.audio).std() / samples(second.audio).std()
     assert float(ratio) == pytest.approx(10 ** (10 / 20), rel=1e-3)

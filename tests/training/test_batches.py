@@ -151,4 +151,4 @@ def test_a_simulator_is_trained_on_a_manifest(
     recipe = replace(SMALL_RECIPE, steps=4)
     data = TrainingData.from_manifest(manifest)
     train_simulator(data, recipe, out=tmp_path / "out", accelerator="cpu")
-    assert "step 4: valid_snr_median" in capsys.readouterr().out
+    assert "step 4 of 4: valid_snr_median" in capsys.readouterr().out

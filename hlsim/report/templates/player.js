@@ -1,8 +1,9 @@
 // Switch between the sounds of a player at the same position, so that they can be compared.
 {
   const maxStep = 12; // dB by which a sound may be louder than the one by which the volume was set
-  // All players of a page have one volume.
-  const shared = (window.hlsimPlayers ??= { volume: 0.5, loudness: null });
+  // All players of a page have one volume. Keys switch between the sounds of the player used last.
+  const shared = (window.hlsimPlayers ??= { volume: 0.5, loudness: null, player: null });
+  const isPage = document.body.classList.contains("hlsim-page"); // not a notebook, which has keys
   const allSounds = () => document.querySelectorAll(".hlsim-player audio");
 
   const setVolume = (volume, loudness) => {
@@ -42,6 +43,7 @@
         excess > 0 ? `Volume lowered by ${excess.toFixed(0)} dB: this sound is much louder.` : "";
     };
     const select = (number) => {
+      shared.player = player;
       protect(number);
       const time = current.currentTime;
       const isPlaying = !current.paused;
@@ -79,10 +81,11 @@
     find(".repeat").addEventListener("change", (event) => {
       for (const audio of audios) audio.loop = event.target.checked;
     });
-    player.addEventListener("keydown", (event) => {
+    (isPage ? document : player).addEventListener("keydown", (event) => {
       const number = Number(event.key) - 1;
       const isPlain = !event.ctrlKey && !event.altKey && !event.metaKey;
-      if (isPlain && audios[number]) select(number);
+      const isMeant = !isPage || shared.player === player;
+      if (isPlain && isMeant && audios[number]) select(number);
     });
     for (const audio of audios) {
       audio.controls = false;
@@ -95,4 +98,5 @@
   };
 
   document.querySelectorAll(".hlsim-player:not([data-ready])").forEach(start);
+  shared.player = document.querySelector(".hlsim-player");
 }
