@@ -1,0 +1,170 @@
+"""The commands and programs of the guides run as printed, on a small corpus (``pytest -m slow``).
+
+Trainings take two steps, and studies two items of one second.
+"""
+
+import csv
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import hlsim
+from hlsim.audio import write_audio
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/guide").glob("*.md"))]
+
+NOT_RUN = {
+    "python3 -m venv": "installs hlsim",
+    ". .venv": "belongs to the line above it",
+    "pip install": "installs packages",
+    "hlsim live": "needs a microphone",
+    "RNNoise": "needs pyrnnoise",
+    "machine_listener.py": "needs a model of Whisper",
+    "listening_page.py": "needs npm",
+    "http.server": "does not end",
+    "huggingface_hub": "needs a network",
+    "LightningModule": "is part of a program",
+    "mine.ckpt": "is part of a program",
+    'loss = hlsim.HearingLossLoss("N3", simulator': "is part of a program",
+}
+"""Texts in commands and programs that are not run, with the reason."""
+
+SHORTER = {
+    "hlsim train-": "--recipe.steps 2 --recipe.batch 2 --recipe.validation_items 2 --quiet",
+    "hlsim evaluate-": "--items 2 --seconds 1 --listen 1 --jobs 1",
+    "hlsim haspi-report": "--listen 1 --jobs 1",
+    "hlsim clarity": "--listen 1 --jobs 1",
+    "examples.training.dead_region_aid": "S2 2",
+}
+"""Options that are added to the commands that contain a text."""
+
+
+def _read_steps(page: Path) -> list[tuple[str, str]]:
+    """Return the shell commands and Python programs of a page, in its order, with their kind."""
+    text = page.read_text(encoding="utf-8")
+    steps = []
+    for kind, block in re.findall(r"```(sh|python)\n(.*?)```", text, re.DOTALL):
+        if kind == "python":
+            steps.append((kind, block))
+        else:
+            lines = re.sub(r"\\\n\s*", "", block).splitlines()
+            steps += [(kind, line) for line in lines if line and not line.startswith("#")]
+    return [step for step in steps if not any(part in step[1] for part in NOT_RUN)]
+
+
+def _write_corpus(folder: Path) -> None:
+    """Write the folders and files that the guides name."""
+    for name in ("hlsim", "compensators", "checkpoints", "examples", "docs"):
+        (folder / name).symlink_to(ROOT / name)
+    bundled = ROOT / "hlsim" / "data" / "speech"
+    shutil.copytree(bundled, folder / "speech")
+    (folder / "audiograms").mkdir()
+    for split in ("train", "valid"):
+        shutil.copy(ROOT / "examples" / "ears.csv", folder / "audiograms" / f"{split}.csv")
+
+    speech = [hlsim.load_audio(path, sample_rate=16000)[0] for path in bundled.glob("*/*.flac")]
+    clean = [waveform[:32000] for waveform in speech if len(waveform) >= 32000][:4]
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.005 * torch.randn(32000, generator=generator)
+    recordings = {
+        "noise/train": [noise],
+        "noise/valid": [noise],
+        "clean": clean,
+        "before": [waveform + noise for waveform in clean],
+        "after": [4.0 * waveform for waveform in clean],
+        "recordings/train": clean[:2],
+        "recordings/valid": clean[2:],
+        **{f"VoxCeleb/id{number:02}/session": clean[:1] for number in range(20)},
+        **{f"collection/set/clean/{speaker}": clean[:1] for speaker in ("a", "b")},
+        **{f"collection/set/noisy/{speaker}": clean[:1] for speaker in ("a", "b")},
+    }
+    noisy = [waveform + noise for waveform in clean]
+    for split in ("trainset_28spk", "testset"):
+        recordings[f"VoiceBank-DEMAND/clean_{split}_wav"] = clean[:2]
+        recordings[f"VoiceBank-DEMAND/noisy_{split}_wav"] = noisy[:2]
+    for name, waveforms in recordings.items():
+        (folder / name).mkdir(parents=True)
+        for number, waveform in enumerate(waveforms):
+            speaker = "p232_" if "testset" in name else "p226_"
+            file = f"{speaker if 'VoiceBank' in name else ''}{number:03}.wav"
+            write_audio(folder / name / file, waveform, 16000)
+    for kind in ("clean", "noisy"):
+        (folder / "dns" / "training" / kind).mkdir(parents=True)
+        for number, waveform in enumerate(clean):
+            file = f"{kind}_fileid_{number + 6}.wav"
+            write_audio(folder / "dns" / "training" / kind / file, waveform, 16000)
+    _write_listeners(folder, clean[0])
+    hlsim.save_compensator(hlsim.MappingCompensator(), folder / "runs" / "aid" / "checkpoint")
+
+
+def _write_listeners(folder: Path, clean: torch.Tensor) -> None:
+    """Write two listeners, a scene of two channels, and a study of recordings."""
+    levels = [35, 35, 35, 40, 50, 55, 60, 65]
+    entry = {
+        "audiogram_cfs": [250, 500, 1000, 2000, 3000, 4000, 6000, 8000],
+        "audiogram_levels_l": levels,
+        "audiogram_levels_r": levels,
+    }
+    listeners = json.dumps({"L0001": entry, "L0002": entry})
+    clarity = folder / "clarity_data"
+    (clarity / "dev" / "scenes").mkdir(parents=True)
+    (clarity / "metadata").mkdir()
+    for path in (folder / "listeners.json", clarity / "metadata" / "listeners.json"):
+        path.write_text(listeners)
+    pairs = json.dumps({"S06001": ["L0001"]})
+    (clarity / "metadata" / "scenes_listeners.dev.json").write_text(pairs)
+    scene = torch.stack([clean, 0.7 * clean])
+    write_audio(folder / "scene.wav", scene, 16000)
+    for kind in ("mix", "target", "target_anechoic"):
+        write_audio(clarity / "dev" / "scenes" / f"S06001_{kind}_CH1.wav", scene, 16000)
+
+    header = ["listener", "ear", *(f"hl_{hz}" for hz in entry["audiogram_cfs"])]
+    with open(folder / "listeners.csv", "w", newline="") as file:
+        csv.writer(file).writerows([header, ["L0001", "left", *levels]])
+    with open(folder / "study.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["listener", "ear", "condition", "clean", "processed", "snr"])
+        for condition, processed in (("unaided", "before"), ("NAL-R", "after")):
+            for item in range(4):
+                paths = [f"clean/{item:03}.wav", f"{processed}/{item:03}.wav"]
+                table.writerow(["L0001", "left", condition, *paths, 10])
+
+
+def _run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, f"{shlex.join(command)}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if _read_steps(page)], ids=lambda page: page.stem
+)
+def test_commands_and_programs_of_a_page_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for extra in ("lightning", "pandas", "matplotlib", "joblib"):
+        pytest.importorskip(extra)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.syspath_prepend(ROOT)
+    _write_corpus(tmp_path)
+    names: dict[str, object] = {}  # each program goes on from the one before it
+    for kind, text in _read_steps(page):
+        if kind == "python":
+            exec(compile(text.replace("items=12", "items=2, seconds=1.0"), page, "exec"), names)
+            continue
+        words = shlex.split(text.replace("network.pt N3 200", "network.pt N3 2"), comments=True)
+        for part, options in SHORTER.items():
+            words += shlex.split(options) if part in text else []
+        module = ["-m", "hlsim"] if words[0] == "hlsim" else []
+        _run([sys.executable, *module, *words[1:]])
