@@ -374,22 +374,17 @@ def _write_signals(
     problems: dict[str, str] = {}
     try:
         mix, reference = _read_scene(pair.files, rate)
-        _write(_reference_file(out, pair.scene), reference, rate)
+        write_audio(_reference_file(out, pair.scene), reference, rate)
     except ValueError as error:
         return dict.fromkeys(folders, str(error))
     for condition in conditions:
         path = pair.output_file(folders[condition.name])
         try:
             if not path.is_file() and condition.process is not None:
-                _write(path, condition.process(mix, pair.listener), rate)
+                write_audio(path, condition.process(mix, pair.listener), rate)
         except Exception as error:  # A failure must not end the study.
             problems[condition.name] = describe_error(error)
     return problems
-
-
-def _write(path: Path, waveform: Tensor, rate: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_audio(path, waveform, rate)
 
 
 def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:

@@ -213,11 +213,12 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
     reference = item.once("normal clean", lambda: perceive(item.clean, NORMAL, rate))
     normal_input = item.once("normal input", lambda: perceive(item.signal, NORMAL, rate))
     perceived = perceive(output, item.ear, rate)
+    peak = 20.0 * output.abs().max().clamp_min(1e-10).log10()
     level = float(level_spl(perceived))
     normal_level = float(level_spl(normal_input))
     normal_clean_level = float(level_spl(reference))
     return {
-        "peak": _peak_spl(output),
+        "peak": float(peak) + PASCAL_SPL,
         "perceived_level": level,
         "normal_level": normal_level,
         "normal_clean_level": normal_clean_level,
@@ -265,11 +266,6 @@ def network_loss(simulator: nn.Module) -> Measure:
         return {"loss_neuro": float(band_level_loss(perceived, reference, item.sample_rate))}
 
     return Measure("network loss", compute, packages=["hlsim"], settings=fingerprint(simulator))
-
-
-def _peak_spl(waveform: Tensor) -> float:
-    """Return the level of the largest sample in dB SPL, where a sample of 1.0 is 94."""
-    return float(20.0 * waveform.abs().max().clamp_min(1e-10).log10()) + PASCAL_SPL
 
 
 def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:

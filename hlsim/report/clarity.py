@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
@@ -35,10 +36,14 @@ def write_scores(evaluation: Evaluation, out: str | Path) -> None:
         out: Folder of the file.
     """
     columns = ["utterance", "listener", "condition", "combined", "haspi", "hasqi", "level"]
-    combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
-    scores = evaluation.table.assign(combined=combined)[columns]
-    scores = scores.rename(columns={"utterance": "scene"})
+    scores = _add_combined(evaluation).table[columns].rename(columns={"utterance": "scene"})
     write_atomically(Path(out) / "scores.csv", scores.to_csv(index=False, float_format="%.6f"))
+
+
+def _add_combined(evaluation: Evaluation) -> Evaluation:
+    """Add the column ``combined``, the mean of HASPI and HASQI, to the table of an evaluation."""
+    combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
+    return replace(evaluation, table=evaluation.table.assign(combined=combined))
 
 
 def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
@@ -67,10 +72,10 @@ def _conditions_table(evaluation: Evaluation) -> Table:
     Only pairs of scene and listener count for which all conditions have scores. A condition without
     any score is ignored in this respect.
     """
-    combined = 0.5 * (evaluation.wide("haspi") + evaluation.wide("hasqi"))
-    scored = combined.dropna(axis=1, how="all").notna().all(axis=1)
-    table = evaluation.table[evaluation.table["item"].isin(scored[scored].index)]
-    table = table.assign(combined=0.5 * (table["haspi"] + table["hasqi"]))
+    evaluation = _add_combined(evaluation)
+    combined = evaluation.wide("combined").dropna(axis=1, how="all")
+    scored = combined.notna().all(axis=1)
+    table = evaluation.table[evaluation.table["item"].map(scored)]
     scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
     columns = {**{title: (statistic(score), ".3f") for title, score in scores.items()}, **LEVEL}
     shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
