@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hlsim.cli.main import main
-from tests.helpers import EXAMPLES, load_example
+from tests.helpers import EXAMPLES, load_example, write_ears
 
 TRAINING = EXAMPLES / "training"
 
@@ -100,38 +100,23 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     for change in shorter:
         lines = [change if line.startswith(change.split()[0]) else line for line in lines]
     recipe.write_text("\n".join(lines))
-    common = (
-        "--out",
-        str(out),
-        "--device",
-        "cpu",
-        "--quiet",
-    )
-    assert (
-        main(
-            ["train-simulator", *teacher, "--recipe", str(recipe), "--speech", str(train), *common]
-        )
-        == 0
-    )
-    ears = tmp_path / "ears.csv"
-    ears.write_text("hl_250,hl_1000,hl_4000\n20,30,75\n")
-    options = (
+
+    def run(command: str, *options: object) -> None:
+        assert main([*command.split(), *map(str, options)]) == 0
+
+    run(
+        "train-simulator --device cpu --quiet",
         *teacher,
+        "--recipe",
+        recipe,
         "--speech",
-        str(valid),
-        "--audiograms",
-        str(ears),
-        "--items",
-        "2",
-        "--seconds",
-        "0.5",
+        train,
+        "--out",
+        out,
     )
-    assert (
-        main(
-            ["evaluate-simulator", str(out / "checkpoint"), *options, "--out", str(tmp_path / "of")]
-        )
-        == 0
-    )
+    ears = write_ears(tmp_path / "ears.csv", "S2")
+    options = (*teacher, "--speech", valid, "--audiograms", ears, "--out", tmp_path / "of")
+    run("evaluate-simulator --items 2 --seconds 0.5", *options, "--", out / "checkpoint")
     assert "examples.training.dead_region:DeadRegion" in capsys.readouterr().out
     example = importlib.import_module("examples.training.dead_region_aid")
     for simulator in (str(out / "checkpoint"), ""):

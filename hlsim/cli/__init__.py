@@ -1,1 +1,1 @@
-"""The program ``hlsim``: a module a command, which joins what computes to what presents."""
+"""The program ``hlsim``: modules that declare the options of its commands and call the library."""

@@ -44,10 +44,11 @@ COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program.
+    """Run the program ``hlsim``.
 
     Args:
-        arguments: Command and options; by default those of the process.
+        arguments: Command and options, such as ``["demo", "--seed", "1"]``; by default those of the
+            process.
 
     Returns:
         Exit status: 0 after success, 2 after an error, and 128 plus the number of the signal that

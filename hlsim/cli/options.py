@@ -20,9 +20,6 @@ TypedEar = str | tuple[float, ...] | dict[float, float]
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
 """Names of the standard ears, as in ``hlsim.audiogram``."""
 
-TEACHERS = ("msbg",)
-"""Names of the teachers that are no plug-ins, as in ``hlsim.training.teacher``."""
-
 EARS_TABLE = (
     "CSV file of ears with columns hl_250, hl_500, ... in dB HL, an empty value where a frequency "
     "was not measured; or standard for Bisgaard's ears N1 to N6 and S1 to S3"
@@ -126,8 +123,8 @@ class Parser(argparse.ArgumentParser):
         """Declare ``--teacher``, a simulator. The help text begins with ``text``."""
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
-            "path/to/file.py:name, which is a function (waveform, audiogram) -> waveform, or a "
-            "class of such functions; waveforms (items, time) are in pascals, audiograms (items, "
+            "path/to/file.py:name, a function (waveform, audiogram) -> waveform or a class whose "
+            "objects are; waveforms (items, time) are in pascals, audiograms (items, "
             "8) in dB HL, and the sample rate is its attribute sample_rate or else 16000 Hz"
         )
         self.option("--teacher", teacher_name, help_, default, metavar="NAME")
@@ -272,8 +269,8 @@ plugin_name = checked_type(
 )
 teacher_name = checked_type(
     str,
-    lambda text: text in TEACHERS or bool(_PLUGIN.fullmatch(text)),
-    f"{', '.join(TEACHERS)}, package.module:name or path/to/file.py:name",
+    lambda text: text == "msbg" or bool(_PLUGIN.fullmatch(text)),
+    "msbg, package.module:name or path/to/file.py:name",
 )
 input_path = checked_type(Path, lambda path: path.exists(), "an existing file or folder")
 input_file = checked_type(Path, lambda path: path.exists(), "an existing file")

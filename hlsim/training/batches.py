@@ -184,7 +184,7 @@ class _RandomBatches(Dataset[Batch]):
         return self.draw(self.recipe.batch, generator)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        """Draw a batch.
+        """Draw the tensors of a batch.
 
         Args:
             count: Number of items.
@@ -326,7 +326,7 @@ def simulator_data(
         plugin: Teacher that replaces the exact MSBG.
 
     Raises:
-        ValueError: Source are missing or invalid.
+        ValueError: Files are missing or invalid.
 
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe())
@@ -352,7 +352,7 @@ def compensator_data(
         ear: Ear of a personal compensator; None for a general one.
 
     Raises:
-        ValueError: Source are missing or invalid, or the recipe requires noise and there is none.
+        ValueError: Files are missing or invalid, or the recipe requires noise and there is none.
 
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> batches = compensator_data(TrainingData(speech), CompensatorRecipe(), ear=None)
@@ -386,7 +386,7 @@ def simulator_validation(data: TrainingData, recipe: SimulatorRecipe) -> list[Ba
         recipe: Settings of the training.
 
     Raises:
-        ValueError: Source are missing or invalid, or used for both training and validation.
+        ValueError: Files are missing or invalid, or used for both training and validation.
 
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> len(simulator_validation(TrainingData(speech), SimulatorRecipe()))  # of 8 items each

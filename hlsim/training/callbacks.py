@@ -122,7 +122,7 @@ class BestCheckpoint(ModelCheckpoint):
 
 
 def remove_score(validation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the measures of a validation without the score that is computed from them.
+    """Return the results of a validation without the score that is computed from them.
 
     >>> remove_score({"score": -0.5, "valid_loss": 0.5})
     {'valid_loss': 0.5}

@@ -35,7 +35,7 @@ _EXPECTED_WARNINGS = (
 
 
 class TrainerOptions(TypedDict, total=False):
-    """Options of a training that do not change the trained weights.
+    """Options that state where and how long a training runs, and what it shows.
 
     Attributes:
         max_minutes: Time limit in minutes, including the time before a resumption. By default, the

@@ -3,6 +3,7 @@
 import json
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
+from tests.helpers import write_table
 
 N3 = Audiogram.standard("N3")
 
@@ -126,33 +128,28 @@ def test_simulate_keeps_rate_channels_and_length(
     assert 0 < np.std(output) < np.std(samples)
 
 
-@pytest.mark.parametrize("levels", ["30,35,40,50,55,60,65,70", "-10 -5 0 10 20 30 40 50"])
-def test_simulate_is_the_exact_model_by_default(
-    tmp_path: Path, utterance: Path, levels: str
-) -> None:
-    options = ("--audiogram", levels, "--full-scale-spl", "100")
-    assert run("simulate", utterance, tmp_path / "out.wav", *options) == 0
-    waveform, rate = read_audio(utterance)
-    ear = Audiogram(tuple(map(float, levels.replace(",", " ").split())))
-    expected = MSBG(ear, sample_rate=rate, full_scale_spl=100.0)(waveform)
-    check_output(tmp_path / "out.wav", expected, atol=1e-7)
+SLOPING = Audiogram((-10.0, -5.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0))
+N7 = Audiogram.standard("N7")  # N7 exceeds the range of a simulator.
+OUTPUTS: dict[str, Callable[[Tensor, int], Tensor]] = {
+    "simulate --audiogram -10,-5,0,10,20,30,40,50 --full-scale-spl 100": (
+        lambda wave, rate: MSBG(SLOPING, sample_rate=rate, full_scale_spl=100.0)(wave)
+    ),
+    "compensate --audiogram N3 --compensator nalr": (
+        lambda wave, rate: NALR(N3, sample_rate=rate)(wave)
+    ),
+    "compensate --audiogram N7 --compensator Nal-R": (
+        lambda wave, rate: NALR(N7, sample_rate=rate)(wave)
+    ),
+    "compensate --audiogram N3 --noise-reduction 0.5 --amplification 0": (
+        lambda wave, rate: load_compensator("hearing-aid", sample_rate=rate)(wave, N3, 0.5, 0.0)
+    ),
+}
 
 
-@pytest.mark.parametrize("name", ["nalr", "NAL-R", "Nal-R"])
-def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path, name: str) -> None:
-    call = ("compensate", utterance, tmp_path / "out.wav", "--compensator", name, "--audiogram")
-    assert run(*call, "N3") == 0
-    waveform, rate = read_audio(utterance)
-    check_output(tmp_path / "out.wav", NALR(N3, sample_rate=rate)(waveform), atol=1e-7)
-    assert run(*call, "N7") == 0  # N7 exceeds the range of a simulator.
-
-
-def test_sliders_reach_the_hearing_aid(tmp_path: Path, utterance: Path) -> None:
-    call = ("compensate", utterance, tmp_path / "out.wav", "--audiogram", "N3")
-    assert run(*call, "--noise-reduction", "0.5", "--amplification", "0") == 0
-    waveform, rate = read_audio(utterance)
-    expected = load_compensator("hearing-aid", sample_rate=rate)(waveform, N3, 0.5, 0.0)
-    check_output(tmp_path / "out.wav", expected)
+@pytest.mark.parametrize("call", OUTPUTS)
+def test_the_output_is_that_of_the_library(tmp_path: Path, utterance: Path, call: str) -> None:
+    assert run(*call.split(), utterance, tmp_path / "out.wav") == 0
+    check_output(tmp_path / "out.wav", OUTPUTS[call](*read_audio(utterance)), 1e-7)
 
 
 def test_a_presentation_level_is_that_of_the_input(
@@ -175,9 +172,7 @@ def test_a_presentation_level_is_that_of_the_input(
 
 def write_listeners(folder: Path, **listeners: Listener) -> Path:
     rows = [row for name, listener in listeners.items() for row in listener.to_rows(name)]
-    lines = [",".join(rows[0]), *(",".join(row.values()) for row in rows)]
-    (folder / "ears.csv").write_text("\n".join(lines))
-    return folder / "ears.csv"
+    return write_table(folder / "ears.csv", rows)
 
 
 def test_both_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:

@@ -12,7 +12,6 @@ from hlsim.cli import options
 from hlsim.cli.main import COMMANDS, GROUPS, main
 from hlsim.cli.options import Parser
 from hlsim.losses.criteria import CRITERIA, CriterionName
-from hlsim.training.teacher import TEACHERS
 
 FUNCTIONS = {
     "simulate": "hlsim.shortcuts",
@@ -68,7 +67,6 @@ def test_defaults_of_a_command_are_those_of_its_function(command: str) -> None:
 
 def test_names_that_are_written_twice_agree() -> None:
     assert tuple(STANDARD) == options.STANDARD_EARS
-    assert options.TEACHERS == TEACHERS
     assert tuple(CRITERIA) == get_args(CriterionName)
 
 

@@ -30,18 +30,11 @@ KINDS = {
 def draw_signal(draw: Random, samples: int) -> Tensor:
     """Draw an impulse, a constant, noise, a tone, a step or bursts, at a random level."""
     time, at = torch.arange(samples, dtype=torch.float64), draw.randrange(samples)
-    noise = torch.randn(
-        samples, generator=torch.Generator().manual_seed(draw.randrange(2**32))
-    ).clamp(-1.0, 1.0)
+    generator = torch.Generator().manual_seed(draw.randrange(2**32))
+    noise = torch.randn(samples, generator=generator).clamp(-1.0, 1.0)
     tone = torch.sin(time * draw.choice((1e-4, 0.1, 1.0, 3.1)))
-    shapes = (
-        time == at,
-        time >= 0,
-        noise,
-        tone,
-        time >= at,
-        noise * (torch.sin(time / 300.0) > 0.0),
-    )
+    bursts = noise * (torch.sin(time / 300.0) > 0.0)
+    shapes = (time == at, time >= 0, noise, tone, time >= at, bursts)
     return draw.choice(LEVELS) * draw.choice(shapes).double()
 
 
@@ -50,22 +43,19 @@ class Case:
 
     def __init__(self, draw: Random, names: tuple[str, ...]) -> None:
         self.name, self.ear, items = draw.choice(names), draw.choice(EARS), draw.choice((1, 1, 3))
-        # of less than 0.7 s there is no score
-        shortest = draw.choice((1, 11200, 11200, 11200)) if self.name in ("haspi", "hasqi") else 1
-        samples = draw.choice(
-            (shortest, *(draw.randint(shortest, max(4000, shortest + 800)) for _ in range(2)))
-        )
+        is_score = self.name in ("haspi", "hasqi")
+        shortest = draw.choice((1, 11200, 11200, 11200)) if is_score else 1  # Scores need 0.7 s.
+        longest = max(4000, shortest + 800)
+        lengths = (shortest, draw.randint(shortest, longest), draw.randint(shortest, longest))
+        samples = draw.choice(lengths)
         kind = draw.choice((torch.float32, torch.float32, torch.float64))
         self.signal, self.clean = (
             torch.stack([draw_signal(draw, samples) for _ in range(items)]).to(kind)
             for _ in range(2)
         )
-        if (
-            shortest > 1 and draw.random() < 0.7
-        ):  # something that can be heard, of which there is a score
-            self.clean = 0.05 * torch.randn(
-                self.clean.shape, generator=torch.Generator().manual_seed(0)
-            ).to(kind)
+        if shortest > 1 and draw.random() < 0.7:  # Audible noise has a score.
+            noise = torch.randn(self.clean.shape, generator=torch.Generator().manual_seed(0))
+            self.clean = 0.05 * noise.to(kind)
 
 
 @cache
@@ -86,9 +76,7 @@ def check(case: Case) -> None:
     assert bool(torch.isfinite(out).all()), "not finite"
     assert paired or out.shape == signal.shape, "another shape"
     out.sum().backward()
-    assert signal.grad is not None and bool(torch.isfinite(signal.grad).all()), (
-        "gradient not finite"
-    )
+    assert signal.grad is not None and bool(torch.isfinite(signal.grad).all()), "gradient"
 
 
 @pytest.mark.parametrize("kind", KINDS)
