@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import OTHER_COLUMNS
@@ -158,3 +160,16 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_nan(entry) for entry in value]
     return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def predict_words(scores: Iterable[float]) -> float:
+    """Predict from HASPI which share of words a listener understands, from 0 to 1.
+
+    Args:
+        scores: HASPI of several items; NaN is ignored.
+
+    >>> predict_words([0.2]) < predict_words([0.8, math.nan])
+    True
+    """
+    haspi = np.array([score for score in scores if not math.isnan(score)]).clip(0.0, 1.0)
+    return words_change(haspi, haspi).before

@@ -9,8 +9,7 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation.aid_properties import mean_band_levels
 from hlsim.evaluation.measures import NORMAL, perceive
-from hlsim.evaluation.result import Evaluation
-from hlsim.metrics.words import words_change
+from hlsim.evaluation.result import Evaluation, predict_words
 from hlsim.report.page import Card, Page, Picture, Section, Table
 from hlsim.report.players import NORMAL_EAR, make_player
 from hlsim.report.plots import (
@@ -93,10 +92,7 @@ def result_table(evaluation: Evaluation) -> Table:
     """Return the table of the demo, with mean scores and levels of each condition."""
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),
-        "Words understood": (
-            lambda rows: _predict_words(evaluation, rows["condition"].iloc[0]),
-            ".0%",
-        ),
+        "Words understood": (lambda rows: predict_words(rows["haspi"]), ".0%"),
         "Output level (dB SPL)": (statistic("level"), ".1f"),
         "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     }
@@ -104,17 +100,13 @@ def result_table(evaluation: Evaluation) -> Table:
     return summary_table(f"Means of {count} utterances", split_rows(evaluation.table), columns)
 
 
-def _predict_words(evaluation: Evaluation, condition: str) -> float:
-    """Return the proportion of words that a listener understands, predicted from HASPI."""
-    return evaluation.words(condition, condition).before
-
-
 def _cards(evaluation: Evaluation) -> list[Card]:
     """Return the cards with HASPI, words understood and loudness error of all conditions."""
     means = evaluation.table.groupby("condition", sort=False)[["haspi", "loudness_error"]].mean()
     haspi, errors = means["haspi"], means["loudness_error"]
-    words = {name: _predict_words(evaluation, name) for name in means.index}
-    fewest_words, most_words = (words_change([score], [score]).before for score in (0.0, 1.0))
+    rows = split_rows(evaluation.table)
+    words = {name: predict_words(part["haspi"]) for name, part in rows.items()}
+    fewest_words, most_words = predict_words([0.0]), predict_words([1.0])
     return [
         Card(
             "HASPI",
