@@ -359,9 +359,10 @@ def check_range(levels: Iterable[float], highest: float, consumer: str) -> None:
     >>> check_range([20.0, 30.0], 100.0, "MSBG")
     """
     if not all(LOWEST_LEVEL <= level <= highest for level in levels):
+        hint = " (the standard audiogram N7 exceeds it)" if highest < HIGHEST_LEVEL else ""
         raise ValueError(
             f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}, "
-            f"got {join_numbers(levels)}; limit them to this range"
+            f"got {join_numbers(levels)}; limit them to this range{hint}"
         )
 
 

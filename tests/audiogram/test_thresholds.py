@@ -43,6 +43,8 @@ def test_values_that_are_not_ears_for_a_simulator_are_rejected(audiogram: Any) -
 def test_another_number_of_thresholds_suggests_a_dictionary(ear: Any) -> None:
     with pytest.raises(ValueError, match=r"pass a dictionary .* such as \{500: 20, 4000: 50\}"):
         as_thresholds(ear)
+    with pytest.raises(ValueError, match="the standard audiogram N7"):
+        as_thresholds("N7")
 
 
 def test_mono_items_have_one_ear_each() -> None:
