@@ -199,7 +199,7 @@ def check_waveform(
         name: Name of the argument, for messages.
         highest: Largest accepted magnitude of a finite sample.
         full_scale_spl: Level in dB SPL of RMS 1.0. If it is passed, the first waveform of a process
-            whose level is above ``LOUDEST_SPL`` causes a warning.
+            whose level is above 120 dB SPL causes a warning.
 
     Raises:
         ValueError: It is not a floating-point tensor with time last, has no samples, or has a

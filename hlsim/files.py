@@ -100,7 +100,7 @@ def check_extension(path: str | Path) -> str:
         path: File to write.
 
     Raises:
-        ValueError: The extension is not in ``WRITTEN_EXTENSIONS``.
+        ValueError: The extension is not .wav, .flac or .ogg.
 
     >>> check_extension("speech.WAV")
     '.wav'
@@ -172,8 +172,7 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
 
 
 def _decode(data: bytes) -> str:
-    """Return the text of a file, in UTF-8 or else in one of the encodings that spreadsheets
-    write."""
+    """Decode the text of a file, in UTF-8 or in an encoding that spreadsheets write."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
     try:

@@ -25,8 +25,7 @@ EAR_NAMES: dict[str, EarName] = {
 
 @dataclass(frozen=True, repr=False)
 class Listener:
-    """The audiograms of both ears of a person, for waveforms (..., 2, time) with the left ear
-    first.
+    """The audiograms of both ears of a person, for waveforms (..., 2, time), left ear first.
 
     A listener may be passed wherever an audiogram may, and so may a sequence with one listener per
     item. ``haspi`` and ``hasqi`` return one score per ear; ``.amax(-1)`` is that of the better ear.

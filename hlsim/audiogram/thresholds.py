@@ -266,7 +266,7 @@ def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
 def interpolation_weights(
     frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
 ) -> NDArray[np.float64]:
-    """Compute the matrix that interpolates levels linearly in Hz, and keeps them constant beyond.
+    """Compute the matrix that interpolates levels linearly in Hz, and continues them as constants.
 
     Args:
         frequencies: Frequencies of the result in Hz.

@@ -24,8 +24,9 @@ _THRESHOLDS = 2.0 ** -np.arange(16.0)[::-1]
 def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     """Compute the level of speech without its pauses, the active speech level.
 
-    The standard's thresholds are fractions of full scale. Here they are fractions of the envelope's
-    maximum, so that a gain of the waveform changes the result by exactly this gain.
+    Samples count as speech where the envelope is above a threshold. The standard's thresholds are
+    fractions of full scale. Here they are fractions of the envelope's maximum, so that a gain of
+    the waveform changes the result by exactly this gain.
 
     Source: ITU-T P.56, method B.
 

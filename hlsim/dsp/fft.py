@@ -19,8 +19,7 @@ MKL takes up to three times as long for 2^10 * 49 points as for 2^4 * 3125 point
 
 
 def rfft(signals: Tensor, points: int | None = None) -> Tensor:
-    """Compute the Fourier transform of real signals, like ``torch.fft.rfft``, with a faster
-    gradient.
+    """Compute the Fourier transform of real signals, with a faster gradient than torch's.
 
     Shape: (..., time) -> complex (..., points // 2 + 1).
 

@@ -92,7 +92,7 @@ def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
     Args:
         waveform: Signals.
         response: Frequency response of the filter: the transform of its coefficients, at most 1025,
-            by ``rfft`` with ``BLOCK_POINTS`` points.
+            by ``rfft`` with ``BLOCK_POINTS`` (4096) points.
         length: Number of samples to return.
 
     >>> delay_by_one = torch.fft.rfft(torch.tensor([0.0, 1.0]), BLOCK_POINTS)

@@ -65,8 +65,7 @@ def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
 
 
 def common_period(rate: int, rate_divisor: int = 1) -> int:
-    """Return the shortest duration that is a whole number of samples at a rate and of envelope
-    steps.
+    """Return the shortest time that is a whole number of samples at a rate and of envelope steps.
 
     An envelope step is the time between two computed values of an envelope: 24 samples at 44.1 kHz,
     or 24.5 where signals run at 22.05 kHz.

@@ -51,8 +51,7 @@ POWER_FLOOR = 1e-30
 
 
 def detect(signals: Tensor, harmonics: bool) -> Tensor:
-    """Compute what rectifying band-pass signals would give, at sample rates too low to rectify
-    them.
+    """Compute rectified band-pass signals where the sample rate is too low for a rectifier.
 
     Rectifying a signal at a low rate would fold its harmonics back to low frequencies. A rectified
     cosine is |cos a| = 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a + ...). Its slow part is
