@@ -15,6 +15,7 @@ from torch.utils._pytree import tree_leaves
 from compensators import WDRC, MappingCompensator, load_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
 from hlsim.metrics import haaqi, haspi, hasqi, mbstoi
+from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear import recursions
 from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
@@ -25,6 +26,8 @@ def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (torchtools, recursions):
         monkeypatch.setattr(module, "without_modes", lambda function, *args: function(*args))
     monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(torchtools.CACHE_BYTES))
+    # so small that four items need several groups of channels
+    monkeypatch.setattr(ear_model, "GPU_CHUNK", 2**20)
 
 
 EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N1", "N3", "NH", "N1")])

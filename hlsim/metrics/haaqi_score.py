@@ -147,7 +147,7 @@ class HaaqiReference(QualityReference):
     envelope_segment = ENVELOPE_SEGMENT
 
     @staticmethod
-    def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
         envelopes = fine_structure.envelope_correlation(
             comparison.clean_levels,
             comparison.processed_levels,

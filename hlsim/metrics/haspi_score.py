@@ -241,7 +241,7 @@ class _Batch(PreparedBatch):
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
-        """Compute the ten features of each item."""
+        """Compute the ten features of HASPI for each item, see ``PreparedBatch.compare``."""
         items, extent = self._batch.items, self._extent
         sound, ear = self._signals.align(processed, self._batch), ears[0][items]
         contributions = [
@@ -262,8 +262,8 @@ class _Batch(PreparedBatch):
 
 # -- noise -----------------------------------------------------------------------------------------
 
-DEVIATES_PER_DRAW = 2**16
-"""Approximate number of normally distributed numbers (deviates) that are drawn at once."""
+DEVIATES_AT_ONCE = 2**16
+"""Approximate number of normally distributed numbers (deviates) that are processed at once."""
 
 
 def _draw_pairs(
@@ -284,18 +284,11 @@ def _draw_pairs(
     for item, (seed, count, frames) in enumerate(zip(seeds, skipped, extent.ends, strict=True)):
         random = legacy_rng_after_normals(seed, count)
         for signal in (0, 1):
-            noise[signal, item, :, :frames] = _draw(random, frames, like.dtype)
+            levels = torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like.dtype)
+            parts = levels.split(DEVIATES_AT_ONCE // CHANNELS)
+            cepstra = torch.cat([envelopes.cepstrum(part.mT) for part in parts], -1)
+            noise[signal, item, :, :frames] = envelopes.NOISE_DB * cepstra
     return noise.to(like.device, non_blocking=like.device.type != "cpu")
-
-
-def _draw(random: np.random.RandomState, frames: int, dtype: torch.dtype) -> Tensor:
-    """Draw noise on all channels, frame by frame, and return its cepstrum. Shape: (5, frames)."""
-    parts = []
-    step = DEVIATES_PER_DRAW // CHANNELS
-    for start in range(0, frames, step):
-        deviates = random.standard_normal((min(step, frames - start), CHANNELS))
-        parts.append(torch.from_numpy(deviates).to(dtype))
-    return envelopes.NOISE_DB * torch.cat([envelopes.cepstrum(part.mT) for part in parts], -1)
 
 
 @lru_cache(maxsize=4)
@@ -308,7 +301,7 @@ def _state_after(seed: int, count: int) -> Any:
     random = np.random.RandomState(seed)
     left = count // 2
     while left:
-        coordinates = random.random_sample(2 * min(left, DEVIATES_PER_DRAW))
+        coordinates = random.random_sample(2 * min(left, DEVIATES_AT_ONCE))
         coordinates *= 2.0
         coordinates -= 1.0
         coordinates *= coordinates

@@ -109,7 +109,7 @@ class HasqiReference(QualityReference):
     envelope_segment = fine_structure.SEGMENT
 
     @staticmethod
-    def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
         counts = fine_structure.segments_of(extent)
         envelopes = fine_structure.envelope_correlation(
             comparison.clean_levels, comparison.processed_levels, counts

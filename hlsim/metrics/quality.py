@@ -6,6 +6,7 @@ therefore show distortion, noise and colour, not whether enough is audible.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -161,7 +162,8 @@ class QualityReference(Reference):
         return QualityParts(self._combine(nonlinear, linear), nonlinear, linear)
 
     @staticmethod
-    def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    @abstractmethod
+    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
         """Compute the nonlinear and the linear part of the score of each item.
 
         Args:
@@ -171,12 +173,11 @@ class QualityReference(Reference):
         Returns:
             Nonlinear and linear parts. Shape: (items, 2).
         """
-        raise NotImplementedError
 
     @staticmethod
+    @abstractmethod
     def _combine(nonlinear: Tensor, linear: Tensor) -> Tensor:
         """Compute the score from its parts. Shape: (...,) twice -> (...,)."""
-        raise NotImplementedError
 
 
 # -- batches --------------------------------------------------------------------------------------
@@ -270,7 +271,10 @@ class _Batch(PreparedBatch):
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
-        """Compute the nonlinear and the linear part of each item."""
+        """Compute the nonlinear and the linear part of the score of each item.
+
+        The arguments are those of ``PreparedBatch.compare``.
+        """
         sound = self._signals.align(processed, self._batch)
         sources = _NoiseSources(noise, seeds[self._batch.items], self._extent, sound)
         comparisons = [
@@ -278,7 +282,7 @@ class _Batch(PreparedBatch):
             for clean in self._clean_features()
         ]
         joined = Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
-        return self._score.compute_parts(joined, self._extent)
+        return self._score._compute_parts(joined, self._extent)
 
     def _compare_channels(
         self,

@@ -7,6 +7,7 @@ items on a GPU.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, TypeVar
@@ -25,7 +26,7 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 
-class PreparedBatch:
+class PreparedBatch(ABC):
     """Clean signals of a batch as an ear receives them, ready to be compared with outputs of aids.
 
     Subclasses compute the features of a score in a few channels of the ear at a time.
@@ -70,10 +71,11 @@ class PreparedBatch:
                 features = self._prepare(channels)
             yield features
 
+    @abstractmethod
     def _prepare(self, channels: slice) -> Any:
         """Compute the features of the clean signals in some channels."""
-        raise NotImplementedError
 
+    @abstractmethod
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
@@ -90,10 +92,9 @@ class PreparedBatch:
             Features of each item of this batch, from which its score follows. Shape: (items,
             features).
         """
-        raise NotImplementedError
 
 
-class Reference:
+class Reference(ABC):
     """Clean signals that are prepared for the scores of many outputs of aids.
 
     On a CPU the items of a batch are distributed over as many threads as torch uses, unless a
@@ -140,8 +141,9 @@ class Reference:
         with torch.autocast(signals.device.type, enabled=False):
             return self._prepare_batches(signals, keep)
 
+    @abstractmethod
     def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
-        raise NotImplementedError
+        """Prepare the clean signals of each batch."""
 
     def _compare(
         self, processed: Tensor, noise: Noise, seed: int | Sequence[int], *ears: ear_model.HairCells

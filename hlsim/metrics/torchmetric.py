@@ -1,6 +1,6 @@
 """HASPI, HASQI and HAAQI as metrics of torchmetrics, for validation loops.
 
-They need the extra ``train``.
+A metric collects the mean score over batches. The classes need the extra ``train``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ _Metric: Any = require("torchmetrics", "train").Metric
 
 
 class _MeanScore(_Metric):
-    """Mean of a score over all items since the last ``reset``; ``score`` is its function."""
+    """Mean of a score over all items since the last ``reset``.
+
+    Subclasses set ``score`` to the function that computes the score of each item.
+    """
 
     is_differentiable = False
     higher_is_better = True
@@ -88,23 +91,15 @@ class _MeanScore(_Metric):
             self.add_state(name, torch.zeros(2), dist_reduce_fx="sum")
         # A MetricCollection merges metrics with equal states, such as those of a batch without any
         # score. This state keeps metrics with different settings apart.
-        settings = (
-            type(self),
-            self.sample_rate,
-            self.full_scale_spl,
-            noise,
-            seed,
-            whole_khz,
-            limit,
-        )
+        settings = type(self), self.sample_rate, self.full_scale_spl, noise, seed, whole_khz, limit
         signature = torch.tensor(zlib.crc32(repr(settings).encode()))
         self.add_state("signature", signature, dist_reduce_fx="max")
 
     def forward(self, *args: Any, **kwargs: Any) -> Tensor:
-        """Update, and return the mean score of this batch alone, in this process.
+        """Update the metric by a batch, and return the mean score of this batch in this process.
 
-        The method of torchmetrics resets the metric before each batch, so that ``limit`` and
-        ``seed`` would begin again.
+        The arguments are those of ``update``. (The method of torchmetrics resets the metric before
+        each batch, so that ``limit`` and ``seed`` would begin again.)
         """
         total, count = self.total.clone(), self.count.clone()
         self.update(*args, **kwargs)
@@ -118,7 +113,7 @@ class _MeanScore(_Metric):
         audiogram: AudiogramLike,
         lengths: Lengths | None = None,
     ) -> None:
-        """Score a batch.
+        """Score a batch, and add the scores to the mean.
 
         An item that cannot be scored (clean speech that is silent or soft, NaN, less than 0.7 s) is
         left out with a warning and counted in ``failed``. Silence in place of processed speech is
@@ -126,13 +121,13 @@ class _MeanScore(_Metric):
         and ``ears`` has the mean of each ear.
 
         Args:
-            processed: Output of the compensator.
+            processed: Outputs of the compensator. Shape: (time,), (batch, time) or, for two ears,
+                (batch, 2, time).
             clean: Clean speech of the same shape.
             audiogram: One ear, or one per item. For two channels a ``Listener``, whose missing ear
                 is left out, a pair of left and right ear, or one of these per item.
             lengths: Number of samples of each item, or its share of the time, for a padded batch.
-
-        Shape: (time,), (batch, time) or (batch, 2, time) twice; ``lengths`` (batch,).
+                Shape: (batch,).
 
         Raises:
             ValueError: The shapes do not fit, the signals are not what ``haspi`` accepts, or
@@ -192,11 +187,17 @@ class _MeanScore(_Metric):
             self.count_ears += is_scored.sum(0).to(self.count_ears)
 
     def compute(self) -> Tensor:
-        """Return the mean score in float32, NaN if nothing was scored."""
+        """Return the mean score of all items since the last reset, NaN if none was scored.
+
+        Shape: (), float32.
+        """
         return self.total / self.count
 
     def merge_state(self, incoming_state: Any) -> None:
-        """Add the state of another metric, given as a metric or as its ``metric_state``.
+        """Add the items that another metric has scored to the mean.
+
+        Args:
+            incoming_state: The other metric, or its ``metric_state``.
 
         Raises:
             ValueError: The other metric has other settings, such as another sample rate.
@@ -217,8 +218,8 @@ class _MeanScore(_Metric):
         """Plot one or several values of the metric by matplotlib.
 
         Args:
-            val: Value or list of values from calls or from ``compute``; by default that of
-                ``compute`` now.
+            val: Value, or list of values, that a call or ``compute`` has returned; by default that
+                of ``compute`` now.
             ax: Axes of matplotlib to draw into; by default those of a new figure.
 
         Returns:
@@ -251,7 +252,15 @@ class _MeanScore(_Metric):
         thresholds: Tensor,
         ends: Tensor,
     ) -> list[float | str]:
-        """Return for each item and side its score, or the reason why there is none."""
+        """Return the score of each pair of item and ear, or the reason why there is none.
+
+        Args:
+            pairs: Indices of item and ear (0 for left or only, 1 for right).
+            first: Number of items that were seen in earlier batches, for the seeds.
+            processed, clean: Signals. Shape: (items, ears, time).
+            thresholds: Ears in dB HL. Shape: (items, ears, 8).
+            ends: Number of samples of each item. Shape: (items,).
+        """
         if not pairs:
             return []
         items, sides = torch.tensor(pairs).unbind(-1)
@@ -276,7 +285,7 @@ class _MeanScore(_Metric):
 
 
 class HASPI(_MeanScore):
-    """Mean HASPI v2 of processed speech over all items since the last ``reset``.
+    """Mean HASPI v2, the intelligibility of processed speech, over all items since ``reset``.
 
     It rewards any gain, so log ``level``, the mean level in dB SPL, next to it. The score of an
     item is that of ``haspi`` with the same settings, in double precision. On a CPU one second of
@@ -286,10 +295,15 @@ class HASPI(_MeanScore):
     ``self.haspi.update(output, clean, audiogram); self.log("haspi", self.haspi)`` in
     ``validation_step``.
 
+    Attributes:
+        count: Number of items that were scored.
+        failed: Number of items that could not be scored.
+        seen: Number of all items, with those beyond ``limit``.
+
     Args:
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
-        noise: Treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores
+        noise: Internal noise of the ear, as in ``haspi``. ``"seeded"`` gives the scores
             of pyclarity.
         seed: Seed of the first item since the last reset, for ``noise="seeded"``. It rises by 1
             with each item, so that epochs can be compared.
@@ -312,10 +326,11 @@ class HASPI(_MeanScore):
 
 
 class HASQI(_MeanScore):
-    """Mean HASQI v2 of processed speech over all items since the last ``reset``.
+    """Mean HASQI v2, the quality of processed speech, over all items since the last ``reset``.
 
-    The arguments are those of ``HASPI``. The reference is clean speech amplified by NAL-R, and the
-    score falls with every difference from it. On a CPU one second of audio takes about 0.2 s.
+    The arguments and attributes are those of ``HASPI``. The reference is clean speech amplified by
+    NAL-R, and the score falls with every difference from it. On a CPU one second of audio takes
+    about 0.2 s.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASQI()
@@ -327,10 +342,10 @@ class HASQI(_MeanScore):
 
 
 class HAAQI(_MeanScore):
-    """Mean HAAQI v1 of processed music over all items since the last ``reset``.
+    """Mean HAAQI v1, the quality of processed music, over all items since the last ``reset``.
 
-    The arguments are those of ``HASPI``. The reference is clean music amplified by NAL-R. With
-    stereo music the better ear counts, and ``ears`` has the mean of each ear.
+    The arguments and attributes are those of ``HASPI``. The reference is clean music amplified by
+    NAL-R. With stereo music the better ear counts, and ``ears`` has the mean of each ear.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> music = 0.02 * torch.sin(2 * torch.pi * 220.0 * seconds) * torch.exp(-3 * seconds)
@@ -344,7 +359,10 @@ class HAAQI(_MeanScore):
 
 
 def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
-    """Return thresholds (items, sides, 8) on the CPU, NaN for missing ears."""
+    """Return the thresholds of each item's ears on the CPU, NaN for missing ears.
+
+    Shape: (items, sides, 8) dB HL.
+    """
     levels = as_thresholds(
         audiogram, highest=HIGHEST_LEVEL, consumer="a score", allow_missing=sides == 2
     )

@@ -37,6 +37,9 @@ def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
 class Extent:
     """Number of samples, or of frames, of each item of a padded batch.
 
+    All items of a batch are padded to the length of the longest one. The methods compute as if
+    there were no padding.
+
     Args:
         ends: Length of each item.
 
