@@ -159,6 +159,8 @@ class Comparison:
         if measure is None or not measure.knows_hearing:
             return f"{self.title} rates the output itself and does not know the hearing loss."
         change = self.level_change
+        if not any(self._significant_tests()):
+            return f"The mean level changed by {change:+.1f} dB."
         if self.equal_level:
             return f"The mean level changed by only {change:+.1f} dB, so gain does not explain it."
         louder = change > 0

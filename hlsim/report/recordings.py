@@ -61,7 +61,7 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
     >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
     >>> report_page(evaluation).title
-    'after: STOI'
+    'STOI: after'
     """
     columns = {**score_columns(evaluation), **LEVEL}
     tables = [summary_table("Means of all items", split_rows(evaluation.table), columns)]
@@ -79,7 +79,7 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
         score_details(evaluation),
     ]
     measures = ", ".join(map(column_title, evaluation.scores))
-    return Page(f"{', '.join(evaluation.names)}: {measures}", verdict, sections)
+    return Page(f"{measures}: {', '.join(evaluation.names)}", verdict, sections)
 
 
 def _mean_verdict(evaluation: Evaluation) -> str:
@@ -98,11 +98,11 @@ def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
     if c.measure != "haspi":
         return []
     words = evaluation.words(c.before, c.after)
-    before, after, change, low, high = (100.0 * share for share in words)
+    before, after, _, low, high = (round(100.0 * share) for share in words)
     return [
-        f"In words: a listener would understand {before:.0f} % of the words of these sentences "
-        f"under {c.before} and {after:.0f} % under {c.after}, a change of {change:+.0f} points. "
-        f"For nine of ten listeners the change lies between {low:+.0f} and {high:+.0f} points.",
+        f"In words: a listener would understand {before} % of the words of these sentences "
+        f"under {c.before} and {after} % under {c.after}, a change of {after - before:+d} points. "
+        f"For nine of ten listeners the change lies between {low:+d} and {high:+d} points.",
         "Words are predicted from HASPI by a curve that was fitted to 22 listeners with ten "
         "hearing aids (hlsim.metrics.words). HASPI ranks aids well, but says little about single "
         "listeners.",

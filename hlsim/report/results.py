@@ -184,8 +184,8 @@ def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparis
     for c in comparisons:
         planned = " (planned)" if c.planned else ""
         row = {"Comparison": f"{c.title}: {c.before} to {c.after}{planned}"}
-        row |= _paired_cells(c.overall, c.p_t, c.p_w)
-        rows.append({**row, "Level change (dB)": format_number(c.level_change, "+.1f")})
+        row["Level change (dB)"] = format_number(c.level_change, "+.1f")
+        rows.append(row | _paired_cells(c.overall, c.p_t, c.p_w))
     return Table.from_rows(caption, rows)
 
 

@@ -90,6 +90,7 @@ FIVE_RISES = {"a": [0.5] * 5, "b": [0.7 + i / 1e3 for i in range(5)]}
         (draw(30, 0.2), {"louder": -6.0}, ["so gain does not explain a rise"]),
         (draw(30, 0.2), {"louder": 20.0}, ["rose by 20.0 dB, and HASPI rewards gain: more"]),
         (draw(10, 0.0), {}, ["b cannot be distinguished from a: HASPI"]),
+        (draw(10, 0.0), {"louder": -6.0}, ["distinguished", "The mean level changed by -6.0 dB. "]),
         (draw(30, 0.2), {"listeners": 6}, ["the means of the 6 listeners gives p"]),
         (draw(1, 0.2), {}, ["(1 item, ", "neither test is defined"]),
         ({"a": [0.5] * 3, "b": [0.5] * 3}, {}, ["cannot be distinguished", "neither test"]),
