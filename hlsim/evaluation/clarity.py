@@ -381,7 +381,10 @@ def _write_signals(
         path = pair.output_file(folders[condition.name])
         try:
             if not path.is_file() and condition.process is not None:
-                write_audio(path, condition.process(mix, pair.listener), rate)
+                output = condition.process(mix, pair.listener)
+                lengths = mix.shape[-1], output.shape[-1]
+                samples = common_length(lengths, rate, ("the input", "the output"))
+                write_audio(path, output[:, :samples], rate)
         except Exception as error:  # A failure must not end the study.
             problems[condition.name] = describe_error(error)
     return problems

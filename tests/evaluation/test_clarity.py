@@ -294,6 +294,8 @@ def test_lengths_may_differ_by_a_tenth_of_a_second(
     write(path, np.concatenate((signal, signal))[: len(signal) + change])
     settings = options(clarity, scenes=scenes, stride=2)
     study = evaluate_scenes({"mine": f"{__name__}:longer_by_220"}, out=tmp_path, **settings)
+    output = soundfile.info(tmp_path / "signals" / "mine" / "S06001_L0001_HA-output.wav")
+    assert output.frames == soundfile.info(scenes / "S06001_mix_CH1.wav").frames
     assert study.failures.empty == (not message)
     assert message in scenes_page(study, listen=0).markdown()
 
