@@ -40,7 +40,7 @@ from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise, match_pair
-from hlsim.metrics.quality import Comparison, QualityReference
+from hlsim.metrics.quality import Comparison, QualityParts, QualityReference
 from hlsim.torchtools import constant_like, not_compiled
 
 ENVELOPE_SEGMENT = 192
@@ -147,7 +147,7 @@ class HaaqiReference(QualityReference):
     envelope_segment = ENVELOPE_SEGMENT
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def _compute_parts(comparison: Comparison, extent: Extent) -> QualityParts:
         envelopes = fine_structure.envelope_correlation(
             comparison.clean_levels,
             comparison.processed_levels,
@@ -162,12 +162,9 @@ class HaaqiReference(QualityReference):
         relative_shape = fine_structure.spectral_similarity((x - y) / (x + y), 25.0)
         nonlinear = 0.754 * envelopes**3 + 0.246 * fine
         linear = 0.329 * shape + 0.671 * relative_shape
-        return torch.stack((nonlinear, linear), -1)
-
-    @staticmethod
-    def _combine(nonlinear: Tensor, linear: Tensor) -> Tensor:
         first_order = 0.336 * nonlinear + 0.001 * linear
-        return first_order + 0.501 * nonlinear.square() + 0.161 * linear.square()
+        combined = first_order + 0.501 * nonlinear.square() + 0.161 * linear.square()
+        return QualityParts(combined, nonlinear, linear)
 
 
 def _split_by_rate(waves: Tensor) -> Tensor:

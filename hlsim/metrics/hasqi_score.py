@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike
@@ -109,7 +108,7 @@ class HasqiReference(QualityReference):
     envelope_segment = fine_structure.SEGMENT
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def _compute_parts(comparison: Comparison, extent: Extent) -> QualityParts:
         counts = fine_structure.segments_of(extent)
         envelopes = fine_structure.envelope_correlation(
             comparison.clean_levels, comparison.processed_levels, counts
@@ -119,8 +118,6 @@ class HasqiReference(QualityReference):
         y = fine_structure.channel_shares(comparison.processed_spectrum)
         shape = fine_structure.spectral_similarity(x - y, 2.5)
         slope = fine_structure.spectral_similarity((x - y).diff(dim=-1), 1.0)
-        return torch.stack((envelopes.square() * fine, 0.579 * shape + 0.421 * slope), -1)
-
-    @staticmethod
-    def _combine(nonlinear: Tensor, linear: Tensor) -> Tensor:
-        return nonlinear * linear
+        nonlinear = envelopes.square() * fine
+        linear = 0.579 * shape + 0.421 * slope
+        return QualityParts(nonlinear * linear, nonlinear, linear)

@@ -158,26 +158,17 @@ class QualityReference(Reference):
         Args:
             processed, noise, seed: The arguments of ``score``.
         """
-        nonlinear, linear = self._compare(processed, noise, seed).unbind(-1)
-        return QualityParts(self._combine(nonlinear, linear), nonlinear, linear)
+        return QualityParts(*self._compare(processed, noise, seed).unbind(-1))
 
     @staticmethod
     @abstractmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
-        """Compute the nonlinear and the linear part of the score of each item.
+    def _compute_parts(comparison: Comparison, extent: Extent) -> QualityParts:
+        """Compute the score of each item and its parts.
 
         Args:
             comparison: Features of the clean signals and of the outputs.
             extent: Number of samples of each item.
-
-        Returns:
-            Nonlinear and linear parts. Shape: (items, 2).
         """
-
-    @staticmethod
-    @abstractmethod
-    def _combine(nonlinear: Tensor, linear: Tensor) -> Tensor:
-        """Compute the score from its parts. Shape: (...,) twice -> (...,)."""
 
 
 # -- batches --------------------------------------------------------------------------------------
@@ -271,7 +262,7 @@ class _Batch(PreparedBatch):
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
-        """Compute the nonlinear and the linear part of the score of each item.
+        """Compute the score of each item, its nonlinear and its linear part.
 
         The arguments are those of ``PreparedBatch.compare``.
         """
@@ -282,7 +273,7 @@ class _Batch(PreparedBatch):
             for clean in self._clean_features()
         ]
         joined = Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
-        return self._score._compute_parts(joined, self._extent)
+        return torch.stack(self._score._compute_parts(joined, self._extent), -1)
 
     def _compare_channels(
         self,
