@@ -179,10 +179,7 @@ class HearingAid(Wearable):
         return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Return the hearing loss in each band, and then NAL-R's gain in each band, both in dB.
-
-        Shape: (items, 8) in dB HL -> (items, 2 bands).
-        """
+        # The hearing loss in each band, and then NAL-R's gain in each band, both in dB
         centres = band_centres(self.bands)
         loss = interpolate(thresholds, centres)
         prescribed = interpolate(nalr_gains_db(thresholds), centres)

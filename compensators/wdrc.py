@@ -101,10 +101,7 @@ class WDRC(Wearable):
         return Stream(self, audiogram)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Return NAL-R's gain in each band in dB, and then the compression ratio in each band.
-
-        Shape: (items, 8) in dB HL -> (items, 2 bands).
-        """
+        # NAL-R's gain in each band in dB, and then the compression ratio in each band
         centres = band_centres(self.bands)
         prescribed = interpolate(nalr_gains_db(thresholds), centres)
         loss = interpolate(thresholds, centres)

@@ -32,17 +32,6 @@ def test_gains_are_linked_by_name() -> None:
         assert aid.linked
 
 
-def test_saving_deletes_no_other_file(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("text")
-    save_compensator(MappingCompensator(SMALL), tmp_path / "runs")
-    (tmp_path / "runs" / "config.json").rename(tmp_path / "runs" / "notes.txt")
-    for name in ("runs", "file", "."):
-        with pytest.raises(ValueError):
-            save_compensator(MappingCompensator(SMALL), tmp_path / name)
-    assert (tmp_path / "file").read_text() == "text"
-    assert (tmp_path / "runs" / "notes.txt").is_file()
-
-
 def test_a_checkpoint_names_the_ear_that_it_was_trained_for(tmp_path: Path) -> None:
     model = MappingCompensator(SMALL)
     records = {"one": {"audiogram": EAR.to_dict()}, "all": {"audiogram": None}, "old": {}}

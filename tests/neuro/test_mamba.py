@@ -21,13 +21,10 @@ SHAPES = {
 }
 
 
-def test_parameters_have_the_names_and_shapes_of_mamba_ssms() -> None:
-    assert {name: tuple(p.shape) for name, p in Mamba(64).named_parameters()} == SHAPES
-
-
-def test_initial_step_sizes_lie_between_0_001_and_0_1() -> None:
-    torch.manual_seed(0)
-    steps = functional.softplus(Mamba(64).dt_proj.bias.detach())
+def test_parameters_are_those_of_mamba_ssms_with_step_sizes_between_0_001_and_0_1() -> None:
+    model = Mamba(64)
+    assert {name: tuple(p.shape) for name, p in model.named_parameters()} == SHAPES
+    steps = functional.softplus(model.dt_proj.bias.detach())
     assert 0.001 <= float(steps.min()) < 0.003 and 0.03 < float(steps.max()) <= 0.1
 
 
