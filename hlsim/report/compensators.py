@@ -43,8 +43,8 @@ _COLUMNS: Columns = {
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
     "Peaks beyond the limit": (statistic("beyond_limit", "sum"), "g"),
     "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
-    "the same, mean absolute": (statistic("loudness_error", "mean absolute"), ".1f"),
-    "against speech alone": (statistic("loudness_error_clean"), "+.1f"),
+    "Mean absolute loudness error (dB)": (statistic("loudness_error", "mean absolute"), ".1f"),
+    "Loudness error against speech alone (dB)": (statistic("loudness_error_clean"), "+.1f"),
     "Band error (dB)": (statistic("band_error"), ".1f"),
 }
 """Columns beside the scores, by title."""
