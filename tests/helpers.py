@@ -1,8 +1,8 @@
-"""Helpers of several tests: tables of ears, short speech, and the modules of examples."""
+"""Helpers of several tests: corpora, tables of ears, short speech, and modules of examples."""
 
 import importlib.util
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +11,14 @@ import soundfile
 from hlsim import Audiogram
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def touch_files(folder: Path, files: Iterable[str]) -> Path:
+    """Create empty files, and return their folder."""
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    return folder
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, str]]) -> Path:

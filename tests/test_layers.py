@@ -22,12 +22,6 @@ FLOORS = {
 }
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS.values()) for room in rooms.split()}
 
-# Rows of a file and a room above it that it imports. A row that is not needed fails the test.
-KNOWN_EXCEPTIONS: set[tuple[str, str]] = set()
-
-# Rows of two rooms that import each other; the imports of the first one should be removed.
-KNOWN_CIRCLES: set[tuple[str, str]] = set()
-
 MOST_FILES = 16
 
 
@@ -60,31 +54,25 @@ def imported_modules(path: Path) -> Iterator[str]:
         yield from (name for name in names if name in MODULES)
 
 
+IMPORTS = {module: set(imported_modules(path)) - {module} for module, path in MODULES.items()}
+
+
 def test_imports_point_downwards() -> None:
     upward = {
-        (str(path.relative_to(ROOT)), room_of(imported))
-        for module, path in MODULES.items()
-        for imported in imported_modules(path)
+        (module, imported)
+        for module, names in IMPORTS.items()
+        for imported in names
         if FLOOR_OF[room_of(imported)] < FLOOR_OF[room_of(module)]
     }
-    assert upward == KNOWN_EXCEPTIONS
+    assert upward == set()
 
 
-def test_rooms_form_no_circle() -> None:
-    below: dict[str, set[str]] = {}
-    for module, path in MODULES.items():
-        rooms = {room_of(imported) for imported in imported_modules(path)}
-        below.setdefault(room_of(module), set()).update(rooms - {room_of(module)})
-    for file, room in KNOWN_EXCEPTIONS:
-        below[room_of(module_of(ROOT / file))].discard(room)
-    for room, other in KNOWN_CIRCLES:
-        below[room].remove(other)
-    TopologicalSorter(below).prepare()  # raises CycleError
-
-
-def test_files_form_no_circle() -> None:
-    imports = {module: set(imported_modules(path)) - {module} for module, path in MODULES.items()}
-    TopologicalSorter(imports).prepare()  # raises CycleError
+def test_rooms_and_files_form_no_circle() -> None:
+    rooms: dict[str, set[str]] = {}
+    for module, names in IMPORTS.items():
+        rooms.setdefault(room_of(module), set()).update(map(room_of, names))
+    TopologicalSorter({room: below - {room} for room, below in rooms.items()}).prepare()
+    TopologicalSorter(IMPORTS).prepare()  # raises CycleError
 
 
 @pytest.mark.parametrize("room", sorted({path.parent for path in MODULES.values()}))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hlsim.cli.main import main
+from tests.helpers import touch_files
 
 VOICEBANK = [
     f"{kind}_{part}_wav_16k/{name}.wav"
@@ -27,13 +28,6 @@ train         1           2      0
 valid         1           1      0"""
 
 
-def make_corpus(root: Path, files: list[str]) -> Path:
-    for file in files:
-        (root / file).parent.mkdir(parents=True, exist_ok=True)
-        (root / file).touch()
-    return root
-
-
 @pytest.mark.parametrize(
     ("files", "options", "text"),
     [
@@ -44,7 +38,7 @@ def make_corpus(root: Path, files: list[str]) -> Path:
 def test_prepare_prints_what_it_recognised(
     files: list[str], options: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    corpus, out = make_corpus(tmp_path / "corpus", files), tmp_path / "manifest.csv"
+    corpus, out = touch_files(tmp_path / "corpus", files), tmp_path / "manifest.csv"
     for _ in range(2):
         assert main(["prepare", str(corpus), "--out", str(out), *options.split()]) == 0
         *lines, last = capsys.readouterr().out.splitlines()
@@ -65,7 +59,7 @@ def test_prepare_prints_what_it_recognised(
 def test_an_error_is_one_line_and_nothing_is_written(
     files: list[str], options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    corpus, out = make_corpus(tmp_path / "corpus", files), tmp_path / "manifest.csv"
+    corpus, out = touch_files(tmp_path / "corpus", files), tmp_path / "manifest.csv"
     assert main(["prepare", str(corpus), "--out", str(out), *options.split()]) == 2
     (error,) = capsys.readouterr().err.splitlines()
     assert error.startswith("hlsim: error: ") and not out.exists()

@@ -1,7 +1,6 @@
 """Batches depend on seed, step and rank alone, whether drawn from folders or from a manifest."""
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from hlsim.training.batches import TrainingData, compensator_data, simulator_dat
 from hlsim.training.corpora.manifest import Utterance, write_manifest
 from hlsim.training.data_module import BatchData, Step
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
-from hlsim.training.simulator import train_simulator
 
 SMALL_RECIPE = SimulatorRecipe(
     model={"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
@@ -143,12 +141,3 @@ def test_other_files_are_another_training(manifest: Path) -> None:
     assert len(str(data.identity())) < 1000
     other = TrainingData(data.speech[:-1], data.noise)  # type: ignore[index]
     assert data.identity()["speech"] != other.identity()["speech"]
-
-
-def test_a_simulator_is_trained_on_a_manifest(
-    manifest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe = replace(SMALL_RECIPE, steps=4)
-    data = TrainingData.from_manifest(manifest)
-    train_simulator(data, recipe, out=tmp_path / "out", accelerator="cpu")
-    assert "step 4 of 4: valid_snr_median" in capsys.readouterr().out
