@@ -96,7 +96,7 @@ def _spaced_frequencies(count: int, erbs: float) -> list[float]:
 def band_powers(powers: Tensor, bands: int) -> Tensor:
     """Add up the power in each band from the power at each frequency of a frame.
 
-    A frequency between two centres counts for both bands, in inverse proportion to the distance.
+    A frequency between two centres belongs to both bands, in inverse proportion to the distance.
 
     Args:
         powers: Powers in Pa^2 from ``frame_power``.
@@ -134,19 +134,20 @@ def _filter_taps(bands: int) -> NDArray[np.float64]:
 def apply_gains(samples: Tensor, excess_gains: Tensor, position: int = 0) -> Tensor:
     """Divide a signal into bands, multiply each by its gain, and add them up again.
 
-    The gain of a band goes on a straight line from the beginning to the end of each hop of 64
-    samples. The output is delayed by 64 samples.
+    The gain of a band is interpolated linearly from the beginning to the end of each hop of 64
+    samples. The output is delayed by ``DELAY`` = 64 samples.
 
     Args:
         samples: ``2 * DELAY`` = 128 earlier samples, which the filters need, followed by whole hops
             or a part of one hop.
         excess_gains: Linear gains minus 1 at the beginning of each hop and at the end of the last.
-        position: Number of samples of the hop before this part of it; 0 for whole hops.
+        position: Number of samples of the hop that come before the part that is passed; 0 for whole
+            hops.
 
     Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
 
-    >>> twice_as_loud = torch.ones(1, 3, 20)
-    >>> apply_gains(torch.ones(1, 2 * DELAY + 2 * HOP), twice_as_loud).round()[0, :3]
+    >>> gains_of_6_db = torch.ones(1, 3, 20)
+    >>> apply_gains(torch.ones(1, 2 * DELAY + 2 * HOP), gains_of_6_db).round()[0, :3]
     tensor([2., 2., 2.])
     """
     time, bands = samples.shape[-1] - 2 * DELAY, excess_gains.shape[-1]

@@ -42,9 +42,10 @@ class NALR(nn.Module):
     limit.
 
     Args:
-        audiogram: Ear or ears for all calls. Pass them to each call instead if they are a tensor
-            that requires a gradient. The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz
-            count, interpolated over log frequency where they were not measured.
+        audiogram: Audiogram of one ear, or of several, which is used by all calls that pass none.
+            A tensor that requires a gradient must be passed to each call instead. The thresholds
+            at 250, 500, 1000, 2000, 4000 and 6000 Hz are used, interpolated over log frequency
+            where they were not measured.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0. It has no effect here; all
             compensators accept it.

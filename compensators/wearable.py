@@ -61,19 +61,21 @@ class Wearable(MeasuredAid):
 
     The signal is divided into bands, which are multiplied by their gains and added up again. This
     delays it by 64 samples at 16 kHz. The gain of a band is computed from the spectrum of the last
-    16 ms, every 4 ms, and goes on a straight line between these values.
+    16 ms, every 4 ms, and interpolated linearly between these times.
 
-    Subclasses define ``bands``, ``limit_spl``, ``fit`` and ``compute_gains``; if they have sliders,
-    ``SLIDERS`` with ``DEFAULT_SLIDERS``; and if their gains depend on the past, ``initial_state``.
+    A slider is a control that the user may set from 0 to 1, such as the strength of noise
+    reduction. Subclasses define ``bands``, ``limit_spl``, ``fit`` and ``compute_gains``; if they
+    have sliders, ``SLIDERS`` with ``DEFAULT_SLIDERS``; and if their gains depend on the past,
+    ``initial_state``.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
-            kHz; components above get the gain of the highest band. Streams need 16000 Hz. For whole
-            signals at other rates, resampling adds 8.5 ms of look-ahead.
+            kHz; components above get the gain of the highest band. A ``Stream`` accepts only 16000
+            Hz. Whole signals at other rates are resampled, which adds 8.5 ms of look-ahead.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
-            in level between them stay if their audiograms are equal. The limit of the output is
-            that of each ear.
+            in level between them stay if their audiograms are equal. The output of each ear is
+            limited separately.
 
     Attributes:
         SLIDERS: Names of the sliders.
@@ -111,7 +113,8 @@ class Wearable(MeasuredAid):
     def fit(self, thresholds: Tensor) -> Tensor:
         """Compute the parameters of the aid for each ear, such as the prescribed gains.
 
-        Shape: (items, 8) in dB HL -> (items, n).
+        Shape: (items, 8) in dB HL -> (items, n), where n is the number of parameters that the
+            subclass needs for an ear.
         """
         raise NotImplementedError
 
@@ -124,7 +127,7 @@ class Wearable(MeasuredAid):
             powers: Power spectrum in Pa^2 of each frame, the last 16 ms, from ``frame_power``.
             fitted: Parameters of the aid for the ear of each item, from ``fit``.
             sliders: Values of the sliders in each frame, such as noise reduction.
-            state: Memory of earlier frames, tensors by name.
+            state: Memory of earlier frames, as ``initial_state`` returns it.
 
         Returns:
             The gains in dB, and the new values of those entries of the state that this class adds
@@ -152,18 +155,20 @@ class Wearable(MeasuredAid):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the gain of each band for some hops of 64 samples (4 ms) of the input.
 
-        The filters delay the signal by one hop, so the output also needs the gains before.
+        The filters delay the signal by one hop. While the first of these hops comes in, the
+        preceding one goes out, so the gains at the beginning and the end of that hop are included.
 
         Args:
             samples: Input in pascals at 16 kHz.
             fitted: Parameters of the aid for the ear of each item, from ``fit``.
-            sliders: Values of the sliders, such as noise reduction, to which they move gradually.
+            sliders: New values of the sliders, such as noise reduction. A slider changes gradually
+                from its previous value to the new one.
             state: Memory of earlier hops: ``initial_state``, or the state that the call for the
                 preceding hops returned.
 
         Returns:
-            Linear gains minus 1 at the end of the two hops before, and at the end of each hop; and
-            the state after the last hop.
+            Linear gains minus 1 at the ends of the two hops before the first one, followed by those
+            at the end of each hop; and the state after the last hop.
 
         Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, 2 + hops, bands).
         """
@@ -185,7 +190,8 @@ class Wearable(MeasuredAid):
         Args:
             samples: Input in pascals at 16 kHz.
             fitted: Parameters of the aid for the ear of each item, from ``fit``.
-            sliders: Values of the sliders, such as noise reduction, to which they move gradually.
+            sliders: New values of the sliders, such as noise reduction. A slider changes gradually
+                from its previous value to the new one.
             state: Memory of earlier hops: ``initial_state``, or the state that the call for the
                 preceding hops returned.
 

@@ -135,10 +135,11 @@ def compensate(
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
         ear: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
             mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
-        sample_rate: Sample rate in Hz, 16000 to 48000.
-        compensator: ``"hearing-aid"``, ``"nalr"``, ``"wdrc"``, or the name or folder of another
-            checkpoint.
-        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+        sample_rate: Sample rate in Hz, 16000 (default) to 48000.
+        compensator: ``"nalr"`` or ``"wdrc"``, or the name or folder of a checkpoint, such as
+            ``"hearing-aid"``.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0, by default 94, so that samples
+            are in pascals.
 
     Returns:
         The output of the aid, of the type and shape of ``audio``. It is as loud as the ear needs:
@@ -233,7 +234,7 @@ class Players:
         return f"Players({levels})"
 
     def save(self, path: str | Path) -> None:
-        """Write the player as one HTML file, which a browser opens without a network.
+        """Write the player as one HTML file, which a browser opens offline.
 
         Args:
             path: File to write.

@@ -49,9 +49,9 @@ def without_modes(
 ) -> Result:
     """Call a function as if the caller were not in a mode such as ``torch.inference_mode``.
 
-    Modes, among them transforms such as ``torch.func.grad``, belong to a thread, so the function
-    runs in another thread. Tensors that it creates are plain ones, which can be kept and used in
-    any mode.
+    Modes, among them transforms such as ``torch.func.grad``, are set for each thread, so the
+    function runs in another thread. Tensors that it creates are ordinary tensors, which can be kept
+    and used in any mode, unlike inference tensors.
 
     Args:
         function: Function to call.

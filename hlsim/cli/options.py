@@ -139,7 +139,14 @@ class Parser(argparse.ArgumentParser):
         self.option("--audiogram", ear, help_, default, group=group)
 
     def listener(self, text: str, group: Any) -> None:
-        """Declare ``--listener``, two ears. The help text begins with ``text``."""
+        """Declare ``--listener``, a file with the audiograms of a person's two ears.
+
+        Users type ``--listener FILE``, or ``--listener FILE:NAME`` for one of several persons.
+
+        Args:
+            text: Beginning of the help text.
+            group: Group of argparse that the option joins, such as a mutually exclusive group.
+        """
         help_ = (
             f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
             "Clarity's listeners.json; write FILE:NAME if the file holds several listeners"

@@ -173,11 +173,13 @@ def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
     """Return a waveform unchanged, and limit its gradient in the backward pass.
 
     In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
-    times as large as the others', which then have no part in the training step. Where a block of 5
-    ms has a gradient above six times the item's usual one (its 90th percentile), the gradient of
-    the whole block is scaled down. Limiting single samples would leave a mean, from which a
-    convolutional network grows a constant pressure that is inaudible. In pauses, blocks 30 dB or
-    more below the loudest one of the item, the limit is six times as low. NaN stays.
+    times as large as that of all other samples, which then hardly affect the training step. The
+    gradient is therefore divided into blocks of 5 ms. The largest magnitude in a block may be six
+    times the usual magnitude of the item: the 90th percentile over its samples outside pauses. In
+    pauses, which are blocks of the waveform whose RMS is 30 dB or more below that of the loudest
+    block, it may be once the usual magnitude. Where it is larger, the whole block is scaled down to
+    the limit. Limiting single samples would give the gradient a non-zero mean, from which a
+    convolutional network learns an inaudible constant pressure. NaN in a gradient is passed on.
 
     Shape: (..., time) -> (..., time).
 

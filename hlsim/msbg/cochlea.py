@@ -67,15 +67,17 @@ def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
 def common_period(rate: int, rate_divisor: int = 1) -> int:
     """Return the shortest time that is a whole number of samples at a rate and of envelope steps.
 
-    An envelope step is the time between two computed values of an envelope: 24 samples at 44.1 kHz,
-    or 24.5 where signals run at 22.05 kHz.
+    If a Fourier transform spans a multiple of this time, its spectrum can be converted to that
+    rate. An envelope step is the time between two computed values of an envelope. In samples at
+    44.1 kHz, it is 24, or 24.5 if signals run at 22.05 kHz.
 
     Args:
         rate: Sample rate in Hz.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
 
     Returns:
-        Duration in samples at 44.1 kHz, or 0 if it is longer than 10000 samples.
+        Duration in samples at 44.1 kHz, or 0 if that is more than 10000: then no FFT length is
+        short enough for both rates.
 
     >>> common_period(16000)
     3528
@@ -171,11 +173,15 @@ def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tenso
 
 
 def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
-    """Simulate the cochlea of impaired ears as pyclarity does, up to the last sample.
+    """Simulate the cochlea of impaired ears with pyclarity's treatment of the end of a signal.
+
+    ``simulate_cochlea`` is faster and gives nearly the same samples, except near the end of a
+    signal, because it treats signals as periodic. MSBG therefore uses this function for the last
+    samples of a signal, and for the whole signal if it is short or is not smeared.
 
     A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
     each channel by a gain that follows its envelope, and the channels are added up. All channels
-    run at 44.1 kHz, which is slower than ``simulate_cochlea``.
+    run at 44.1 kHz.
 
     Shape: (items, time), (items, channels) -> (items, time).
 

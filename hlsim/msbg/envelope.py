@@ -278,15 +278,16 @@ def _polynomial_with_roots(roots: NDArray[np.complex128]) -> NDArray[np.float64]
 def mean_weights(samples: int = STEP) -> NDArray[np.float64]:
     """Compute the weights for ``partial_means``: how much each sample contributes to averages.
 
-    A step is a group of neighbouring samples with one value of the envelope, the average over three
-    steps. Three running means, each as long as a step, give this average.
+    A step is a group of neighbouring samples with one value of the envelope. This value is a
+    weighted average over three steps. The weights are largest in the middle: they are those of
+    three running means in series, each as long as a step.
 
     Args:
         samples: Number of samples per step.
 
     Returns:
-        Weights, (3, samples). The rows are the contributions to the average of the step after, of
-        the same step and of the step before.
+        Weights of the samples of a step, (3, samples): row 0 in the average of the following step,
+        row 1 in that of the same step, row 2 in that of the preceding step.
 
     >>> print(mean_weights(3).sum(-1).round(3))
     [0.148 0.704 0.148]

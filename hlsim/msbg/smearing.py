@@ -97,10 +97,11 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
 def smearing_from_filters(
     normal: NDArray[np.float64], wide: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Compute a matrix that makes a normal ear perceive a spectrum as an impaired ear does.
+    """Compute a matrix that makes a normal ear perceive a power spectrum as an impaired ear does.
 
-    The filters of the normal ear, applied after the matrix, give what the filters of the impaired
-    ear give.
+    The matrix is multiplied by the power spectrum. The filters of the normal ear have nearly the
+    same outputs for the product as the filters of the impaired ear for the spectrum itself:
+    ``normal @ matrix`` approximates ``wide``.
 
     Shape: (count, count), (count, count) -> (count, count).
 

@@ -18,9 +18,10 @@ def log_magnitude(squared: Tensor) -> Tensor:
 
 
 def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
-    """Compute the sine of the phase of spectra, an input channel of the networks.
+    """Compute the sine of the phase of spectra, an input of networks beside the magnitude.
 
-    Unlike the phase, it has no jump at pi. In silence it fades to 0 with a finite gradient.
+    Unlike the phase, it does not jump where the phase wraps from pi to -pi. In silence it fades to
+    0 with a finite gradient.
 
     Args:
         spectrum: Complex spectra, any shape.

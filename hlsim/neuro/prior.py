@@ -183,12 +183,13 @@ class Prior(nn.Module):
         return smear_spectrum(spectrum, self._smearing()[severity], SMEARING_GRADIENT_FLOOR)
 
     def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
-        """Compute the level of each channel of MSBG's filter bank: the square root of its power.
+        """Compute the RMS pressure of each channel of MSBG's filter bank in each frame.
 
         Shape: (items, frames, frequencies), (items,) -> (items, channels, frames) in Pa.
 
         Args:
-            smeared_powers: Power at each point of the smeared spectrogram in Pa^2.
+            smeared_powers: Power in Pa^2 at each point of a spectrogram, spread over neighbouring
+                frequencies as ``smear`` does. Negative values are treated as 0.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
         """
         excitation = self._corrected("excitation") * self.ear_power

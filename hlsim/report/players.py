@@ -45,13 +45,14 @@ def listening_sections(
 ) -> list[Section]:
     """Return the section "Listen" of a page, with one player per item.
 
-    The items range from the largest rise of the score to the largest fall, by the comparison with
-    which the page begins. A player has what a normal ear perceives of the clean speech, and what
-    the ear perceives under each condition.
+    Items are ranked by how much their score changes between the two conditions of the evaluation's
+    headline comparison, largest gain first. The items of the section are evenly spaced in this
+    ranking. A player has what a normal ear perceives of the clean speech, and what the impaired ear
+    perceives under each condition.
 
     Args:
         evaluation: The evaluation of the page.
-        count: Number of items.
+        count: Number of items in the section.
         conditions: Names of the conditions to be played; all of them if empty.
 
     Returns: The section, or an empty list if there is no comparison or ``count`` is 0.

@@ -190,7 +190,15 @@ def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparis
 
 
 def paired_table(caption: str, rows: Mapping[str, PairedComparison]) -> Table:
-    """Return a table with one row per paired comparison, by name, with unadjusted p values.
+    """Return a table with one row per paired comparison.
+
+    The columns are the label of the comparison, the number of pairs n, the means before and after,
+    their change with its 95 % interval, the t-test, Wilcoxon's test, and Cohen's d. The p values
+    are not corrected for multiple comparisons.
+
+    Args:
+        caption: Caption of the table.
+        rows: Comparisons, each under the label that begins its row.
 
     >>> from hlsim.evaluation import paired_comparison
     >>> paired_table("Ears", {"N3": paired_comparison([0.2, 0.4], [0.3, 0.5])}).rows[0][:2]

@@ -17,10 +17,11 @@ from hlsim.plugins import WaveformPlugin
 class PluginTeacher:
     """Teacher that calls a user's simulator of hearing loss.
 
-    The simulator is a function ``(waveform, audiogram) -> waveform`` or a class whose objects are.
-    It receives signals in pascals with shape (items, time) and thresholds in dB HL with shape
-    (items, 8), and returns the perceived signals, time-aligned with its input. Its sample rate is
-    its attribute ``sample_rate`` or else 16000 Hz.
+    The simulator is a function ``(waveform, audiogram) -> waveform``, or a class whose objects can
+    be called in this way and which is constructed without arguments. It receives signals in pascals
+    with shape (items, time) and thresholds in dB HL with shape (items, 8), and returns the
+    perceived signals, time-aligned with its input. Its sample rate is its attribute ``sample_rate``
+    or else 16000 Hz.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``, see ``load_plugin``.
@@ -30,7 +31,7 @@ class PluginTeacher:
             half a second of noise has another shape, is delayed or is not finite.
 
     >>> teacher = PluginTeacher("hlsim:MSBG")
-    >>> teacher(0.02 * torch.randn(1, 16000), torch.zeros(1, 8), 16000).shape
+    >>> teacher(0.02 * torch.randn(1, 16000), torch.zeros(1, 8), sample_rate=16000).shape
     torch.Size([1, 16000])
     """
 

@@ -41,7 +41,8 @@ class TrainerOptions(TypedDict, total=False):
         max_minutes: Time limit in minutes, including the time before a resumption. By default, the
             training ends after the recipe's steps.
         accelerator: Type of device, "auto" (default), "cpu" or "gpu", see Lightning's ``Trainer``.
-        devices: Number of devices, 1 by default. Each draws a batch of its own at every step.
+        devices: Number of devices, 1 by default. Each draws a batch of its own at every step, so
+            that N devices train with N batches per step.
         progress: Whether a terminal shows a progress bar, which it does by default.
 
     >>> TrainerOptions(max_minutes=5.0)

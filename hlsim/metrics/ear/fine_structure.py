@@ -76,13 +76,16 @@ def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
 def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Tensor:
     """Smooth the levels of channels: compute the Hann-weighted mean of each segment.
 
+    Neighbouring segments overlap by half. The first and the last one are half as long.
+
     Args:
-        levels: Levels in dB.
-        extent: Number of samples of each item.
+        levels: Levels in dB at 24 kHz. Shape: (items, channels, time), where items are padded to
+            the length of the longest one.
+        extent: Number of samples of each item before padding.
         segment: Length of a segment in samples, an even number.
 
     Returns:
-        Means. Shape: (items, channels, longest) -> (items, channels, segments).
+        Means in dB, 0 after the last segment of an item. Shape: (items, channels, segments).
 
     >>> smooth_levels(torch.ones(1, 2, 1000), Extent((1000,))).shape
     torch.Size([1, 2, 5])
