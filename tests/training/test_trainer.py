@@ -115,7 +115,7 @@ def test_takes_the_recipes_steps_and_validates_after_the_last(
     assert run(module, tmp_path / "new" / "out") == tmp_path / "new" / "out" / "checkpoint"
     assert module.steps_taken == list(range(9))
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == [f"step {i}" for i in (0, 2, 4, 6, 8, 9)]
+    assert [line.split(":")[0] for line in lines] == [f"step {i} of 9" for i in (0, 2, 4, 6, 8, 9)]
     assert "valid_sum" in lines[0] and "score" not in lines[0]
     assert last_state(tmp_path / "new" / "out")["global_step"] == 9
     assert list((tmp_path / "new" / "out" / "events").glob("events.out.tfevents.*"))
