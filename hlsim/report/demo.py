@@ -106,7 +106,7 @@ def _cards(evaluation: Evaluation) -> list[Card]:
     haspi, errors = means["haspi"], means["loudness_error"]
     rows = split_rows(evaluation.table)
     words = {name: predict_words(part["haspi"]) for name, part in rows.items()}
-    fewest_words, most_words = predict_words([0.0]), predict_words([1.0])
+    fewest_words, most_words = (predict_words([score] * len(evaluation.items)) for score in (0, 1))
     return [
         Card(
             "HASPI",
