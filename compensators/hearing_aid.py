@@ -123,8 +123,8 @@ class HearingAid(Wearable):
     def train(self, mode: bool = True) -> Self:
         """Set the mode of all modules except the LSTM, which stays in training mode.
 
-        cuDNN computes no gradient through an LSTM in evaluation mode. The two modes differ in
-        nothing else, because the LSTM has no dropout.
+        cuDNN computes no gradient through an LSTM in evaluation mode. The output of the LSTM is the
+        same in both modes, because it has no dropout.
         """
         super().train(mode)
         self.recur.train()
@@ -179,7 +179,7 @@ class HearingAid(Wearable):
         return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        # The hearing loss in each band, and then NAL-R's gain in each band, both in dB
+        # The hearing loss in each band, followed by NAL-R's gain in each band, both in dB
         centres = band_centres(self.bands)
         loss = interpolate(thresholds, centres)
         prescribed = interpolate(nalr_gains_db(thresholds), centres)

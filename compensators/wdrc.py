@@ -71,12 +71,12 @@ class WDRC(Wearable):
         self.limit_spl = limit_spl
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the output for a whole signal, time-aligned with the input.
+        """Return the output for a complete recording, time-aligned with the input.
 
         Args:
             waveform: Input of the aid.
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform.
+                leading dimensions of the waveform. It is required; None raises an error.
 
         Shape: (..., time) -> (..., time).
 
@@ -101,7 +101,7 @@ class WDRC(Wearable):
         return Stream(self, audiogram)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        # NAL-R's gain in each band in dB, and then the compression ratio in each band
+        # NAL-R's gain in each band in dB, followed by the compression ratio in each band
         centres = band_centres(self.bands)
         prescribed = interpolate(nalr_gains_db(thresholds), centres)
         loss = interpolate(thresholds, centres)

@@ -176,8 +176,8 @@ def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHE
     accepted = is_finite(sample_rate) and lowest <= sample_rate <= highest
     if not accepted or int(sample_rate) != sample_rate:
         raise ValueError(
-            f"expected a sample rate from {lowest} to {highest} Hz as a whole number, "
-            f"got {describe(sample_rate)}"
+            f"expected a sample rate that is a whole number from {lowest} to {highest} Hz, got "
+            f"{describe(sample_rate)}; resample the signal"
         )
     return int(sample_rate)
 
@@ -333,7 +333,7 @@ def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
 
     Args:
         waveform: Padded signals.
-        ends: Number of samples of each item.
+        ends: Number of samples of each item before padding.
 
     >>> silence_after(torch.ones(2, 3), torch.tensor([1, 2]))
     tensor([[1., 0., 0.],

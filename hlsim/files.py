@@ -158,7 +158,8 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
                 surplus_values = row.pop(None, ())
                 if any(surplus_values):
                     raise ValueError(
-                        f"{path}, line {reader.line_num}: expected {len(names)} values, got more"
+                        f"{path}, line {reader.line_num}: expected {len(names)} values, one for "
+                        f"each column of the header, got {len(names) + len(surplus_values)}"
                     )
                 values = {name: value.strip() for name, value in row.items() if name}
                 rows.append((reader.line_num, values))

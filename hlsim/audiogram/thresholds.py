@@ -187,7 +187,7 @@ def resolve_thresholds(
     """
     if audiogram is None and stored is None:
         raise ValueError(
-            "expected an ear, got None; pass an audiogram, such as 'N3', with the signal or to the "
+            "expected an audiogram, got None; pass one, such as 'N3', after the signal or to the "
             "module's constructor"
         )
     thresholds = stored if audiogram is None else as_thresholds(audiogram, **options)
@@ -245,9 +245,10 @@ def check_two_channels(waveform: Tensor) -> None:
 
 
 def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
-    """Interpolate thresholds at the eight ``FREQUENCIES`` to other ones, linearly in Hz.
+    """Interpolate thresholds at the eight ``FREQUENCIES`` to other frequencies, linearly in Hz.
 
-    Beyond the lowest and the highest of the eight frequencies, they stay constant.
+    Below the lowest of the eight frequencies, the result is the threshold at that frequency; above
+    the highest, the threshold at the highest.
 
     Shape: (..., 8) -> (..., frequencies).
 

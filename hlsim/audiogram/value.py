@@ -144,7 +144,10 @@ class Audiogram:
         return f"Audiogram({self.short_text()})"
 
     def short_text(self) -> str:
-        """Return the audiogram as short text: a standard name in quotes, or levels by frequency."""
+        """Return the audiogram as short text, such as ``'N3'`` or ``{500: 20, 4000: 55}``.
+
+        This is the name of a standard audiogram, or the threshold in dB HL at each frequency in Hz.
+        """
         for name, levels in STANDARD.items():
             if self.frequencies == FREQUENCIES and self.levels == levels:
                 return repr(name)

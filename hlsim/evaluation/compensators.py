@@ -78,7 +78,7 @@ def evaluate_compensators(
 
     Scores are stored as they become known. An interrupted run can be continued, and a run with one
     more compensator, or with another simulator, computes only the scores that are missing. An item
-    counts only if every condition has all its scores.
+    is used only if every condition has all its scores.
 
     Args:
         compensators: Modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
@@ -121,12 +121,13 @@ def evaluate_compensators(
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
     require("pandas", "eval")
-    is_in_range = all(0.0 <= level <= 120.0 for level in levels)
-    if items < 1 or not compensators or not levels or not is_in_range:
+    if not compensators:
+        raise ValueError("expected at least one compensator, got none; pass one under its name")
+    if items < 1:
+        raise ValueError(f"expected at least one item, got {items}; set items to 1 or more")
+    if not levels or not all(0.0 <= level <= 120.0 for level in levels):
         raise ValueError(
-            "expected at least one compensator, one item and one level, and levels from 0 to 120 "
-            f"dB SPL, got {len(compensators)} compensators, {items} items and the levels "
-            f"{', '.join(f'{level:g}' for level in levels)}"
+            f"expected one or more levels from 0 to 120 dB SPL, got {list(levels)}; change levels"
         )
     for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")

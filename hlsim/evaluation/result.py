@@ -25,12 +25,16 @@ class Evaluation:
     """A finished study.
 
     Attributes:
-        items, conditions, measures: The three inputs of ``run_study``.
+        items: Items of the study: speech, the input of the aid, and an audiogram each.
+        conditions: Conditions that process every item, such as hearing aids.
+        measures: Measures that score every output.
         table: Table with one row per item and condition, see ``run_study``.
         comparisons: Comparisons of two conditions by one measure each, see ``compare``.
-        settings: Settings on which the values depend, such as the seed, by name.
+        settings: Settings on which the values depend, such as the seed, each under its name. They
+            are written to ``report.json``.
         notes: Sentences with which the page of the evaluation begins.
-        details: Further results for ``report.json`` and the page, such as gain curves, by name.
+        details: Further results for ``report.json`` and the page, such as gain curves, each under
+            its name.
         groups: The same evaluation for a part of the items, such as noisy speech, by the name of
             the part.
 
@@ -61,12 +65,16 @@ class Evaluation:
         settings: Mapping[str, Any],
         **running: Any,
     ) -> Evaluation:
-        """Run a study, and return its evaluation without comparisons.
+        """Score every output of a study, and return its evaluation without statistical tests.
 
         Args:
-            items, conditions, measures: The three inputs of ``run_study``.
-            store: File of scores; None stores nothing.
-            settings: Settings on which the values depend, by name.
+            items: Items of the study: speech, the input of the aid, and an audiogram each.
+            conditions: Conditions that process every item, such as hearing aids.
+            measures: Measures that score every output.
+            store: File to which scores are written as they become known, and from which a repeated
+                run reads them; None stores nothing.
+            settings: Settings to record in the evaluation, such as the seed, each under its name.
+                They change no score.
             running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
         Raises:
@@ -134,7 +142,12 @@ class Evaluation:
         return words_change(scores[before].to_numpy(), scores[after].to_numpy())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of ``report.json``, with None for missing values."""
+        """Return the contents of ``report.json``, with None in place of NaN.
+
+        The keys are the attributes ``settings`` and ``notes``, ``versions`` of packages,
+        ``conditions``, ``comparisons``, ``groups`` with comparisons of parts of the items, the keys
+        of ``details``, and ``rows``, one dictionary per row of ``table``.
+        """
         fields = ("name", "kind", "of", "rivals")
         conditions = [{name: getattr(c, name) for name in fields} for c in self.conditions]
         groups = {

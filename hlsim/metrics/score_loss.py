@@ -13,7 +13,7 @@ from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 
 SCORES: dict[str, Callable[..., Tensor]] = {"haspi": haspi, "hasqi": hasqi}
-"""Scores between 0 and 1 by name, the higher the better."""
+"""Functions that compute scores from 0 to 1, the higher the better, under the score's name."""
 
 
 def score_loss(
@@ -26,9 +26,9 @@ def score_loss(
 ) -> Tensor:
     """Compute 1 minus the score of each item, for training.
 
-    The ear's internal noise counts with its mean effect, so the loss is smooth. An item whose clean
-    signal is hardly audible (silent, below 20 dB SPL, a click, or for HASPI below the threshold of
-    hearing) has no meaningful score: its loss is 0 and has no gradient. An item with NaN or
+    The ear's internal noise is replaced by its expected effect, so the loss is smooth. An item has
+    no meaningful score if its clean signal is silent, below 20 dB SPL, only as long as a click, or
+    for HASPI below the threshold of hearing: its loss is 0 and has no gradient. An item with NaN or
     infinity in ``processed`` has the loss NaN.
 
     Args:
@@ -36,7 +36,7 @@ def score_loss(
         processed: Output of the compensator in pascals. Shape: (items, time).
         clean: Clean speech in pascals, for which no gradient is computed. Shape: (items, time).
         ears: Thresholds of the impaired ear of each item in dB HL. Shape: (items, 8).
-        ends: Number of samples of each item.
+        ends: Number of samples of each item before padding.
         sample_rate: Sample rate in Hz.
 
     Returns:

@@ -14,8 +14,8 @@ def estimate_delay(
 ) -> int:
     """Measure by how many samples a simulator delays its output.
 
-    The input is one second of silence with one sample of sound, an impulse, in the middle. The
-    delay is the time from the impulse to the largest magnitude of the output. It depends on the ear
+    The input is an impulse: one second of zeros, except for one sample in the middle. The delay is
+    the time from the impulse to the largest magnitude of the output. The delay depends on the ear
     and on the level, because MSBG delays low frequencies more than high ones: at 44.1 kHz it is
     1078 samples without a hearing loss and 1237 to 1271 samples with one. To align signals, use
     ``MSBG.delay``, which depends on the severity of the loss only.
@@ -27,8 +27,8 @@ def estimate_delay(
             with ``aligned=False``, because aligned simulators have no delay.
         audiogram: Hearing loss of one ear. By default, it is the simulator's stored one, or 0 dB HL
             if there is none.
-        level: Level of the impulse: its sample is as large as the RMS of a sound of this level in
-            dB SPL.
+        level: Pressure of the impulse, as the level in dB SPL of a sound with this RMS pressure:
+            94 is 1 Pa.
 
     Returns:
         The delay in samples at the simulator's sample rate.

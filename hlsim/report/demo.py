@@ -89,7 +89,11 @@ def demo_page(
 
 
 def result_table(evaluation: Evaluation) -> Table:
-    """Return the table of the demo, with mean scores and levels of each condition."""
+    """Return the table of ``hlsim demo``, with one row per condition.
+
+    The columns are the means of HASPI, of the share of words that it predicts to be understood, of
+    the level of the aid's output and of the error of loudness.
+    """
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),
         "Words understood": (lambda rows: predict_words(rows["haspi"]), ".0%"),

@@ -92,7 +92,10 @@ class Clips:
             waveform = self._decode(index)
             peak = float(waveform.abs().max())
             if peak == 0.0:
-                raise ValueError(f"{self.files[index]}: its first channel is silent")
+                raise ValueError(
+                    f"{self.files[index]}: its first channel is silent, and no other channel is "
+                    "used; move the sound to the first channel, or remove the file"
+                )
             self._recordings[index] = (waveform / peak * 32767.0).round().to(torch.int16)
             self._limit_memory()
         return self._recordings[index].float() / 32767.0

@@ -38,8 +38,8 @@ class TrainerOptions(TypedDict, total=False):
     """Options that state where and how long a training runs, and what it shows.
 
     Attributes:
-        max_minutes: Time limit in minutes, including the time before a resumption. By default, the
-            training ends after the recipe's steps.
+        max_minutes: Time limit in minutes, including the time before a resumption. A training that
+            reaches it ends before the recipe's last step. By default, there is no limit.
         accelerator: Type of device, "auto" (default), "cpu" or "gpu", see Lightning's ``Trainer``.
         devices: Number of devices, 1 by default. Each draws a batch of its own at every step, so
             that N devices train with N batches per step.

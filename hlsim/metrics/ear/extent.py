@@ -41,7 +41,7 @@ class Extent:
     there were no padding.
 
     Args:
-        ends: Length of each item.
+        ends: Length of each item before padding.
 
     >>> extent = Extent((100, 30))
     >>> extent.longest, extent.padded

@@ -101,7 +101,7 @@ class Recursion(NamedTuple):
         return (blocks @ self.through).add_(before @ self.outward)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Recursion:
-        """Return the same filters on a device and in a dtype."""
+        """Return the same filters with their matrices on a device, converted to ``dtype``."""
         on_gpu = device.type != "cpu"
         through, inward, outward, step = (
             matrix.to(device, dtype, non_blocking=on_gpu) for matrix in self[:4]

@@ -81,7 +81,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     try:
         check_utterances(utterances, folder)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: the manifest is not valid: {error}") from error
     if not (folder / utterances[0].path).is_file():
         raise ValueError(
             f"{path}: {folder} does not contain its first file, {utterances[0].path}; set the root "
