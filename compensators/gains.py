@@ -34,7 +34,7 @@ class MeasuredAid(nn.Module):
     def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
         """Measure the insertion gains for noise with the spectrum of average speech.
 
-        Noise reduction is off, and the limit of the output does not count.
+        Noise reduction is off, and the limit of the output is not applied.
 
         Args:
             audiogram: One or more ears.
@@ -55,7 +55,7 @@ class MeasuredAid(nn.Module):
         thresholds = as_thresholds(audiogram, consumer="an aid").to(weight)
         ears = thresholds.reshape(-1, len(FREQUENCIES))
         noise = constant_like(ears, _speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
-        # The first second, in which gains settle, does not count.
+        # The first second, in which gains settle, is left out.
         output = self._amplify_noise(noise.repeat(len(ears), 2), ears)[:, RATE:]
         in_third = constant_like(ears, _thirds_of_octave)
         output_power, noise_power = (

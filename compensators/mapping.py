@@ -177,7 +177,7 @@ def _average_over_stride(levels: Tensor, stride: int) -> Tensor:
 
 
 def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
-    """Return weights from bands to frequencies, straight lines between the centres of the bands.
+    """Return weights that interpolate from bands to frequencies, linearly between band centres.
 
     The centres lie evenly on the ERB-number scale from 100 Hz to 8 kHz.
 

@@ -31,7 +31,7 @@ class Stream:
         aid: Aid at 16 kHz.
         audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the leading
             dimensions of the chunks.
-        sliders: Values from 0 to 1 by name, one number or one value per item.
+        sliders: Value from 0 to 1 under each slider's name, one number or one value per item.
 
     Raises:
         ValueError: The aid has another sample rate, or rejects the ear, a slider or a chunk; the

@@ -144,7 +144,7 @@ class Wearable(MeasuredAid):
         Args:
             sliders: Values of the sliders at the beginning. Shape: (items, sliders).
 
-        Returns: Tensors by name, (items, ...) each, of the type and device of ``sliders``.
+        Returns: Named tensors, (items, ...) each, of the type and device of ``sliders``.
         """
         past = sliders.new_zeros(len(sliders), HISTORY)
         gains = sliders.new_zeros(len(sliders), 2, self.bands)

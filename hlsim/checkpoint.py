@@ -168,7 +168,7 @@ def checkpoint_about(name: str | Path) -> dict[str, Any]:
     Args:
         name: Name or folder of the checkpoint.
 
-    Returns: Entries by name; an empty dictionary if the checkpoint has no record.
+    Returns: Entries, each under its name; an empty dictionary if the checkpoint has no record.
 
     Raises:
         ValueError: There is no such checkpoint.
@@ -181,7 +181,7 @@ def checkpoint_about(name: str | Path) -> dict[str, Any]:
 
 
 def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]:
-    """Return the folders of the checkpoints that ship with hlsim, by name.
+    """Return the folders of the checkpoints that ship with hlsim, each under its name.
 
     Args:
         kinds: Kinds of checkpoints to include, such as ``hearing-aid``; all by default.

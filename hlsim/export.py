@@ -7,7 +7,7 @@ The program of a wearable aid (``WDRC`` or ``HearingAid``) processes one *hop* o
 samples or 4 ms at 16 kHz, or a fixed number of hops. What the aid remembers from one call to the
 next, its *state*, is passed in and returned as tensors. All tensors are float32.
 
-Inputs by name:
+Inputs and their names:
 
 - ``samples`` (items, hops * 64): the input, where RMS 1.0 is ``aid.full_scale_spl`` dB SPL
 - ``fitted`` (items, n): the aid's parameters for the ear of each item
@@ -15,7 +15,7 @@ Inputs by name:
     any
 - the state, (items, ...) each: for example ``past`` (items, 192), the preceding samples in pascals
 
-Outputs by name:
+Outputs and their names:
 
 - ``output`` (items, hops * 64): the aid's output, delayed by ``aid.latency`` = 64 samples
 - the next state, with the prefix ``next_``: for example ``next_past``, the input ``past`` of the
@@ -236,7 +236,7 @@ def first_inputs(
 def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export.ExportedProgram:
     """Convert a wearable aid to a ``torch.export`` program that processes a few ms per call.
 
-    ``program.module()(**inputs)`` returns the outputs by name. The module's docstring lists inputs
+    ``program.module()(**inputs)`` returns the named outputs. The module's docstring lists inputs
     and outputs, and ``first_inputs`` returns the inputs of the first call.
 
     Args:

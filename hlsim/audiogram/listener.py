@@ -64,7 +64,7 @@ class Listener:
         return f"Listener({', '.join(ears)})"
 
     def ears(self) -> dict[EarName, Audiogram]:
-        """Return the audiograms of the known ears by name, ``"left"`` and ``"right"``."""
+        """Return the audiograms of the known ears, under the keys ``"left"`` and ``"right"``."""
         ears = zip(EARS, (self.left, self.right), strict=True)
         return {name: ear for name, ear in ears if ear is not None}
 

@@ -88,7 +88,7 @@ def read_listeners(path: str | Path, names: Collection[str] | None = None) -> di
         names: Names of the listeners to read, by default all. Other listeners are not validated.
 
     Returns:
-        Listeners by name.
+        Listeners, each under its name.
 
     Raises:
         ValueError: The file cannot be read, has no listener of a name, or an ear is not valid, is

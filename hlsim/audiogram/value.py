@@ -206,7 +206,7 @@ class Audiogram:
         return plot_thresholds(self.frequencies, self.levels, axes, ear, **style)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """Return the lists ``levels`` and ``frequencies`` by name, which can be written as JSON."""
+        """Return a dictionary of ``levels`` and ``frequencies``, which can be written as JSON."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
 
     @classmethod

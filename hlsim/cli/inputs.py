@@ -127,6 +127,6 @@ def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
-    """Return the values of ``--noise-reduction`` and ``--amplification`` that are set, by name."""
+    """Return the values of ``--noise-reduction`` and ``--amplification``, if set, under names."""
     values = {name: getattr(options, name) for name in ("noise_reduction", "amplification")}
     return {name: value for name, value in values.items() if value is not None}

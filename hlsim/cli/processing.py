@@ -113,7 +113,7 @@ def _process(
     Args:
         options: Options of the command.
         build: Function from a sample rate in Hz to a simulator or compensator.
-        sliders: Further arguments of the simulator or compensator, by name.
+        sliders: Further arguments of the simulator or compensator, each under its name.
         alternatives: Options for models that keep the band above 8 kHz, for a warning.
     """
     # Threads of OpenMP spin while they wait. On a busy machine that triples the time of the many
@@ -166,7 +166,7 @@ def _process_file(
         target: File to write.
         ears: Audiogram or listener.
         build: Function from a sample rate in Hz to a simulator or compensator.
-        sliders: Further arguments of the simulator or compensator, by name.
+        sliders: Further arguments of the simulator or compensator, each under its name.
     """
     import torch
 

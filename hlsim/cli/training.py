@@ -113,7 +113,7 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
 
 def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments that both training functions have, by name."""
+    """Return the keyword arguments that both training functions have."""
     from hlsim.training.batches import TrainingData
 
     names = ("noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms", "workers")

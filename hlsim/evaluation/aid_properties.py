@@ -63,9 +63,9 @@ def measure_aids(
     """Measure a property of several hearing aids, each for several ears.
 
     Args:
-        aids: Hearing aids by name.
-        ears: Audiograms by name.
-        measure: Function ``(aid, ear, *arguments) -> values by name``, such as
+        aids: Hearing aids, each under its name.
+        ears: Audiograms, each under its name.
+        measure: Function ``(aid, ear, *arguments) -> dictionary``, such as
             ``measure_steady_tones``.
         arguments: Further arguments of this function.
 

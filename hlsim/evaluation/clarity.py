@@ -194,7 +194,7 @@ def evaluate_scenes(
 
 
 def _read_scenes(folder: Path) -> dict[str, _Scene]:
-    """Return the scenes of a folder by name.
+    """Return the scenes of a folder, each under its name.
 
     Raises:
         ValueError: There is no scene, or a scene lacks its reference.

@@ -81,7 +81,7 @@ def evaluate_compensators(
     is used only if every condition has all its scores.
 
     Args:
-        compensators: Modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
+        compensators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
             waveform and an ear. If a module has the attribute ``limit_spl`` or
             ``config.limit_spl``, its peaks are compared with that limit in dB SPL.
         speech: Folder of recordings of clean speech.
@@ -206,7 +206,7 @@ def _make_conditions(
     """Return all conditions, each of them after those with which it is compared.
 
     Args:
-        aids: Prescriptions and compensators by name.
+        aids: Prescriptions and compensators, each under its name.
         equalisers: Equaliser with the mean gain of each compensator.
         enhancers: Enhancers, by the part of their names after the colon.
     """

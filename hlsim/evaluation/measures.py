@@ -98,7 +98,7 @@ MEASURES = {
     "stoi": STOI,
     "pesq": PESQ,
 }
-"""The scores of ``--measures`` by name. Higher is better for all of them."""
+"""The scores of ``--measures``, each under its name. Higher is better for all of them."""
 
 _PACKAGES = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
 """Optional package of a measure, and the extra of hlsim that installs it."""
@@ -271,7 +271,7 @@ def network_loss(simulator: nn.Module) -> Measure:
 def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:
     """Compute the median absolute difference between the levels of ERB-wide bands, in dB.
 
-    Only those bands and frames count in which a normal ear finds the reference audible.
+    Only those bands and frames are used in which a normal ear finds the reference audible.
 
     Args:
         perceived: Output as an ear perceives it, in pascals. Shape: (time,).

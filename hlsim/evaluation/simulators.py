@@ -55,7 +55,7 @@ def evaluate_simulators(
     more simulator computes only its values.
 
     Args:
-        simulators: Modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
+        simulators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
             waveform and an ear.
         speech: Folder of recordings of clean speech.
         audiograms: CSV file of ears, see ``draw_simulator_items``.

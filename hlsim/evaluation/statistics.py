@@ -66,7 +66,7 @@ class PairedComparison:
     ci_high: float | None = None
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """Return the attributes by name."""
+        """Return a dictionary of the attributes' names and values."""
         return asdict(self)
 
 
@@ -175,7 +175,7 @@ def holm(p_values: Iterable[float | None]) -> list[float | None]:
     """Adjust p values for the number of tests by the method of Holm (1979, Scand. J. Statist. 6).
 
     Args:
-        p_values: P values of all tests of a family. None, an undefined one, counts as a test.
+        p_values: P values of all tests of a family. None, an undefined value, counts as a test.
 
     Returns: The adjusted p values in the same order. Undefined ones stay None.
 

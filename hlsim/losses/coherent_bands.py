@@ -111,7 +111,7 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Four parts by name, (items,) each: ``incoherence``, from 0 for filtered speech to 1 for
+        Four parts, (items,) each: ``incoherence``, from 0 for filtered speech to 1 for
         noise; ``misalignment``, the effect of a phase shift; ``levels``, the level error in dB,
         compressed; ``louder``, the excess level in dB.
 
@@ -217,7 +217,7 @@ class _GradientLimiter(torch.autograd.Function):
         powers = _split(waveform, ctx.block).square().mean(-1)
         sizes = _split(gradient.abs(), ctx.block)
         sounding = powers >= SOUNDING * powers.amax(-1, keepdim=True)
-        # Samples behind the end of an item have no gradient, and do not count.
+        # Samples behind the end of an item have no gradient, and are left out.
         counted = sounding.unsqueeze(-1) & (sizes > 0.0)
         candidates = torch.where(counted, sizes, math.nan).flatten(-2)
         sample = candidates[..., :: max(1, time // LIMITER_SAMPLES)]

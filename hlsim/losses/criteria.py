@@ -36,10 +36,10 @@ def check_criterion(criterion: Any) -> dict[str, Any]:
     """Convert the criterion argument of a loss into criteria by name with their weights.
 
     Args:
-        criterion: Name of a criterion, weights of several by name, or a function.
+        criterion: Name of a criterion, dictionary of names and weights, or a function.
 
     Returns:
-        Weights above 0 by name; or the function itself under the name ``criterion``.
+        Weights above 0 under the names of criteria; or a function under the name ``criterion``.
 
     Raises:
         ValueError: A name is unknown, or a weight is negative or not finite.
@@ -60,11 +60,11 @@ def combine_weights(
     """Compute the weight of each part of a loss: its own weight times that of its criterion.
 
     Args:
-        weights: Weights of the parts by name; the defaults of the criteria if None.
+        weights: Weight under each part's name; the defaults of the criteria if None.
         criteria: Criteria with their weights, from ``check_criterion``.
 
     Returns:
-        Weights by name of the part.
+        Weights, each under the name of its part.
 
     Raises:
         ValueError: A part is unknown, or a weight is negative or not finite.
@@ -108,8 +108,8 @@ def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
     """Compute the sum of the parts of a loss times their weights.
 
     Args:
-        parts: Parts by name, all with the same shape.
-        weights: Weights by name. Parts without a weight do not count.
+        parts: Parts, each under its name, all with the same shape.
+        weights: Weights, each under the name of its part. Parts without a weight are ignored.
 
     >>> weighted_sum({"time": torch.tensor(2.0), "phase": torch.tensor(1.0)}, {"time": 0.5})
     tensor(1.)

@@ -112,7 +112,7 @@ class HearingLossLoss(nn.Module):
       (``hlsim.metrics.score_loss``). They ignore the level, so combine them with another criterion.
     - ``"interaural"``: change of the differences between the ears of a listener
       (``hlsim.metrics.interaural``), to be combined with another criterion
-    - several of these by name with their weights, ``{"coherent-bands": 1.0, "haspi": 0.3}``
+    - names of several of these with their weights, ``{"coherent-bands": 1.0, "haspi": 0.3}``
     - a function of the perceived speech and the reference, (items, time) each in pascals, that
       returns one value per item, (items,)
 
@@ -139,7 +139,7 @@ class HearingLossLoss(nn.Module):
             ear (``hlsim.msbg.response``), unless ``normal`` is passed or the simulator does not
             emulate MSBG. Without this phase, speech of the opposite sign could have a lower loss.
         criterion: Criterion, as listed above.
-        weights: Weights of the parts that ``parts`` returns, by name; other parts do not count.
+        weights: Weight under the name of each part of ``parts``; other parts are ignored.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"`` for one value
             per item.
         normal: Normal ear that belongs to the simulator: a module, which is frozen too, or a
@@ -273,7 +273,7 @@ class HearingLossLoss(nn.Module):
         *,
         listener: Mapping[str, Any] | None = None,
     ) -> dict[str, Tensor]:
-        """Compute the terms of the loss by name, before they are multiplied by their weights.
+        """Compute the named terms of the loss, before they are multiplied by their weights.
 
         ``forward`` returns ``sum(weight * parts[name] for name, weight in loss.weights.items())``.
         Arguments, shapes and errors are those of ``forward``.
@@ -340,7 +340,7 @@ class HearingLossLoss(nn.Module):
         lengths: Lengths | None,
         listener: Mapping[str, Any] | None,
     ) -> _Call:
-        """Validate the arguments of a call, and silence what does not count."""
+        """Validate the arguments of a call, and silence samples after the end of each item."""
         check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
         for name in ("shape", "device"):
@@ -432,7 +432,7 @@ class HearingLossLoss(nn.Module):
                 (items, time) each, in pascals.
 
         Returns:
-            Parts by name, (items,) each.
+            Parts, each under its name, (items,) each.
         """
         perceived = signals["perceived"]
         parts: dict[str, Tensor] = {}
@@ -456,7 +456,7 @@ class HearingLossLoss(nn.Module):
         """Reduce the parts of each ear and item as ``ears`` and ``reduction`` demand.
 
         Args:
-            parts: Parts by name, each in the shape of the leading dimensions.
+            parts: Parts under their names, each in the shape of the leading dimensions.
             known: Mask of the ears that are not missing, or None if none is missing.
         """
         if known is not None:

@@ -61,7 +61,7 @@ def haspi(
     """Compute HASPI version 2 of each item: the intelligibility for an impaired ear, 0 to 1.
 
     The score compares the output of an aid in the impaired ear with clean speech in a normal ear.
-    A delay of the output does not count. A silent output has the score of the ear's internal noise.
+    A delay of the output has no effect. A silent output has the score of the ear's internal noise.
     ``HaspiReference`` prepares clean speech once for many scores.
 
     The score is differentiable in ``processed``. The delays that align the output are constants for

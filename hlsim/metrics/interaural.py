@@ -122,7 +122,7 @@ def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000
 def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
     """Compute how much an aid changes the differences between the ears, as a loss for training.
 
-    Gains and delays that are equal in both ears do not count. The loss of an octave is the error of
+    Gains and delays that are equal in both ears are ignored. The loss of an octave is the error of
     the level difference in bels, plus 1 minus the cosine of the error of the phase difference. The
     result is a mean over octaves, in which octaves where clean speech is soft have less weight.
 

@@ -130,7 +130,7 @@ def _mean_correlation(features: Tensor, counts: tuple[int, ...]) -> Tensor:
     item = torch.arange(len(counts), device=device)
     item = item.repeat_interleave(segments, output_size=total)
     start = torch.arange(total, device=device) - (segments.cumsum(0) - segments)[item]
-    # As in pyclarity, one ear alone does not count in the last segment of an item.
+    # As in pyclarity, one ear alone is not used in the last segment of an item.
     may_use_one_ear = start < segments[item] - 1
     segments_at_once = CPU_SEGMENTS if device.type == "cpu" else GPU_SEGMENTS
     groups = torch.arange(total, device=device).split(segments_at_once)
@@ -169,7 +169,7 @@ def _resample_items(signals: Tensor, ends: list[int], rate: int) -> tuple[Tensor
 
     Args:
         signals: Signals. Shape: (items, 4, time).
-        ends: Number of samples of each item.
+        ends: Number of samples of each item before padding.
         rate: Sample rate in Hz.
 
     Returns:
@@ -206,7 +206,7 @@ def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, tuple[int,
     Args:
         signals: Clean signals of the left and the right ear, then the processed ones. Shape:
             (items, 4, time).
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Windowed frames of the shortened signals, (items, 4, frames, 256), and the number of frames

@@ -167,7 +167,7 @@ class QualityReference(Reference):
 
         Args:
             comparison: Features of the clean signals and of the outputs.
-            extent: Number of samples of each item.
+            extent: Number of samples of each item before padding.
         """
 
 
@@ -331,7 +331,7 @@ class _NoiseSources:
     Args:
         noise: Kind of the noise.
         seeds: Seed of each item.
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
         like: Tensor whose dtype and device the noise has.
     """
 

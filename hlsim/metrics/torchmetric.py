@@ -259,7 +259,7 @@ class _MeanScore(_Metric):
             first: Number of items that were seen in earlier batches, for the seeds.
             processed, clean: Signals. Shape: (items, ears, time).
             thresholds: Ears in dB HL. Shape: (items, ears, 8).
-            ends: Number of samples of each item. Shape: (items,).
+            ends: Number of samples of each item before padding. Shape: (items,).
         """
         if not pairs:
             return []

@@ -69,7 +69,7 @@ class ModelConfig:
         """Build settings from a dictionary, for example one that ``to_dict`` returned.
 
         Args:
-            data: Values of settings by name. Missing settings have their default values.
+            data: Values under the names of settings. Missing settings have their default values.
 
         Raises:
             ValueError: A name is unknown, or a value is not accepted.

@@ -1,4 +1,4 @@
-"""The selective scan, the recurrence of the Mamba layer, in plain torch and parallel over time.
+"""The selective scan, the recurrence of the Mamba layer, in torch alone and parallel over time.
 
 Each channel of a signal has several *states*, which remember its past: h[t] = decay[t] h[t - 1] +
 drive[t], where drive is the weighted input. In the order of Mamba's names: decay[t] = exp(delta[t]

@@ -92,7 +92,7 @@ def _draw_picture(
 
 
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
-    """Return a colour of matplotlib for each condition, by name.
+    """Return the names of conditions with a colour of matplotlib for each.
 
     A condition that belongs to another one, such as NAL-R at an aid's level, has its colour, paler.
 
@@ -191,7 +191,7 @@ def curves_picture(
     """Draw curves, with a legend below them.
 
     Args:
-        curves: Curves by name.
+        curves: Curves, each under the name that the legend shows.
         title: Heading above the picture.
         axis: Title of the vertical axis.
         over: Title of the horizontal axis; by default, it is frequency in Hz.

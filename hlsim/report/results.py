@@ -82,7 +82,7 @@ def score_columns(evaluation: Evaluation) -> Columns:
 
 
 def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
-    """Return the parts of a study's table for each condition, by name.
+    """Split a study's table into the rows of each condition, under its name.
 
     Args:
         table: The table.
@@ -125,7 +125,7 @@ def summary_table(
 
     Args:
         caption: Caption of the table.
-        rows: Parts of the study's table by name, see ``split_rows``.
+        rows: Parts of the study's table, each under its name, see ``split_rows``.
         columns: Statistics by the title of their column.
         first: Title of the first column, which contains the names.
         folded: Whether the page shows only the caption until a reader opens the table.

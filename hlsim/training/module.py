@@ -64,7 +64,7 @@ class TrainingModule(L.LightningModule):
         """Measure the network on a validation batch.
 
         Returns:
-            Measured values by name, each with shape (items,) or, for a mean over items, (1,).
+            Named measured values, each with shape (items,) or, for a mean over items, (1,).
         """
         raise NotImplementedError
 
@@ -72,10 +72,10 @@ class TrainingModule(L.LightningModule):
         """Summarise the measured values of all validation batches.
 
         Args:
-            values: Values of all items by name, see ``evaluate``.
+            values: Values of all items under each name, see ``evaluate``.
 
         Returns:
-            Means or quantiles by name, and ``score``, which is highest for the best network.
+            Named means or quantiles, and ``score``, which is highest for the best network.
         """
         raise NotImplementedError
 

@@ -29,7 +29,7 @@ class TrainingRecipe:
         batch: Number of clips per step.
         seconds: Duration of a clip.
         learning_rate: Highest learning rate of the optimiser, AdamW.
-        weights: Weights of the criteria by name.
+        weights: Weight under the name of each criterion.
         levels: Lowest and highest level of the speech in dB SPL.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1.
         validate_every: Number of steps between validations.

@@ -68,7 +68,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
         levels: Levels in dB over threshold at 24 kHz. Shape: (items, channels, padded).
         delays: Delays in samples that make up for different group delays of the channels. Shape:
             (items, channels), int64.
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Frames. Shape: (items, channels, ceil(longest / 9)).
@@ -142,7 +142,7 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
 
     Args:
         amplitude: Mean amplitude of clean speech over all channels. Shape: (items, frames).
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Indices of the audible frames of each item, (items, most audible frames), and the number of

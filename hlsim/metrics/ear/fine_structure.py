@@ -59,7 +59,7 @@ def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
     """Return the number of segments of each item.
 
     Args:
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
         segment: Length of a segment in samples, an even number.
 
     >>> segments_of(Extent((1000, 800))).ends
@@ -196,7 +196,7 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
     Args:
         motion: Motion of the basilar membrane, zero after the end of each item. Shape: (items,
             channels, longest).
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Spectra, (items, channels, segments, frequencies), and mean squares of the envelope, which

@@ -159,7 +159,7 @@ def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
 
     Args:
         signals: Signals at 24 kHz. Shape: (items, time).
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Spectra, long enough for correlations at all delays. Shape: (items, frequencies).

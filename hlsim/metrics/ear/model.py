@@ -181,7 +181,7 @@ def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[s
 
     Args:
         items: Number of items of the batch.
-        samples: Number of samples of each item.
+        samples: Number of samples of each item before padding.
         device: Device that computes.
 
     Yields:
@@ -254,7 +254,7 @@ def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Exte
         control: Power of the control filters' envelopes. Shape: (items, channels, padded).
         cells: Hair cells of these channels.
         channels: The channels.
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Bandwidths, float64. Shape: (items, channels).
@@ -301,7 +301,7 @@ def simulate_cochlea(
         signal: Sound behind the middle ear, in multiples of 20 uPa. Shape: (items, padded).
         ear: Hair cells of all channels. Shape: (items, 32) or (32,).
         channels: Channels to compute.
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
         motion: Return the motion of the basilar membrane and the long-term level, too.
 
     >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
@@ -405,7 +405,7 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
 
     Args:
         reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Spectrum. Shape: (items, channels, frequencies).
@@ -440,7 +440,7 @@ def align_channels(
         envelope: Envelope or motion of the same channels, from which the shifts are computed.
             Shape: (items, channels, padded).
         reference_spectrum: ``lag_spectrum`` of the clean signal's envelope or motion.
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Shifted channels. Shape: (items, channels, padded).
@@ -566,7 +566,7 @@ def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tenso
     Args:
         signal: Sound behind the middle ear. Shape: (items, padded).
         ear: Hair cells of all channels.
-        extent: Number of samples of each item.
+        extent: Number of samples of each item before padding.
 
     Returns:
         Delay in samples. Shape: (items, 1), int64.
