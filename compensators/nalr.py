@@ -188,7 +188,7 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
 
 
 def _has_loss(thresholds: Tensor) -> Tensor:
-    """Return whether each ear has a loss. NaN counts as one, so that it reaches the output."""
+    """Return whether each ear has a loss. NaN is treated as a loss, and so reaches the output."""
     return ~(_formula_levels(thresholds) <= 0.0).all(-1, keepdim=True)
 
 

@@ -76,7 +76,7 @@ class Listener:
         """Draw the audiograms of both ears, the left one blue and the right one red.
 
         Args:
-            axes: Matplotlib axes to draw on; by default new ones.
+            axes: Matplotlib axes to draw on; by default new axes.
             style: Matplotlib's properties of the lines, such as ``linewidth=2``.
 
         Returns:

@@ -38,7 +38,7 @@ def plot_thresholds(
     Args:
         frequencies: Frequencies in Hz.
         levels: Threshold at each frequency in dB HL.
-        axes: Matplotlib axes to draw on, which may show other ears; by default new ones.
+        axes: Matplotlib axes to draw on, which may show other ears; by default new axes.
         ear: ``"left"`` draws blue crosses, ``"right"`` red circles, both with a legend.
         style: Matplotlib's properties of the line, such as ``color="tab:green"``.
 

@@ -190,7 +190,7 @@ class Audiogram:
         """Draw the audiogram as audiologists do, with bands for mild, moderate and severe losses.
 
         Args:
-            axes: Matplotlib axes to draw on, which may show other ears; by default new ones.
+            axes: Matplotlib axes to draw on, which may show other ears; by default new axes.
             ear: ``"left"`` draws blue crosses and ``"right"`` red circles, as audiologists do, with
                 the ear and its pure-tone average in the legend.
             style: Matplotlib's properties of the line, such as ``color="tab:green"``.

@@ -36,8 +36,11 @@ def check_extras(*extras: str) -> None:
 def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
     """Return the ear of ``--audiogram``, or both ears of the listener that ``--listener`` names.
 
+    Args:
+        options: Parsed options of a command.
+
     Returns:
-        None if both options are missing.
+        The ear or the listener, or None if both options are missing.
 
     Raises:
         ValueError: There is no such file or listener, or an ear is missing.

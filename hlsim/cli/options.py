@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 TypedEar = str | tuple[float, ...] | dict[float, float]
-"""An ear of a command line: its name, its eight levels, or its levels by frequency."""
+"""An ear of a command line: its name, its eight levels, or the level at each of some frequencies."""
 
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
 """Names of the standard ears, as in ``hlsim.audiogram``."""
@@ -116,24 +116,37 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
-        """Declare an option without a value, which is True if it is used and otherwise False."""
+        """Declare an option without a value, which is True if it is used and otherwise False.
+
+        Args:
+            name: Name, such as ``--json``.
+            text: Description for the help.
+            group: Group of argparse that the option joins, such as a mutually exclusive group.
+        """
         (group or self).add_argument(name, action="store_true", help=text)
 
     def teacher(self, text: str, default: str) -> None:
         """Declare ``--teacher``, a simulator. The help text begins with ``text``."""
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
-            "path/to/file.py:name, a function (waveform, audiogram) -> waveform or a class whose "
-            "objects are; waveforms (items, time) are in pascals, audiograms (items, "
-            "8) in dB HL, and the sample rate is its attribute sample_rate or else 16000 Hz"
+            "path/to/file.py:name, a function (waveform, audiogram) -> waveform or a class that is "
+            "constructed without arguments and whose objects are such functions; waveforms "
+            "(items, time) are in pascals, audiograms (items, 8) in dB HL, and the sample rate is "
+            "its attribute sample_rate or else 16000 Hz"
         )
         self.option("--teacher", teacher_name, help_, default, metavar="NAME")
 
     def audiogram(self, default: str | None = None, text: str = "", group: Any = None) -> None:
-        """Declare ``--audiogram``, one ear. The help text ends with ``text``."""
+        """Declare ``--audiogram``, the thresholds of one ear.
+
+        Args:
+            default: Value if the option is missing, such as ``N3``.
+            text: End of the help text.
+            group: Group of argparse that the option joins, such as a mutually exclusive group.
+        """
         help_ = (
             "NH, N1 to N7, S1 to S3; eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, "
-            "6000 and 8000 Hz, separated by commas; or levels by frequency in Hz, such as "
+            "6000 and 8000 Hz, separated by commas; or frequencies in Hz with levels, such as "
             f"500:30,1000:40,4000:60{text}"
         )
         self.option("--audiogram", ear, help_, default, group=group)
@@ -230,7 +243,7 @@ def checked_type(
 
 
 def _read_ear(text: str) -> TypedEar:
-    """Return the name of a standard ear, eight levels, or a dictionary of levels by frequency."""
+    """Return the name of a standard ear, eight levels, or a dictionary of frequencies and levels."""
     if text.upper() in STANDARD_EARS:
         return text.upper()
     parts = re.split(r"[,\s]+", text.strip())
@@ -268,7 +281,7 @@ count_or_zero = checked_type(int, lambda value: value >= 0, "a whole number, 0 o
 ear = checked_type(
     _read_ear,
     _is_ear,
-    f"{', '.join(STANDARD_EARS)}, eight levels from -10 to 120 dB HL, or levels by frequency in Hz "
+    f"{', '.join(STANDARD_EARS)}, eight levels from -10 to 120 dB HL, or frequencies in Hz with levels "
     "such as 500:30,1000:40,4000:60",
 )
 plugin_name = checked_type(

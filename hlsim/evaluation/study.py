@@ -238,7 +238,7 @@ def run_study(
         items: Items, or sources that load them.
         conditions: Conditions that process each item.
         measures: Measures that score each output.
-        store: Scores of earlier runs, to which new ones are added. A score is computed again only
+        store: Scores of earlier runs, to which new scores are added. A score is computed again only
             if samples, ear, condition or measure have changed.
         jobs: Number of processes; all cores by default.
         dask: Address of a Dask scheduler, whose workers replace the processes.

@@ -284,7 +284,7 @@ def _envelope_step(rate_divisor: int) -> float:
 
 
 def _count_channels(bank: FilterBank, highest: float) -> int:
-    """Count the channels, where all that are far above the highest frequency count as one."""
+    """Count the channels, where all channels far above the highest frequency make one."""
     limit = _MERGED_ABOVE * highest
     return min(bank.channels, 1 + sum(hz <= limit for hz in bank.centre_frequencies))
 

@@ -67,10 +67,11 @@ def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
 
 
 def _conditions_table(evaluation: Evaluation) -> Table:
-    """Return a table with mean scores and look-ahead of each condition.
+    """Return a table with one row per condition.
 
-    Only pairs of scene and listener count for which all conditions have scores. A condition without
-    any score is ignored in this respect.
+    The columns are mean scores, the level of the output, the look-ahead in ms, and whether this is
+    within the rule of the Clarity challenge. Only those pairs of scene and listener are used for
+    which all conditions have scores, except conditions that have no score at all.
     """
     evaluation = _add_combined(evaluation)
     combined = evaluation.wide("combined").dropna(axis=1, how="all")

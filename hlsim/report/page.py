@@ -52,11 +52,11 @@ class Table:
     def from_rows(
         cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False
     ) -> Table:
-        """Return the table of rows by title, without columns that are "n/a" in all rows.
+        """Return the table of these rows, without columns that are "n/a" in all rows.
 
         Args:
             caption: Caption.
-            rows: Texts by the title of their column, the same titles in each row.
+            rows: Texts, each under the title of its column, with the same titles in each row.
             folded: Whether a page shows only the caption until a reader opens the table.
         """
         titles = rows[0] if rows else ()

@@ -171,7 +171,12 @@ def loss_name(severity: str) -> str:
 
 
 def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparisons") -> Table:
-    """Return a table with one row per comparison, with the p values that the sentences state.
+    """Return a table with one row per comparison of two conditions by one measure.
+
+    The columns are the measure with the two conditions, the change of the output level in dB, the
+    number of pairs n, the means under both conditions, their change with its 95 % interval, the
+    t-test, Wilcoxon's test, and Cohen's d. The p values are those of the sentences on the page:
+    adjusted by Holm's method unless the comparison was planned.
 
     >>> import pandas
     >>> from hlsim.evaluation import compare
@@ -329,7 +334,11 @@ def score_details(
 
 
 def _items_table(evaluation: Evaluation, caption: str) -> Table:
-    """Return a table with scores and level of every item under every condition."""
+    """Return a table with one row per item.
+
+    The columns are the name and the degree of loss, and each score and the output level in dB SPL
+    under each condition.
+    """
     facts = evaluation.table.drop_duplicates("item").set_index("item")
     columns = {"Item": facts["name"], "Loss": facts["severity"]}
     formats = {**dict.fromkeys(evaluation.scores, ".3f"), "level": ".1f"}
