@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 TypedEar = str | tuple[float, ...] | dict[float, float]
-"""An ear of a command line: its name, its eight levels, or the level at each of some frequencies."""
+"""An ear of a command line: its name, its eight levels, or frequencies with levels."""
 
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
 """Names of the standard ears, as in ``hlsim.audiogram``."""
@@ -243,7 +243,7 @@ def checked_type(
 
 
 def _read_ear(text: str) -> TypedEar:
-    """Return the name of a standard ear, eight levels, or a dictionary of frequencies and levels."""
+    """Return the name of a standard ear, eight levels, or frequencies with their levels."""
     if text.upper() in STANDARD_EARS:
         return text.upper()
     parts = re.split(r"[,\s]+", text.strip())
@@ -281,8 +281,8 @@ count_or_zero = checked_type(int, lambda value: value >= 0, "a whole number, 0 o
 ear = checked_type(
     _read_ear,
     _is_ear,
-    f"{', '.join(STANDARD_EARS)}, eight levels from -10 to 120 dB HL, or frequencies in Hz with levels "
-    "such as 500:30,1000:40,4000:60",
+    f"{', '.join(STANDARD_EARS)}, eight levels from -10 to 120 dB HL, or frequencies in Hz with "
+    "levels such as 500:30,1000:40,4000:60",
 )
 plugin_name = checked_type(
     str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name or path/to/file.py:name"
