@@ -177,7 +177,7 @@ def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHE
     if not accepted or int(sample_rate) != sample_rate:
         raise ValueError(
             f"expected a sample rate that is a whole number from {lowest} to {highest} Hz, got "
-            f"{describe(sample_rate)}; resample the signal"
+            f"{describe(sample_rate)}; use signals at such a rate"
         )
     return int(sample_rate)
 

@@ -143,7 +143,10 @@ REJECTED: dict[str, tuple[Callable[[Path], object], str]] = {
     "rate as text": (lambda path: hlsim.load_audio(path, sample_rate="16000"), r"'16000' \(str\)"),
     "rate of 0": (lambda path: hlsim.load_audio(path, sample_rate=0), "got 0"),
     "rate of a telephone": (lambda path: hlsim.load_audio(path, sample_rate=8000), "from 16000"),
-    "broken rate": (lambda _: resample(SPEECH, 16000, 22050.5), "whole number, got 22050.5"),
+    "broken rate": (
+        lambda _: resample(SPEECH, 16000, 22050.5),
+        "whole number from 1 to 1000000 Hz, got 22050.5",
+    ),
     "negative rate": (lambda _: resample(SPEECH, 16000, -8000), "got -8000"),
     "rate of a simulator as text": (
         lambda _: hlsim.simulate(SPEECH, "N3", sample_rate="16000"),

@@ -225,7 +225,7 @@ class _GradientLimiter(torch.autograd.Function):
         limit = usual * torch.where(sounding, MAX_GRADIENT_RATIO, 1.0)
         factor = (limit / sizes.amax(-1)).clamp_max(1.0)
 
-        # The factors go linearly from edge to edge, where the smaller one of both blocks holds.
+        # Factors are linear between the edges of blocks, where the smaller one of both holds.
         before = functional.pad(factor, (1, 0), value=1.0)
         after = functional.pad(factor, (0, 1), value=1.0)
         edges = torch.minimum(before, after)
