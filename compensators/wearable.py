@@ -287,12 +287,12 @@ class Wearable(MeasuredAid):
         return batch, self.fit(flatten_items(thresholds, batch, dtype))
 
     def stack_sliders(self, sliders: Sequence[Slider], batch: torch.Size, like: Tensor) -> Tensor:
-        """Convert the sliders of a call to one row per item.
+        """Stack the values of the sliders, such as noise reduction, to one row per item.
 
         Args:
             sliders: Value of each slider in the order of ``SLIDERS``.
-            batch: Leading dimensions of the call.
-            like: Tensor whose type and device the result has.
+            batch: Leading dimensions of the signals and ears.
+            like: Tensor whose dtype and device the result has.
 
         Returns: Values from 0 to 1, (items, sliders).
 

@@ -114,6 +114,8 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
 def dbfs(waveform: Tensor) -> Tensor:
     """Compute the RMS level of waveforms in dB relative to RMS 1.0.
 
+    A sine with a peak of 1.0 has -3 dB. Silence has -200 dB.
+
     Shape: (..., time) -> (...).
 
     Args:

@@ -119,11 +119,13 @@ def read_checkpoint(
 def find_checkpoint(
     name: str | Path, kinds: Collection[str] | None = None, other_names: Sequence[str] = ()
 ) -> Path:
-    """Return the folder of a checkpoint.
+    """Return the folder of a checkpoint of any kind.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
-        kinds: Kinds of checkpoints that the error message suggests; all by default.
+        name: Folder of a checkpoint or, if there is no such folder, the name of a checkpoint that
+            ships with hlsim.
+        kinds: Kinds of checkpoints that the error message suggests; all by default. Only the
+            message depends on them.
         other_names: Names that the error message suggests in addition.
 
     Raises:

@@ -219,7 +219,8 @@ def check_waveform(
         peak = max(-float(low), float(high))
         if highest < peak < math.inf:
             raise ValueError(
-                f"expected samples of {name} up to {highest:g}, got {peak:.3g}; scale it to pascals"
+                f"expected samples of {name} up to {highest:g}, got a peak of {peak:.3g}; scale "
+                f"{name} to pascals, for example with hlsim.load_audio"
             )
         if full_scale_spl is not None:
             _warn_if_loud(waveform, name, peak, full_scale_spl)

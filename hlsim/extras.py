@@ -21,7 +21,7 @@ def require(module: str, extra: str) -> ModuleType:
 
     Args:
         module: Dotted module name, e.g. ``"matplotlib.figure"``.
-        extra: hlsim's extra that installs it, e.g. ``"eval"``.
+        extra: Optional extra of hlsim that installs it, e.g. ``"eval"`` as in ``hlsim[eval]``.
 
     Raises:
         MissingExtraError: The module, or one that it imports, is not installed.

@@ -23,7 +23,7 @@ WRITTEN_EXTENSIONS = (".wav", ".flac", ".ogg")
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Write a file or folder all at once: a ``with`` block writes to a temporary path instead.
+    """Write a file or folder all at once, from a ``with`` block that writes to a temporary path.
 
     When the block ends, the temporary file or folder replaces ``path``. If the block raises,
     ``path`` stays as it was.

@@ -133,10 +133,11 @@ class Live:
 
 
 class SimulatedStream:
-    """Simulator for a signal that arrives in chunks: a function from a chunk to the next output.
+    """Simulator for a signal that arrives in chunks.
 
-    The output has as many samples as the chunk. It is delayed by the simulator's look-ahead, so
-    that it depends on past input only.
+    Call it with each chunk in turn; it returns as many samples of what is perceived. This output is
+    delayed by the simulator's look-ahead, so that it depends on past input only. Its first
+    ``latency`` samples belong to the silence before the first chunk.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz with a finite receptive field, such as ``neuro-msbg``.
@@ -144,10 +145,10 @@ class SimulatedStream:
 
     Attributes:
         latency: Delay of the output in samples.
-        block: Number of samples of which the length of every chunk is a multiple.
+        block: Every chunk must be a multiple of this many samples long.
 
     Raises:
-        ValueError: The simulator is no such network.
+        ValueError: The simulator is not a Neuro-MSBG at 16 kHz with a finite receptive field.
 
     >>> import hlsim
     >>> stream = SimulatedStream(hlsim.load_pretrained("neuro-msbg"), Audiogram.standard("N3"))

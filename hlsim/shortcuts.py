@@ -39,10 +39,10 @@ def load_audio(
 
     Args:
         path: A file that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
-        spl: RMS level in dB SPL to which the recording is scaled, with one gain for all channels.
-            ``None`` keeps the samples as they are in the file.
-        sample_rate: Rate in Hz to which the recording is resampled, 16000 to 48000; by default its
-            own.
+        spl: RMS level over all channels in dB SPL to which the recording is scaled, with one gain.
+            ``None`` takes the file's samples as pascals already.
+        sample_rate: Rate in Hz to which the recording is resampled, 16000 to 48000; by default the
+            file's rate.
 
     Returns:
         Samples in pascals, ``(time,)`` for a mono file and ``(channels, time)`` otherwise, and

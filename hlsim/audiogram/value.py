@@ -172,7 +172,7 @@ class Audiogram:
 
     @property
     def severity(self) -> str:
-        """Severity of the loss: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
+        """Degree of hearing loss: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
 
         It follows from the mean of the levels that were measured from 2 to 8 kHz, and is none if
         there is no such level, as in pyclarity.
@@ -305,9 +305,10 @@ class Audiogram:
 
 
 def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -> Tensor:
-    """Compute the severity of the loss of each ear: 0 none, 1 mild, 2 moderate, 3 severe.
+    """Compute the degree of hearing loss of each ear: 0 none, 1 mild, 2 moderate, 3 severe.
 
-    It follows from the mean threshold from 2 to 8 kHz, as in pyclarity.
+    The mean threshold from 2 to 8 kHz decides, as in pyclarity: a loss is mild above 15 dB HL,
+    moderate above 35 dB HL and severe above 56 dB HL.
 
     Shape: (..., frequencies) -> int64 (...), indices into ``SEVERITIES``.
 

@@ -88,9 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make_parser() -> Parser:
-    """Make the parser of the program, which has one parser per command.
+    """Make the parser of the ``hlsim`` command line, which has one parser per command.
 
-    A command declares its options when it is used, so that other commands need not be imported.
+    A command declares its options when it is invoked, so that other commands need not be imported.
     """
     lines = []
     for group, commands in GROUPS.items():

@@ -116,7 +116,7 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
-        """Declare an option without a value, which is True if it is used and otherwise False.
+        """Declare an option without a value, which is True if a user gives it and otherwise False.
 
         Args:
             name: Name, such as ``--json``.
@@ -224,12 +224,14 @@ def checked_type(
 ) -> Callable[[str], Any]:
     """Make a function that converts the text of an option to a value and validates it.
 
-    argparse turns its ``ArgumentTypeError`` into an error of one line.
-
     Args:
-        read: Function that converts the text; it raises ValueError for text of another form.
+        read: Function that converts the text; it raises ValueError for text that it cannot convert.
         accepts: Function that returns whether a value is valid.
         expected: Description of valid values, for the error message.
+
+    Returns:
+        Function from a text to its value. For an invalid text it raises ``ArgumentTypeError``,
+        which argparse reports as an error of one line.
     """
 
     def read_value(text: str) -> Any:

@@ -85,14 +85,14 @@ def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
 
 
 def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
-    """Filter signals block by block, which takes a quarter of the time of one Fourier transform.
+    """Filter signals block by block, four times as fast as by one transform of the whole signal.
 
     Shape: (..., time), (2049,) -> (..., length).
 
     Args:
         waveform: Signals.
-        response: Frequency response of the filter: the transform of its coefficients, at most 1025,
-            by ``rfft`` with ``BLOCK_POINTS`` (4096) points.
+        response: Frequency response of the filter, ``rfft(coefficients, 4096)`` of at most 1025
+            coefficients. The 4096 points are ``BLOCK_POINTS``.
         length: Number of samples to return.
 
     >>> delay_by_one = torch.fft.rfft(torch.tensor([0.0, 1.0]), BLOCK_POINTS)

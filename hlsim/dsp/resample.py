@@ -67,8 +67,9 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 
     Raises:
         TypeError: The samples are integers or complex.
-        ValueError: A rate is not a whole number from 1 to 1000000 Hz, or the common factor of the
-            rates is so small that the kernel would take gigabytes, as for 44101 and 16000 Hz.
+        ValueError: A rate is not a whole number from 1 to 1000000 Hz, or the greatest common
+            divisor of the rates is so small that the kernel would take gigabytes, as for
+            44101 and 16000 Hz.
 
     >>> resample(torch.randn(2, 44100), 44100, 16000).shape
     torch.Size([2, 16000])
@@ -85,8 +86,9 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     source, target = source_rate // common, target_rate // common
     if source * target > MAX_KERNEL_VALUES:
         raise ValueError(
-            f"cannot resample from {source_rate} to {target_rate} Hz: their common factor, {common}"
-            ", is too small; choose rates such as 16000, 22050, 24000, 32000, 44100 and 48000"
+            f"cannot resample from {source_rate} to {target_rate} Hz: their greatest common "
+            f"divisor, {common}, is too small; choose rates such as 16000, 22050, 24000, "
+            "32000, 44100 and 48000"
         )
     kernel = compute_once(sinc_kernel, source, target, waveform.dtype, waveform.device)
 
@@ -107,8 +109,8 @@ def sinc_kernel(source: int, target: int, dtype: torch.dtype, device: torch.devi
     each of these output samples.
 
     Args:
-        source: Source rate divided by the common factor of both rates.
-        target: Target rate divided by the common factor of both rates.
+        source: Source rate divided by the greatest common divisor of both rates.
+        target: Target rate divided by the greatest common divisor of both rates.
         dtype: Type of the result. The filters are computed in float32 at least.
         device: Device of the result.
 

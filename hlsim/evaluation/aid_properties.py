@@ -67,10 +67,11 @@ def measure_aids(
         ears: Audiograms, each under its name.
         measure: Function ``(aid, ear, *arguments) -> dictionary``, such as
             ``measure_steady_tones``.
-        arguments: Further arguments of this function.
+        arguments: Arguments of ``measure`` after aid and ear.
 
     Returns:
-        One dictionary per ear and aid: the names ``aid`` and ``ear``, and the values.
+        One dictionary per ear and aid: the names ``aid`` and ``ear``, and the values. The order is
+        that of ``ears`` and, for each ear, that of ``aids``.
 
     Raises:
         ValueError: An aid fails; the message names aid and ear.
@@ -259,12 +260,13 @@ def measure_look_ahead(
     other: Tensor,
     positions: Iterable[int],
 ) -> int:
-    """Return by how many samples an aid's output changes before its input becomes another sound.
+    """Return how many samples ahead of its input an aid's output depends on.
 
-    A change is a difference of more than 1e-4 of the output's peak.
+    From a position on, another sound replaces the input. The result is how many samples before this
+    position the output changes, by more than 1e-4 of its peak.
 
     Args:
-        aid: Hearing aid for one ear, or a pair of them.
+        aid: Function (signal, ear) -> output: a hearing aid for one ear, or aids for both ears.
         ear: The audiogram, or the ``Listener`` of a pair.
         signal: First sound. Shape: (..., time).
         other: Second sound. Shape: (..., time).

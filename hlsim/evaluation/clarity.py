@@ -420,7 +420,7 @@ def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Te
     waveform, file_rate = read_audio(path)
     if file_rate != rate or len(waveform) not in numbers:
         raise ValueError(
-            f"{path}: expected {' or '.join(map(str, numbers))} channels at the sample rate of the "
-            f"first scene, {rate} Hz, got {len(waveform)} channels at {file_rate} Hz"
+            f"{path} has {len(waveform)} channels at {file_rate} Hz; expected "
+            f"{' or '.join(map(str, numbers))} channels at {rate} Hz, as in the first scene"
         )
     return waveform

@@ -293,7 +293,7 @@ def _compare_units(
 
 
 def format_p(p: float) -> str:
-    """Return a p value as reports state it, with five decimals.
+    """Return a p value as reports state it: with five decimals, or as ``p < 0.00001``.
 
     >>> format_p(0.0125)
     'p = 0.01250'

@@ -123,7 +123,7 @@ class Evaluation:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions of the packages on which the values depend."""
+        """Installed versions of hlsim, of SciPy and of the packages that the measures use."""
         packages = [package for measure in self.measures for package in measure.packages]
         return installed_versions(["hlsim", *packages, "scipy"])
 

@@ -75,8 +75,8 @@ def content_hash(path: str | Path) -> str:
     Raises:
         ValueError: The file cannot be read.
 
-    >>> content_hash(__file__) == content_hash(__file__)
-    True
+    >>> len(content_hash(__file__))
+    64
     """
     try:
         return sha256(Path(path))

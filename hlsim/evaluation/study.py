@@ -349,7 +349,9 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     """Process an item, and cut the item and its output to the shorter length."""
     output = condition.output(item)
     if not output.isfinite().all():
-        raise ValueError("expected finite samples of the output, got NaN or infinite ones")
+        raise ValueError(
+            f"expected finite samples of the output of {condition.name}, got NaN or infinity"
+        )
     lengths = item.clean.shape[-1], output.shape[-1]
     samples = common_length(lengths, item.sample_rate, (item.name, f"its output {condition.name}"))
     if samples < lengths[0]:

@@ -73,16 +73,17 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
 def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tensor:
     """Compute by how many dB the band levels of perceived speech differ from those of a normal ear.
 
-    This is a mean of absolute differences, weighted by the audibility of the bands. A gain of g dB
-    costs ``abs(g)``. The perceived level has no floor. With one, such as a threshold of hearing, a
-    band that the impaired ear misses altogether would have no gradient, and no compensator would
-    learn to restore it.
+    This is a weighted mean of absolute differences over frames and bands. A gain of g dB costs
+    ``abs(g)``. Perceived levels are not raised to the threshold of hearing: otherwise, a band that
+    the impaired ear misses altogether would have no gradient, and no compensator would learn to
+    restore it.
 
-    The weight of a band is its audibility for a normal ear, or that of the perceived signal if it
-    is higher: noise that fills a pause is an error, too. Such an error counts down to 40 dB below
-    audibility. The weights carry no gradient.
+    The weight of a band in a frame is its audibility for a normal ear, 0 to 1, or that of the
+    perceived signal if it is higher: noise that fills a pause is an error, too. The level with
+    which such noise is compared is never lower than 40 dB below the threshold of audibility. The
+    weights carry no gradient.
 
-    Shape: (..., time) twice -> (...).
+    Shape: (..., time), (..., time) -> (...).
 
     Args:
         perceived: Speech that the impaired ear perceives, in pascals.

@@ -57,10 +57,11 @@ def check_criterion(criterion: Any) -> dict[str, Any]:
 def combine_weights(
     weights: Mapping[str, float] | None, criteria: Mapping[str, Any]
 ) -> dict[str, float]:
-    """Compute the weight of each part of a loss: its own weight times that of its criterion.
+    """Multiply the weight of each part of a loss by the weight of its criterion.
 
     Args:
-        weights: Weight under each part's name; the defaults of the criteria if None.
+        weights: Weight under each part's name; parts that it lacks are left out of the loss. None
+            stands for the default weights of the criteria.
         criteria: Criteria with their weights, from ``check_criterion``.
 
     Returns:
@@ -109,7 +110,10 @@ def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 
     Args:
         parts: Parts, each under its name, all with the same shape.
-        weights: Weights, each under the name of its part. Parts without a weight are ignored.
+        weights: Weights, each under the name of its part. Parts without a weight are left out.
+
+    Returns:
+        The sum, with the shape of one part.
 
     >>> weighted_sum({"time": torch.tensor(2.0), "phase": torch.tensor(1.0)}, {"time": 0.5})
     tensor(1.)

@@ -195,8 +195,9 @@ class FrozenSimulator:
             fft: Length of the transform.
 
         Returns:
-            Number of frequencies from 0 Hz up to 7500 Hz; ``None``, for all of them, if the output
-            of the simulator reaches half the sample rate.
+            Number of frequencies from 0 Hz up to 7500 Hz if the output of the simulator ends below
+            half the loss's sample rate, as that of Neuro-MSBG does at 8 kHz for rates above 16 kHz;
+            otherwise ``None``, for all of them.
         """
         return int(HIGHEST * fft / self.sample_rate) + 1 if self._limits_band else None
 

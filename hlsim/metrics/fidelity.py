@@ -306,7 +306,8 @@ def _as_equal_length(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndar
     y = _as_array(second)
     if x.ndim != 1 or x.shape != y.shape or not len(x):
         raise ValueError(
-            f"expected two signals of one shape (time,), got shapes {x.shape} and {y.shape}"
+            "expected two one-dimensional signals of equal length, not empty, got shapes "
+            f"{x.shape} and {y.shape}"
         )
     return x, y
 

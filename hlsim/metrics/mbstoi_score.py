@@ -160,8 +160,10 @@ def _check_values(signals: Tensor) -> None:
     clean_left, clean_right, left, right, is_sounding = torch.cat((finite, sounding[None])).tolist()
     if not (left and right):
         raise ValueError("processed holds samples that are NaN or infinite")
-    if not (clean_left and clean_right and is_sounding):
-        raise ValueError("clean is silent, or holds samples that are NaN or infinite")
+    if not (clean_left and clean_right):
+        raise ValueError("clean holds samples that are NaN or infinite")
+    if not is_sounding:
+        raise ValueError("clean is silent at both ears")
 
 
 def _resample_items(signals: Tensor, ends: list[int], rate: int) -> tuple[Tensor, Extent]:

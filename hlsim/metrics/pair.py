@@ -154,5 +154,7 @@ def item_seeds(seed: int | Sequence[int], items: int) -> list[int]:
     except TypeError:  # neither a sequence nor a tensor with elements
         seeds = [seed] * items
     if len(seeds) != items:
-        raise ValueError(f"expected one seed or {items}, one for each item, got {len(seeds)}")
+        raise ValueError(
+            f"expected one seed or one for each of the {items} items, got {len(seeds)} seeds"
+        )
     return [check_seed(value) for value in seeds]

@@ -64,12 +64,15 @@ class Curve(NamedTuple):
 class WordsChange(NamedTuple):
     """Proportion of words that a new listener understands with a first and with a second aid.
 
+    ``words_change`` predicts it from HASPI.
+
     Attributes:
         before: Mean proportion with the first aid, 0 to 1.
         after: Mean proportion with the second aid, 0 to 1.
-        change: Mean of the change from the first to the second aid over listeners.
-        low: Lower end of the interval of the change.
-        high: Upper end of the interval of the change.
+        change: ``after`` minus ``before``.
+        low: Lower end of the interval in which the change of a new listener lies with a probability
+            of 90 %, or of the ``interval`` that was passed.
+        high: Upper end of this interval.
 
     >>> WordsChange(0.5, 0.7, 0.2, -0.1, 0.5).change
     0.2

@@ -38,7 +38,7 @@ class FilterBank:
 
     @property
     def channels(self) -> int:
-        """Number of channels."""
+        """Number of band-pass filters."""
         return len(self.centre_frequencies)
 
     @property

@@ -54,7 +54,8 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     """Compute how many dB the perceived level in each channel changes per dB of input.
 
     The channels are the bands of a filter bank. This expansion ratio is 105 / (105 - threshold),
-    where 105 dB SPL is the level at which an impaired ear perceives sounds as loud as a normal one.
+    where 105 dB SPL is the level at which a sound is as loud for an impaired ear as for a normal
+    ear. Thresholds must be below 105 dB HL; simulators accept at most 100 dB HL.
 
     Shape: (..., frequencies), (frequencies, channels) -> (..., channels).
 

@@ -83,13 +83,13 @@ class SequencePath(nn.Module):
 
 
 class BidirectionalMamba(nn.Module):
-    """Two Mamba layers, one of which runs backwards, and whose outputs are concatenated.
+    """Two Mamba layers, one for each direction of a sequence, with concatenated outputs.
 
     Shape: (sequences, length, channels) -> (sequences, length, 2 * channels).
 
     Args:
         channels: Number of channels of the input.
-        states: Number of states, values that remember the past, per inner channel.
+        states: State size of the recursion per inner channel.
         expansion: Number of inner channels relative to ``channels``.
 
     >>> BidirectionalMamba(8, states=4, expansion=2)(torch.randn(3, 20, 8)).shape
@@ -106,7 +106,7 @@ class BidirectionalMamba(nn.Module):
 
 
 class BidirectionalLSTM(nn.Module):
-    """An LSTM that runs forwards and backwards, and whose outputs are concatenated.
+    """An LSTM that runs forwards and backwards, with concatenated outputs.
 
     Shape: (sequences, length, channels) -> (sequences, length, 2 * hidden).
 

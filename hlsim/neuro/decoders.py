@@ -116,14 +116,17 @@ class PhaseDecoder(Decoder):
         super().__init__(channels, depth, stride, 2, normalise)
 
     def factor(self, features: Tensor, size: tuple[int, int], log_gain: Tensor) -> Tensor:
-        """Decode the shift, and return the complex factor exp(log gain + j shift).
+        """Compute the complex factor by which the network multiplies the input's spectrogram.
+
+        The factor is exp(log gain + j shift), with the decoded phase shift in radians.
 
         Shape: (items, channels, time / stride[0], frequency / stride[1]), (items, time, frequency)
             -> complex (items, time, frequency).
 
         Args:
             features: Feature maps.
-            size: Number of frames and frequencies of the spectrogram.
+            size: Number of frames and frequencies of the spectrogram, to which the decoded values
+                are cut.
             log_gain: Natural logarithm of the factor's magnitude.
         """
         # Autocast may return maps of lower precision than that of the weights.

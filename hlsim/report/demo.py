@@ -50,14 +50,17 @@ def demo_page(
     perceived: Mapping[str, Sequence[Tensor]],
     sentence: str = "",
 ) -> Page:
-    """Return the page of the demo: three numbers, verdict, sounds, pictures, details.
+    """Return the page of ``hlsim demo``: verdict, sounds, pictures, details and three numbers.
+
+    The numbers are HASPI, the share of words understood and the error of loudness.
 
     Args:
-        evaluation: Study of the demo's conditions, with the detail ``gain_curves``.
+        evaluation: Study of the demo's conditions. Its ``details`` hold the gains of the aids under
+            ``gain_curves``.
         ear_name: Name of the ear, for the title.
         outputs: Outputs of the aid for each item in pascals, by condition. Shape of each: (time,).
         perceived: The same outputs as the ear perceives them, by condition.
-        sentence: Words of the last item, which is played.
+        sentence: Transcript of the last item, which is played.
     """
     headline = evaluation.headline
     assert headline is not None

@@ -129,7 +129,9 @@ class Sound:
 
 @dataclass(frozen=True)
 class Player:
-    """A player with which a reader switches between sounds at the same position.
+    """A player with which a reader of a page compares sounds, such as outputs of hearing aids.
+
+    Another sound continues at the same position.
 
     Attributes:
         groups: Sounds by the heading of their group, which may be empty. The sounds of a group are
@@ -154,7 +156,7 @@ class Player:
         return [sound for group in self.groups.values() for sound in group]
 
     def html(self) -> str:
-        """Return the player with its style and script, to be shown by a notebook."""
+        """Return the player as HTML for a notebook, with its sounds, style and script embedded."""
         return _render("fragment.html", player=self)
 
 

@@ -22,7 +22,9 @@ from hlsim.report.results import (
 
 
 def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) -> Path:
-    """Write the page of an evaluation as ``report.html`` and ``report.md``, and ``report.json``.
+    """Write three files: ``report.html``, a page; ``report.md``, its text; and ``report.json``.
+
+    The last one contains the settings, comparisons and scores, see ``Evaluation.to_dict``.
 
     Args:
         evaluation: Evaluation of ``haspi_report``.

@@ -252,6 +252,11 @@ class _SimulatorBatches(_RandomBatches):
 class CompensatorBatches(_RandomBatches):
     """Data set of random batches for a compensator: clean or noisy speech, tones and clicks.
 
+    Its index is a ``Step``, the number of the training step. An entry is a batch, a dictionary:
+    ``clean`` is the reference and ``signal`` the input of the aid, both in pascals with shape
+    (items, time); ``thresholds`` are the ears in dB HL. For tones and clicks, both signals are the
+    same.
+
     Args:
         recipe: Settings of the training.
         data: Speech, noise and ears.
@@ -318,12 +323,15 @@ def _babble(voices: Tensor) -> Tensor:
 def simulator_data(
     data: TrainingData, recipe: SimulatorRecipe, plugin: PluginTeacher | None = None
 ) -> BatchData:
-    """Make the data module from which a simulator learns.
+    """Make the Lightning data module with the batches for the training of a Neuro-MSBG.
 
     Args:
         data: Speech, noise and ears.
         recipe: Settings of the training.
-        plugin: Teacher that replaces the exact MSBG.
+        plugin: Simulator that replaces the exact MSBG as the teacher, whose output is learnt.
+
+    Returns:
+        Batches for training and validation, with the teacher.
 
     Raises:
         ValueError: Files are missing or invalid.
@@ -344,12 +352,15 @@ def simulator_data(
 def compensator_data(
     data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
 ) -> BatchData:
-    """Make the data module from which a compensator learns.
+    """Make the Lightning data module with the batches for the training of a compensator.
 
     Args:
         data: Speech, noise and ears.
         recipe: Settings of the training.
         ear: Ear of a personal compensator; None for a general one.
+
+    Returns:
+        Batches for training and validation.
 
     Raises:
         ValueError: Files are missing or invalid, or the recipe requires noise and there is none.

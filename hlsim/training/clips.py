@@ -118,7 +118,9 @@ class Clips:
         return torch.nn.functional.pad(clip, (0, self.samples - len(clip)))
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw random clips that are not silent.
+        """Draw clips at random positions of random recordings, and redraw silent clips.
+
+        A clip is silent if its RMS is at least 70 dB below the peak of its recording.
 
         Args:
             count: Number of clips.
@@ -128,7 +130,7 @@ class Clips:
             Clips with shape (count, time).
 
         Raises:
-            ValueError: 10,000 draws in a row gave no clip.
+            ValueError: 10,000 draws in a row gave only silent clips and files that cannot be used.
         """
         clips: list[Tensor] = []
         failures = 0

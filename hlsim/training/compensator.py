@@ -112,7 +112,7 @@ def train_compensator(
     simulator: Simulator = "neuro-msbg",
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a compensator, or resume its training, and save the one with the best validation.
+    """Train a compensator, or resume its training, and save its state with the best validation.
 
     Args:
         data: Speech, noise and ears for training and validation.

@@ -26,21 +26,20 @@ def draw_sounds(
 ) -> Tensor:
     """Draw sounds that are not speech, without a calibrated level.
 
-    The first and every second item after it has one to four steady tones, which rise over 10 ms at
-    a random time in the first half of the item. The other items have one to eight clicks of one
-    sample.
+    Items 0, 2, 4 and so on have one to four steady tones, which rise over 10 ms at a random time in
+    the first half of the item. The other items have one to eight clicks of one sample.
 
-    Half of the tones have multiples of 250 Hz, like those of audiometry. Such a tone has the same
-    phase in every frame of a Fourier transform whose frames are 4 or 8 ms apart. At random
-    frequencies, that does not happen.
+    The frequency of about half of the tones is a multiple of 250 Hz, as in audiometry. Such a tone
+    has a whole number of periods in 4 or 8 ms, so that it has the same phase in every frame of a
+    Fourier transform with this hop. A tone of random frequency does not.
 
     Args:
         items: Number of sounds.
         samples: Length of each sound in samples.
         sample_rate: Sample rate in Hz.
         generator: Source of the random numbers.
-        early_share: Longest time before the start of an item at which its tones may begin,
-            relative to half the item. With 1.0, half of the tones sound from the first sample on.
+        early_share: Longest time before the first sample at which a tone may begin, relative to
+            half the length of the item. With 0, no tone begins early.
 
     Returns:
         Sounds with shape (items, samples).

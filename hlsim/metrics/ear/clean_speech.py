@@ -210,8 +210,8 @@ class CleanSpeech:
         """Return the thresholds of the ear that hears each item.
 
         Args:
-            audiogram: One ear, or one for each item.
-            host: Return them on the CPU. The host waits for ears that lie on a GPU.
+            audiogram: One ear, or one for each item; None raises ValueError.
+            host: Return the thresholds on the CPU, even if this must wait for a GPU.
 
         Returns:
             Thresholds. Shape: (items, 8) dB HL.

@@ -24,7 +24,7 @@ def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
         device: Device of the tensor.
 
     Returns:
-        The integers, int64. Shape: (number of values,).
+        The integers, int64, which must not be changed in place. Shape: (number of values,).
 
     >>> integers((3, 5), torch.device("cpu"))
     tensor([3, 5])
@@ -84,7 +84,7 @@ class Extent:
         return torch.where(inside, signal, 0.0)
 
     def mean(self, signal: Tensor) -> Tensor:
-        """Return the mean of each item over its own samples.
+        """Return the mean of each item over its length without the padding.
 
         Shape: (items, ..., time) -> (items, ...).
         """

@@ -224,6 +224,9 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
         utterances: Rows of a manifest.
         share: Share of the training speakers to move. At least one is moved.
 
+    Returns:
+        New rows in the same order; the rows that were passed do not change.
+
     Raises:
         ValueError: There is a validation split already, a speaker is unknown, or no training
             speaker would remain.
