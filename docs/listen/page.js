@@ -331,7 +331,7 @@ showEar();
 chart.addEventListener("change", changeEar);
 addEventListener("keydown", (event) => {
   const name = Object.keys(VERSIONS)[Number(event.key) - 1];
-  const typing = event.target.closest?.("input, select") || event.ctrlKey || event.altKey || event.metaKey;
+  const typing = event.target.closest?.("input") || event.ctrlKey || event.altKey || event.metaKey;
   if (name !== undefined && !typing) press(name);
 });
 addEventListener("hashchange", () => {

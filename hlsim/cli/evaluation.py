@@ -266,7 +266,7 @@ def _arguments(options: argparse.Namespace, evaluate: Callable[..., Evaluation])
         "measures": [*getattr(options, "measures", []), *options.own_measures],
         "store": options.out / "scores.jsonl",
     }
-    running = {"jobs": options.jobs, "dask": options.dask, "progress": show_progress("values")}
+    running = {"jobs": options.jobs, "dask": options.dask, "progress": show_progress("scores")}
     return {name: values[name] for name in parameters if name in values} | running
 
 

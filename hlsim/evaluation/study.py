@@ -350,7 +350,7 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     output = condition.output(item)
     if not output.isfinite().all():
         raise ValueError(
-            f"expected finite samples of the output of {condition.name}, got NaN or infinity"
+            f"expected finite samples of the output of {condition.name}, got NaN or infinite ones"
         )
     lengths = item.clean.shape[-1], output.shape[-1]
     samples = common_length(lengths, item.sample_rate, (item.name, f"its output {condition.name}"))

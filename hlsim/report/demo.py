@@ -24,9 +24,6 @@ from hlsim.report.results import Columns, score_details, split_rows, statistic, 
 UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED = "unaided", "NAL-R", "NAL-R, same level", "trained aid"
 """Names of the demo's conditions."""
 
-_SOUND_NAMES = (UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED)
-_CURVE_NAMES = (UNAIDED, NAL_R, TRAINED)
-
 _COMPARISON = (
     "HASPI rewards any gain. The trained aid is therefore compared with NAL-R, the prescription "
     "that clinics know, amplified to the same output level. This comparison was planned before "
@@ -68,15 +65,11 @@ def demo_page(
     rate = items[0].sample_rate
     normal = [perceive(item.clean, NORMAL, rate) for item in items]
     pictures = _draw_pictures(evaluation, items[0].ear, outputs, {NORMAL_EAR: normal, **perceived})
+    last_perceived = {name: signals[-1] for name, signals in perceived.items()}
+    last_outputs = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
     groups = {
-        "Perceived by this ear, beside a normal ear": {
-            NORMAL_EAR: normal[-1],
-            **{name: perceived[name][-1] for name in _SOUND_NAMES},
-        },
-        "Output of the aids": {
-            "original speech": items[-1].clean,
-            **{name: outputs[name][-1] for name in _SOUND_NAMES[1:]},
-        },
+        "Perceived by this ear, beside a normal ear": {NORMAL_EAR: normal[-1], **last_perceived},
+        "Output of the aids": {"original speech": items[-1].clean, **last_outputs},
     }
     player = make_player(groups, rate, sentence)
     details = score_details(evaluation, [_COMPARISON], [result_table(evaluation)])
@@ -161,7 +154,7 @@ def _draw_pictures(
     colours = condition_colours(evaluation.conditions)
     gains = evaluation.details["gain_curves"]
     frequencies = gains[0]["frequencies"]
-    styles = {name: {"color": colours[name]} for name in _CURVE_NAMES}
+    styles = {name: {"color": colour} for name, colour in colours.items()}
     styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
     perceived_curves = {
         name: (frequencies, mean_band_levels(perceived[name]), style)

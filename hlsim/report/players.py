@@ -170,15 +170,14 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
     """
     level = float(level_spl(signal.flatten()))
     levels = spectrogram_levels(signal, sample_rate)
-    lowest = SPECTROGRAM_LEVELS[0]
-    is_empty = float((levels > lowest).float().mean()) < _EMPTY_SHARE
+    is_empty = float((levels > SPECTROGRAM_LEVELS[0]).float().mean()) < _EMPTY_SHARE
     return Sound(
         label,
         level,
         encode_flac(signal * (_PEAK / peak), sample_rate),
         loudness=level - _full_scale(peak),
         spectrogram=_spectrogram_png(levels),
-        note=f"almost nothing above {lowest:.0f} dB SPL" if is_empty else "",
+        note="almost silence" if is_empty else "",
     )
 
 

@@ -189,5 +189,5 @@ def test_command(
     printed = capsys.readouterr()
     assert printed.out.startswith("On clean speech, mine") and "report.html" in printed.out
     warning = "mine was trained for one ear, 55, 55, 55"
-    assert f"hlsim: warning: {warning}" in printed.err and "60 of 60 values" in printed.err
+    assert f"hlsim: warning: {warning}" in printed.err and "60 of 60 scores" in printed.err
     assert warning in (tmp_path / "out" / "report.md").read_text()

@@ -57,7 +57,7 @@ def test_spectrograms_have_one_scale_and_say_where_nothing_is_seen() -> None:
     expected = 255 * (80.0 - lowest) / (highest - lowest)
     assert loud.getpixel((frames // 2, row)) == pytest.approx(expected, abs=1)
     assert soft.getextrema() == (0, 0)
-    assert [sound.note for sound in player.sounds] == ["", "almost nothing above 0 dB SPL"]
+    assert [sound.note for sound in player.sounds] == ["", "almost silence"]
     palette = bytes(loud.getpalette())
     ends = "".join(f"#{palette[place : place + 3].hex()} " for place in (0, 3 * 255))
     assert ends.split() == [SPECTROGRAM_COLOURS[0], SPECTROGRAM_COLOURS[-1]]
