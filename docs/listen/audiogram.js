@@ -120,6 +120,7 @@ export class AudiogramChart extends EventTarget {
       element("circle", { class: "target", r: 22 }),
       element("circle", { class: "ring", r: 13 }),
       element("circle", { class: "dot", r: 8 }),
+      element("text", { class: "value", y: -20, "text-anchor": "middle" }),
     );
     point.addEventListener("keydown", (event) => this._key(event, index));
     this.svg.append(point);
@@ -186,6 +187,7 @@ export class AudiogramChart extends EventTarget {
       point.setAttribute("transform", `translate(${places[i]})`);
       point.setAttribute("aria-valuenow", level);
       point.setAttribute("aria-valuetext", `${level} decibels`);
+      point.querySelector(".value").textContent = `${level} dB HL`;
     });
   }
 }

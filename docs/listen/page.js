@@ -22,6 +22,7 @@ const VERSIONS = {
 const FIRST_EAR = "N3";
 const RECORDED_SECONDS = 5;
 const SOFTEST_SPL = 5; // level in dB SPL below which speech is not heard
+const SOFT_SPL = 30; // level in dB SPL below which a listener is tempted to turn the volume up
 const HIGHEST_LATE_SHARE = 0.1; // of the blocks of the live aid
 const DRAG_PAUSE = 120; // milliseconds without a movement after which the sounds follow
 const PLAY = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M7 4v16l13-8z"/></svg>';
@@ -45,22 +46,33 @@ let live = null;
 
 // The ear
 
+function settingOfLink(name) {
+  return new URLSearchParams(location.hash.slice(1)).get(name);
+}
+
 function thresholdsOfLink() {
-  const text = new URLSearchParams(location.hash.slice(1)).get("ear");
+  const text = settingOfLink("ear");
   if (text === null) return null;
   const thresholds = parseThresholds(text);
   if (thresholds === null) $("shared").textContent = `The link has no ear: it needs eight levels from ${LOWEST} to ${HIGHEST} dB HL.`;
   return thresholds;
 }
 
-function link() {
-  return `#ear=${chart.thresholds.join(",")}`;
+// The link never sets the volume, which is the listener's own.
+function writeLink() {
+  history.replaceState(null, "", `#ear=${chart.thresholds.join(",")}&speech=${$("speech").value}`);
 }
 
 function showEar() {
-  const [key] = Object.entries(STANDARD).find(([, { thresholds }]) => `${thresholds}` === `${chart.thresholds}`) ?? [];
-  for (const button of $("presets").children) button.setAttribute("aria-pressed", button.textContent === key);
-  write("ear-name", key ? STANDARD[key].name : "An ear of your own");
+  const distanceTo = (key) =>
+    STANDARD[key].thresholds.reduce((sum, level, i) => sum + Math.abs(level - chart.thresholds[i]), 0);
+  const [closest] = Object.keys(STANDARD).sort((a, b) => distanceTo(a) - distanceTo(b));
+  const isStandard = distanceTo(closest) === 0;
+  for (const button of $("presets").children) {
+    button.setAttribute("aria-pressed", isStandard && button.textContent === closest);
+  }
+  const { name } = STANDARD[closest];
+  write("ear-name", isStandard ? name : `Your own ear, closest to ${name}`);
   chart.thresholds.forEach((level, i) => {
     const input = $("numbers").querySelectorAll("input")[i];
     if (document.activeElement !== input) input.value = level;
@@ -69,7 +81,7 @@ function showEar() {
 
 function changeEar() {
   showEar();
-  history.replaceState(null, "", link());
+  writeLink();
   $("shared").textContent = "";
   for (const name of ["ear", "aided"]) cards[name].setAttribute("aria-busy", "true");
   clearTimeout(timer);
@@ -133,10 +145,13 @@ function show(name, pascals) {
 function describeLoudness(name) {
   const { normal, [name]: perceived } = state.results;
   if (name === "normal" || !normal || !perceived) return VERSIONS[name].about;
-  if (levelOf(perceived) < SOFTEST_SPL) return "not heard at all";
-  const difference = Math.round(levelOf(perceived) - levelOf(normal));
+  const level = levelOf(perceived);
+  const difference = Math.round(level - levelOf(normal));
   if (Math.abs(difference) <= 1) return "as loud as for a healthy ear";
-  return `${Math.abs(difference)} dB ${difference > 0 ? "louder" : "softer"} than for a healthy ear`;
+  const size = `${Math.abs(difference)} dB ${difference > 0 ? "louder" : "softer"} than for a healthy ear`;
+  if (level >= SOFT_SPL) return size;
+  const silence = level < SOFTEST_SPL ? "not heard at all" : size;
+  return `${silence}. Do not turn the volume up: this silence is the hearing loss.`;
 }
 
 function addCard(name) {
@@ -206,6 +221,7 @@ async function setSound(promise, name) {
   try {
     const samples = present(await promise);
     if (choice !== choices) return; // Another sound was chosen meanwhile.
+    wanted = player.playing ?? wanted;
     player.clear();
     state.sound = samples;
     state.results = {};
@@ -228,8 +244,15 @@ async function bundledSpeech(file) {
 }
 
 function chooseSpeech() {
-  const { file, sentence } = SPEECH[$("speech").selectedIndex];
-  return setSound(bundledSpeech(file), `“${sentence}” (a computer’s voice)`);
+  const { value, selectedOptions } = $("speech");
+  return setSound(bundledSpeech(value), `“${selectedOptions[0].text}” (a computer’s voice)`);
+}
+
+function setSpeechOfLink() {
+  const file = settingOfLink("speech") ?? "";
+  const isNew = file !== $("speech").value && SPEECH.some((speech) => speech.file === file);
+  if (isNew) $("speech").value = file;
+  return isNew;
 }
 
 async function recordSound() {
@@ -322,7 +345,8 @@ FREQUENCIES.forEach((hertz, i) => {
   label.append(input);
   $("numbers").append(label);
 });
-for (const { sentence } of SPEECH) $("speech").add(new Option(sentence));
+for (const { file, sentence } of SPEECH) $("speech").add(new Option(sentence, file));
+setSpeechOfLink();
 for (const name of Object.keys(VERSIONS)) addCard(name);
 player.onchange();
 player.setRepeat($("repeat").checked);
@@ -336,9 +360,13 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("hashchange", () => {
   const thresholds = thresholdsOfLink();
+  if (setSpeechOfLink()) chooseSpeech();
   if (thresholds !== null && `${thresholds}` !== `${chart.thresholds}`) setEar(thresholds);
 });
-$("speech").addEventListener("change", chooseSpeech);
+$("speech").addEventListener("change", () => {
+  writeLink();
+  chooseSpeech();
+});
 $("file").addEventListener("change", () => {
   const [file] = $("file").files;
   if (file) setSound(file.arrayBuffer().then(decode), file.name);
@@ -355,7 +383,7 @@ $("headphones").addEventListener("change", () => {
 });
 $("live").addEventListener("click", () => (live === null ? startLive() : stopLive()));
 $("share").addEventListener("click", async () => {
-  history.replaceState(null, "", link());
+  writeLink();
   const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
   $("shared").textContent = copied ? "Copied." : "Copy the address of this page.";
 });

@@ -6,8 +6,9 @@
   const isPage = document.body.classList.contains("hlsim-page"); // not a notebook, which has keys
   const allSounds = () => document.querySelectorAll(".hlsim-player audio");
 
-  const setVolume = (volume, loudness) => {
+  const setVolume = (volume, loudness, note = "") => {
     Object.assign(shared, { volume, loudness });
+    for (const text of document.querySelectorAll(".hlsim-player .lowered")) text.textContent = note;
     for (const slider of document.querySelectorAll(".hlsim-player .volume")) slider.value = volume;
     for (const audio of allSounds()) audio.volume = volume;
   };
@@ -38,9 +39,9 @@
     };
     const protect = (number) => {
       const excess = loudness[number] - shared.loudness - maxStep;
-      if (excess > 0) setVolume(shared.volume * 10 ** (-excess / 20), loudness[number]);
-      find(".lowered").textContent =
-        excess > 0 ? `Volume lowered by ${excess.toFixed(0)} dB: this sound is much louder.` : "";
+      if (excess <= 0) return;
+      const note = `Volume lowered by ${excess.toFixed(0)} dB, for one sound is much louder. Raise it with the slider.`;
+      setVolume(shared.volume * 10 ** (-excess / 20), loudness[number], note);
     };
     const select = (number) => {
       shared.player = player;
