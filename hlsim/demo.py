@@ -19,7 +19,7 @@ from hlsim.evaluation.aid_properties import measure_aids, measure_gain_curve
 from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS, ear_name
-from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
+from hlsim.evaluation.measures import LEVELS, MEASURES, NORMAL, PERCEPTION, perceive
 from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
@@ -34,6 +34,7 @@ from hlsim.report.demo import (
     result_table,
 )
 from hlsim.report.page import write_page
+from hlsim.report.players import NORMAL_EAR
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
@@ -175,15 +176,15 @@ def _compute_signals(
 
     Returns:
         Two dictionaries, the outputs and the perceived signals: one signal per item, by condition.
+        The second one begins with clean speech as a normal ear perceives it, under ``NORMAL_EAR``.
     """
     with torch.no_grad():
         outputs = {
             condition.name: [condition.output(item) for item in items] for condition in conditions
         }
-    perceived = {
-        name: [perceive(signal, items[0].ear, NEURO_RATE) for signal in signals]
-        for name, signals in outputs.items()
-    }
+    perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
+    for name, signals in outputs.items():
+        perceived[name] = [perceive(signal, items[0].ear, NEURO_RATE) for signal in signals]
     return outputs, perceived
 
 
@@ -201,8 +202,8 @@ def _write_audio(
         files = {}
         for kind, signals_by_condition in signals.items():
             for condition, item_signals in signals_by_condition.items():
-                name = f"{item.name}-{kind}-{condition.replace(',', '').replace(' ', '-')}.wav"
-                files[folder / name] = item_signals[number]
+                name = re.sub(r"[^\w-]+", "-", f"{kind}-{condition}").strip("-")
+                files[folder / f"{item.name}-{name}.wav"] = item_signals[number]
         peak = max(float(signal.abs().max()) for signal in files.values())
         for path, signal in files.items():
             write_audio(path, 0.9 * signal / peak, NEURO_RATE)

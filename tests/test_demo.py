@@ -54,7 +54,9 @@ def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Pa
     for name in names:
         assert f">{means[name]:.3f}</td>" in page
     assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0
-    assert len(list((out / "audio").glob("*.wav"))) == 2 * 4 * 8
+    assert "for 20 steps" in page and "exceeds 110 dB SPL" in page
+    assert len(list((out / "audio").glob("*.wav"))) == (4 + 5) * 8
+    assert len(list((out / "audio").glob("*-perceived-normal-ear-the-goal.wav"))) == 8
 
 
 def test_speech_that_cannot_be_scored_is_named_before_the_training(

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
+from compensators import MappingConfig
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation.aid_properties import mean_band_levels
-from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation, predict_words
 from hlsim.report.page import Card, Page, Picture, Section, Table
 from hlsim.report.players import NORMAL_EAR, make_player
@@ -34,8 +34,10 @@ _LISTEN = (
     "in the folder audio beside this page."
 )
 _ABOUT_PICTURES = (
-    "The training adjusts the gain so that this ear perceives speech as loud as a normal ear "
-    "does, in each frequency band. NAL-R has one gain for all levels. Less gain for louder "
+    "The aid started from the gains of NAL-R, and was trained for this ear through Neuro-MSBG for "
+    "{steps} steps, so that the ear perceives speech as loud as a normal ear does, in "
+    "each frequency band. No sample of its output exceeds {limit:g} dB SPL. NAL-R follows "
+    "from the audiogram alone, and has one gain for all levels and no limit. Less gain for louder "
     "speech is compression."
 )
 
@@ -53,29 +55,32 @@ def demo_page(
 
     Args:
         evaluation: Study of the demo's conditions. Its ``details`` hold the gains of the aids under
-            ``gain_curves``.
+            ``gain_curves``, its ``settings`` the number of ``training_steps``.
         ear_name: Name of the ear, for the title.
         outputs: Outputs of the aid for each item in pascals, by condition. Shape of each: (time,).
-        perceived: The same outputs as the ear perceives them, by condition.
+        perceived: The same outputs as the ear perceives them, by condition, after clean speech as a
+            normal ear perceives it, under ``NORMAL_EAR``.
         sentence: Transcript of the last item, which is played.
     """
     headline = evaluation.headline
     assert headline is not None
     items = [source.load() for source in evaluation.items]
     rate = items[0].sample_rate
-    normal = [perceive(item.clean, NORMAL, rate) for item in items]
-    pictures = _draw_pictures(evaluation, items[0].ear, outputs, {NORMAL_EAR: normal, **perceived})
+    pictures = _draw_pictures(evaluation, items[0].ear, outputs, perceived)
     last_perceived = {name: signals[-1] for name, signals in perceived.items()}
     last_outputs = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
     groups = {
-        "Perceived by this ear, beside a normal ear": {NORMAL_EAR: normal[-1], **last_perceived},
+        "Perceived by this ear, beside a normal ear": last_perceived,
         "Output of the aids": {"original speech": items[-1].clean, **last_outputs},
     }
     player = make_player(groups, rate, sentence)
     details = score_details(evaluation, [_COMPARISON], [result_table(evaluation)])
+    about_pictures = _ABOUT_PICTURES.format(
+        steps=evaluation.settings["training_steps"], limit=MappingConfig().limit_spl
+    )
     sections = [
         Section("Listen", [_LISTEN], player=player),
-        Section("What training changed", [_ABOUT_PICTURES], pictures=pictures),
+        Section("What training changed", [about_pictures], pictures=pictures),
         details,
     ]
     verdict = headline.verdict("The trained aid", "NAL-R at the same level")
@@ -102,8 +107,10 @@ def result_table(evaluation: Evaluation) -> Table:
 
 def _cards(evaluation: Evaluation) -> list[Card]:
     """Return the cards with HASPI, words understood and loudness error of all conditions."""
-    means = evaluation.table.groupby("condition", sort=False)[["haspi", "loudness_error"]].mean()
+    columns = ["haspi", "loudness_error", "level"]
+    means = evaluation.table.groupby("condition", sort=False)[columns].mean()
     haspi, errors = means["haspi"], means["loudness_error"]
+    change = means.loc[NAL_R_AT_LEVEL] - means.loc[NAL_R]
     rows = split_rows(evaluation.table)
     words = {name: predict_words(part["haspi"]) for name, part in rows.items()}
     fewest_words, most_words = (predict_words([score] * len(evaluation.items)) for score in (0, 1))
@@ -125,8 +132,10 @@ def _cards(evaluation: Evaluation) -> list[Card]:
         Card(
             "Loudness error",
             _decibels(errors[TRAINED]),
-            "Overall perceived level minus that of a normal ear. A picture below shows each "
-            "frequency band, in which the error may be larger.",
+            "Perceived level minus that of a normal ear; a picture below shows each frequency "
+            f"band. NAL-R gets {_decibels(change['level'])} to reach the same level, perceived as "
+            f"{_decibels(change['loudness_error'])}, because this ear's loudness grows too fast "
+            "(recruitment).",
             [(name, _decibels(e), abs(e) / errors.abs().max()) for name, e in errors.items()],
         ),
     ]
