@@ -16,7 +16,7 @@ from compensators import load_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, set_level
-from hlsim.checks import check_rate
+from hlsim.checks import check_number, check_rate
 from hlsim.dsp.resample import resample
 from hlsim.files import write_atomically
 from hlsim.losses.frozen_simulator import build_simulator
@@ -163,6 +163,7 @@ def listen(
     *,
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
+    peak_spl: float = 0.0,
     **signals: Tensor | NDArray[Any],
 ) -> Players:
     """Show a player in a notebook that switches between signals at the same position.
@@ -173,6 +174,9 @@ def listen(
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+        peak_spl: Peak level in dB SPL for which the gain leaves room, even if all signals are
+            softer. Players with the same value have the same gain, unless a signal has a higher
+            peak.
         signals: Signals by the label to show, ``(time,)``, or ``(2, time)`` in stereo.
 
     Returns:
@@ -180,7 +184,7 @@ def listen(
 
     Raises:
         ValueError: There is no signal, all signals are silent, one has another shape, or the
-            sample rate is not valid.
+            sample rate or a level is not valid.
 
     Example:
         >>> import hlsim
@@ -191,6 +195,7 @@ def listen(
     """
     if not signals:
         raise ValueError("no signal to play; pass signals by name, as in listen(original=speech)")
+    check_number("peak_spl", peak_spl, 0.0, 200.0)
     gain = gain_to_pascals(full_scale_spl)
     pascals = {}
     for label, signal in signals.items():
@@ -201,7 +206,7 @@ def listen(
                 "pass one item, such as x[0]"
             )
         pascals[label.replace("_", " ")] = tensor * gain
-    return Players(pascals, check_rate(sample_rate))
+    return Players(pascals, check_rate(sample_rate), peak_spl)
 
 
 class Players:
@@ -210,15 +215,17 @@ class Players:
     Args:
         signals: Signals in pascals by their labels, ``(time,)`` or ``(2, time)``.
         sample_rate: Sample rate in Hz of all signals.
+        peak_spl: Peak level in dB SPL for which the gain leaves room, see ``listen``.
 
     >>> Players({"original": example_speech()}, 16000)
     Players(original 65 dB SPL)
     """
 
-    def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:
+    def __init__(self, signals: dict[str, Tensor], sample_rate: int, peak_spl: float = 0.0) -> None:
         from hlsim.report.players import make_player
 
-        self._player = make_player({"": signals}, sample_rate)
+        lowest_peak = gain_to_pascals(peak_spl)
+        self._player = make_player({"": signals}, sample_rate, lowest_peak=lowest_peak)
 
     @property
     def labels(self) -> list[str]:

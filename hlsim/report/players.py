@@ -117,7 +117,11 @@ def _item_section(
 
 
 def make_player(
-    groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int, sentence: str = ""
+    groups: Mapping[str, Mapping[str, Tensor]],
+    sample_rate: int,
+    sentence: str = "",
+    *,
+    lowest_peak: float = 0.0,
 ) -> Player:
     """Return a player that switches between sounds, with their spectrograms.
 
@@ -130,6 +134,7 @@ def make_player(
             may be empty. Shape of each signal: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
         sentence: Words that are spoken, shown above the sounds.
+        lowest_peak: Peak in pascals for which the gain leaves room, even if all signals are softer.
 
     Raises:
         ValueError: All signals of a group are silent.
@@ -139,10 +144,10 @@ def make_player(
     >>> [f"{sound.label} {sound.level:.0f} dB SPL" for sound in player.sounds]
     ['tone 91 dB SPL', 'soft tone 71 dB SPL']
     """
-    first_peak = _peak(next(iter(groups.values())))
+    first_peak = max(_peak(next(iter(groups.values()))), lowest_peak)
     sounds = {}
     for heading, group in groups.items():
-        peak = _peak(group)
+        peak = max(_peak(group), lowest_peak)
         softer = 20.0 * math.log10(peak / first_peak)
         title = heading + (
             f", played {softer:.0f} dB softer than the first row" if softer > 0.5 else ""
