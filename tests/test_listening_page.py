@@ -293,6 +293,7 @@ def test_a_recording_can_be_heard(opened: Any) -> None:
         "document.getElementById('source-name').textContent == 'Your recording'"
     )
     wait(opened)
+    assert opened.locator("#speech").input_value() == ""
     recording = result(opened, "normal")
     assert recording.shape == (5 * 16000,)
     assert float(recording.norm()) > 0.1

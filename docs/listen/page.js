@@ -216,7 +216,7 @@ function moveHead() {
 
 // The sound
 
-async function setSound(promise, name) {
+async function setSound(promise, name, file = "") {
   const choice = ++choices;
   try {
     const samples = present(await promise);
@@ -225,6 +225,7 @@ async function setSound(promise, name) {
     player.clear();
     state.sound = samples;
     state.results = {};
+    $("speech").value = file; // No sentence is selected beside a file or a recording, so that each can be chosen again.
     const seconds = samples.length / SAMPLE_RATE;
     const cut = seconds === LONGEST_SECONDS ? `, the first ${LONGEST_SECONDS} seconds` : "";
     $("source-name").textContent = `${name}${cut}`;
@@ -245,7 +246,7 @@ async function bundledSpeech(file) {
 
 function chooseSpeech() {
   const { value, selectedOptions } = $("speech");
-  return setSound(bundledSpeech(value), `“${selectedOptions[0].text}” (a computer’s voice)`);
+  return setSound(bundledSpeech(value), `“${selectedOptions[0].text}” (a computer’s voice)`, value);
 }
 
 function setSpeechOfLink() {
