@@ -66,8 +66,9 @@ class HearingAid(Wearable):
       0 before training, and where there is no loss.
     - The attenuation comes from a recurrent network that gets levels, but no audiogram.
 
-    Amplification is at most ``config.cap_db``, and fades for sounds below ``config.quiet_spl``. The
-    peak of the output is softly limited at ``config.limit_spl``.
+    The sum of restoring gain and correction is limited to 0 to ``config.cap_db`` dB before the
+    slider ``amplification`` scales it, and fades for sounds below ``config.quiet_spl`` dB SPL. The
+    peak of the output is softly limited at ``config.limit_spl`` dB SPL.
 
     Args:
         config: Sizes of the networks, and limits of the gains; by default ``HearingAidConfig()``.

@@ -55,9 +55,12 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     """
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"expected the path of an audio file, got {type(path).__name__}")
+    if os.path.isdir(path):
+        raise ValueError(
+            f"{path}: expected an audio file, got a folder; pass the path of a file in it"
+        )
     if not os.path.isfile(path):
-        problem = "this is a folder" if os.path.isdir(path) else "there is no such file"
-        raise ValueError(f"{path}: expected an audio file, but {problem}")
+        raise ValueError(f"{path}: there is no such file; correct the path")
     try:
         with soundfile.SoundFile(os.fspath(path)) as file:
             rate = int(file.samplerate)

@@ -113,7 +113,7 @@ def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[
     """Validate weights by name, and return them as floats.
 
     Args:
-        weights: Mapping of names to finite numbers of 0 or more, of which one is above 0.
+        weights: Mapping of names to finite numbers of 0 or more, of which at least one is above 0.
         known: Accepted names.
         description: Noun in the plural for messages, such as ``criteria``.
 
@@ -132,7 +132,9 @@ def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[
     for name, weight in weights.items():
         check_number(f"the weight of {name}", weight, 0.0)
     if not any(weights.values()):
-        raise ValueError(f"expected a weight above 0 for one of the {description}, got {weights}")
+        raise ValueError(
+            f"expected a weight above 0 for at least one of the {description}, got {weights}"
+        )
     return {name: float(weight) for name, weight in weights.items()}
 
 

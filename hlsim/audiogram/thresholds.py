@@ -128,7 +128,7 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
     grids = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
     for ear in grids:
         if ear is not None:
-            check_range(ear.levels, HIGHEST_SIMULATED, "MSBG")
+            check_range(ear.levels, HIGHEST_SIMULATED, "MSBG", ear.frequencies)
     return grids if any(grids) else []
 
 

@@ -76,9 +76,14 @@ class Audiogram:
             )
         is_measured = ~np.isnan(levels)
         levels, frequencies = levels[is_measured], frequencies[is_measured]
-        check_range(levels, HIGHEST_LEVEL, "an audiogram")
+        check_range(levels, HIGHEST_LEVEL, "an audiogram", frequencies)
         ascending = len(levels) > 0 and frequencies[0] > 0 and (np.diff(frequencies) > 0).all()
-        if not ascending or frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:
+        overlaps = (
+            ascending
+            and FREQUENCIES[0] <= frequencies[-1] < math.inf
+            and frequencies[0] <= FREQUENCIES[-1]
+        )
+        if not overlaps:
             raise ValueError(
                 "expected levels at ascending frequencies in Hz that overlap the range from "
                 f"{FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g}, got levels at "
@@ -349,24 +354,36 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
         raise ValueError(f"{place}: {error}") from error
 
 
-def check_range(levels: Iterable[float], highest: float, consumer: str) -> None:
+def check_range(
+    levels: Iterable[float],
+    highest: float,
+    consumer: str,
+    frequencies: Iterable[float] = FREQUENCIES,
+) -> None:
     """Validate that thresholds lie between -10 dB HL and a highest level.
 
     Args:
         levels: Thresholds in dB HL.
         highest: Highest level that is valid, in dB HL.
         consumer: Name of the model or metric that needs the thresholds, for the message.
+        frequencies: Frequency of each threshold in Hz, for the message.
 
     Raises:
         ValueError: A level is below -10 or above ``highest``, or NaN.
 
-    >>> check_range([20.0, 30.0], 100.0, "MSBG")
+    >>> check_range([20.0] * 8, 100.0, "MSBG")
     """
-    if not all(LOWEST_LEVEL <= level <= highest for level in levels):
-        hint = " (the standard audiogram N7 exceeds it)" if highest < HIGHEST_LEVEL else ""
+    for level, frequency in zip(levels, frequencies, strict=True):
+        if LOWEST_LEVEL <= level <= highest:
+            continue
+        fix = "limit it to this range"
+        if math.isnan(level):
+            fix = "replace it by a threshold"
+        elif highest < HIGHEST_LEVEL:
+            fix += " (the standard audiogram N7 exceeds it)"
         raise ValueError(
             f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}, "
-            f"got {join_numbers(levels)}; limit them to this range{hint}"
+            f"got {level:g} at {frequency:g} Hz; {fix}"
         )
 
 
@@ -410,8 +427,8 @@ def _as_array(values: Any) -> NDArray[np.float64]:
         numbers = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = np.array(math.nan)
-    if numbers.ndim != 1 or np.isinf(numbers).any():
-        raise ValueError(f"expected finite numbers for an audiogram, got {values!r}")
+    if numbers.ndim != 1:
+        raise ValueError(f"expected a list of numbers for an audiogram, got {values!r}")
     return numbers
 
 

@@ -213,7 +213,10 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
         enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
         label = name.rpartition(":")[2]
         if label in enhancers:
-            raise ValueError(f"two enhancers have the name {label} after the colon; rename one")
+            raise ValueError(
+                f"two enhancers are called {label} ({enhancers[label].name} and {name}); rename "
+                "one of the functions, or leave one out"
+            )
         enhancers[label] = enhancer
     return enhancers
 

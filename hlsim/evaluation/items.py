@@ -51,9 +51,9 @@ def draw_simulator_items(
     """Draw the items on which simulators are compared: clips of speech, each for one ear.
 
     Half of the ears are from ``audiograms``, a quarter are mild standard ears (NH, N1, N2, S1) and
-    a quarter are random. With noise, every second item is noisy, with one of four signal-to-noise
-    ratios in turn. With five levels, 160 items contain each combination of ratio, level and kind of
-    ear once.
+    a quarter are random. With noise, every second item is noisy, at signal-to-noise ratios of 2.5,
+    7.5, 12.5 and 17.5 dB in turn. With five levels, the 80 noisy ones of 160 items contain each
+    combination of a ratio, a level and a quarter of the ears once.
 
     Args:
         speech: Folder of recordings of clean speech.
@@ -64,8 +64,8 @@ def draw_simulator_items(
         seed: Seed of all random draws.
         levels: Levels of the signal with its noise in dB SPL, in turn.
 
-    Returns: Items at 16 kHz. Their facts are ``severity``, ``input_level``, ``speech``,
-        ``noise_snr`` and ``audiogram``.
+    Returns: Items at 16 kHz. Their facts are ``severity``, ``input_level`` (dB SPL), ``speech``
+        (clean or noisy), ``noise_snr`` (dB, NaN if clean) and ``audiogram``.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> settings = {"items": 2, "seconds": 1.0, "seed": 0}
@@ -104,8 +104,9 @@ def draw_aid_items(
 ) -> list[Item]:
     """Draw the items on which hearing aids are compared: clips of speech, for the ears in turn.
 
-    With noise, every second item is noisy. Every ear occurs with every combination of level and
-    signal-to-noise ratio.
+    With noise, every second item is noisy, at signal-to-noise ratios of 2.5, 7.5, 12.5 and 17.5 dB
+    in turn. The noisy ones of ``8 * len(levels) * len(ears)`` items contain each combination of an
+    ear, a level and a ratio once; fewer items contain some of the combinations.
 
     Args:
         speech: Folder of recordings of clean speech.
@@ -116,8 +117,8 @@ def draw_aid_items(
         seed: Seed of all random draws.
         levels: Levels of the clean speech in dB SPL, in turn.
 
-    Returns: Items at 16 kHz. Their facts are ``ear``, ``severity``, ``input_level``, ``speech``,
-        ``snr`` and ``audiogram``.
+    Returns: Items at 16 kHz. Their facts are ``ear``, ``severity``, ``input_level`` (dB SPL),
+        ``speech`` (clean or noisy), ``snr`` (dB, NaN if clean) and ``audiogram``.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> settings = {"items": 1, "seconds": 1.0, "seed": 0}

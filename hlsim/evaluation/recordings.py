@@ -41,10 +41,10 @@ from hlsim.files import EXTENSIONS, read_table, resolve_links
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_REQUIRED_COLUMNS = {"condition", "clean", "processed"}
+_REQUIRED_COLUMNS = ("condition", "clean", "processed")
 """Columns that a manifest must have."""
 
-_LEVEL_COLUMNS = {"spl", "full_scale_spl"}
+_LEVEL_COLUMNS = ("spl", "full_scale_spl")
 """Columns that a manifest must not have, because levels are options."""
 
 _UTTERANCE_COLUMNS = ["listener", "utterance", "snr"]
@@ -144,7 +144,8 @@ class Recording:
 
     def _output_file(self, condition: str) -> Path:
         if condition not in self.outputs:
-            raise ValueError(self.problems.get(condition, "no file is named"))
+            missing = f"{self.name}: no file is named for condition {condition}; add it to outputs"
+            raise ValueError(self.problems.get(condition, missing))
         return self.outputs[condition]
 
     def _read_output(self, condition: str, rate: int) -> Tensor:
@@ -160,9 +161,15 @@ class Recording:
         """Read the ear's channel, in float64 with shape (time,), and the sample rate in Hz."""
         waveform, rate = read_audio(path)
         channels = len(waveform)
-        if channels > 2 or (channels == 2 and not self.ear):
+        if channels > 2:
             raise ValueError(
-                f"{path}: expected one channel, or two and the name of the ear, got {channels}"
+                f"{path}: expected one channel, or two for a left and a right ear, got {channels}; "
+                "write the channel of each ear to a file"
+            )
+        if channels == 2 and not self.ear:
+            raise ValueError(
+                f"{path}: expected one channel, because the ear of {self.name} has no name, got 2; "
+                "name the ear left or right (column ear of a manifest), or pass mono files"
             )
         channel = waveform[EARS.index(self.ear) if channels == 2 else 0]
         return channel.double(), rate
@@ -428,12 +435,21 @@ def _read_manifest(
     """
     folder = resolve_links(Path(path).parent if root is None else root)
     rows = read_table(path, "the manifest")
-    columns = rows[0][1].keys() if rows else set()
-    if not columns >= _REQUIRED_COLUMNS or columns & _LEVEL_COLUMNS:
-        raise ValueError(
-            f"{path}: expected rows with the columns {', '.join(sorted(_REQUIRED_COLUMNS))}, and "
-            "the level as an option, not as a column"
-        )
+    if not rows:
+        raise ValueError(f"{path}: the manifest has no rows; add one for each output file")
+    columns = rows[0][1].keys()
+    for column in _REQUIRED_COLUMNS:
+        if column not in columns:
+            raise ValueError(
+                f"{path}: there is no column {column}; expected the columns "
+                f"{', '.join(_REQUIRED_COLUMNS)}, add it to the first line and to all rows"
+            )
+    for column in _LEVEL_COLUMNS:
+        if column in columns:
+            raise ValueError(
+                f"{path}: expected no column {column}, because all files have one level; remove "
+                f"it, and pass the option --{column.replace('_', '-')} ({column} in Python)"
+            )
     ears = {} if audiograms is None else _read_ears(audiograms, "listener")
     recordings: dict[tuple[str, Path], Recording] = {}
     for line, row in rows:
@@ -470,12 +486,24 @@ def _read_row(
         audiogram = Audiogram.standard(row["audiogram"])
     else:
         audiogram = _find_ear(ears, listener, ear) or audiogram
-    if audiogram is None or not condition:
+    if not condition:
         raise ValueError(
-            f"expected a condition and an audiogram of listener {listener!r}, ear {ear!r}, got "
-            f"condition {condition!r} and {audiogram}; add columns hl_250, hl_500, ... or a column "
-            "audiogram, or name a file of audiograms"
+            "expected the name of a condition, such as unaided, in the column condition, got an "
+            "empty value; fill it in"
         )
+    if audiogram is None:
+        raise ValueError(
+            f"there is no audiogram of listener {listener!r}, ear {ear!r}; add columns hl_250, "
+            "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
+            "ear"
+        )
+    try:
+        snr = float(row.get("snr") or "nan")
+    except ValueError:
+        raise ValueError(
+            f"expected a number of dB in the column snr, got {row['snr']!r}; correct it, or leave "
+            "it empty"
+        ) from None
     return Recording(
         utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
         clean=_path_below(root, row["clean"]),
@@ -483,16 +511,23 @@ def _read_row(
         audiogram=audiogram,
         listener=listener,
         ear=ear,
-        snr=float(row.get("snr") or "nan"),
+        snr=snr,
         **settings,
     )
 
 
 def _merge(recording: Recording, other: Recording) -> Recording:
     """Return a recording with the output of another row of the same utterance and ear."""
-    if recording.audiogram != other.audiogram or recording.outputs.keys() & other.outputs:
+    for condition in recording.outputs.keys() & other.outputs:
         raise ValueError(
-            f"expected one row of {recording.name} for each condition, with the same audiogram"
+            f"expected one row of {recording.name} under condition {condition}, got a second one; "
+            "remove one of them, or give both different values in the column item"
+        )
+    if recording.audiogram != other.audiogram:
+        raise ValueError(
+            f"expected the audiogram of earlier rows of {recording.name}, "
+            f"{recording.audiogram.short_text()}, got {other.audiogram.short_text()}; write one "
+            "audiogram in all its rows"
         )
     return replace(recording, outputs={**recording.outputs, **other.outputs})
 
@@ -505,7 +540,10 @@ def _path_below(root: Path, name: str) -> Path:
     """
     path = resolve_links(root / name)
     if not name or not path.is_relative_to(root):
-        raise ValueError(f"expected a path below {root}, got {name!r}")
+        raise ValueError(
+            f"expected the path of a file below {root}, got {name!r}; move the file there, or pass "
+            "the folder that contains all files as root"
+        )
     return path
 
 
@@ -513,7 +551,7 @@ def _ear_name(row: _Row) -> str:
     """Return ``"left"``, ``"right"`` or, if the row names no ear, an empty text."""
     text = row.get("ear", "").lower()
     if text and text not in EAR_NAMES:
-        raise ValueError(f"expected left or right in the column ear, got {text!r}")
+        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
     return EAR_NAMES.get(text, "")
 
 
@@ -531,9 +569,12 @@ def _read_ears(path: str | Path, column: str) -> _Ears:
         if column == "file":
             name = _without_extension(PurePath(name))
         key = name, convert_at(place, _ear_name, row)
-        if not row.get(column) or key in ears:
+        if not row.get(column):
+            raise ValueError(f"{place}: expected a name in the column {column}, got none; add it")
+        if key in ears:
             raise ValueError(
-                f"{place}: expected a name in the column {column}, and one row per ear"
+                f"{place}: expected one row per ear, but {ears[key][0]} has the same ear of "
+                f"{column} {name}; remove one of them"
             )
         ears[key] = place, row
     return ears

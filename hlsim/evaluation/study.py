@@ -150,7 +150,10 @@ class Condition:
         if self.process is not None:
             return self.process(item.signal, item.ear)
         if self.name not in item.recorded:
-            raise ValueError(f"no output of {item.name} is recorded under {self.name}")
+            raise ValueError(
+                f"no output of {item.name} is recorded under {self.name}; add its file, for "
+                "example by a row of the manifest"
+            )
         return item.recorded[self.name]()
 
 

@@ -100,7 +100,7 @@ def check_values(values: Any, items: int) -> Tensor:
         result = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
         raise ValueError(
             f"expected the criterion to return one value per item, shape ({items},), got {result}; "
-            "apply a criterion that returns a mean to the result of loss.heard(...)"
+            "leave out its mean over items, or apply it yourself to the result of loss.heard(...)"
         )
     return values
 

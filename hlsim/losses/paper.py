@@ -58,9 +58,12 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
     This is the sum of three means: of the distance between the phases, and of the distances between
     their differences from frequency to frequency (group delay) and from frame to frame
-    (instantaneous frequency). The gradient of a phase is 1 / magnitude, so that inaudible
-    frequencies would dominate it; it is faded out where the estimate or the target is fainter than
-    a tone of 20 dB SPL.
+    (instantaneous frequency). All frequencies count alike in the value. The gradient of a phase is
+    1 / magnitude, so that inaudible frequencies would dominate the gradient. Therefore the gradient
+    is faded out where the estimate or the target is fainter than a tone of 20 dB SPL.
+
+    The spectra are those of signals in pascals by ``PAPER_STFT``, or are scaled to its magnitudes
+    as in ``paper_parts``.
 
     Shape: complex (items, frames, bins) twice -> (items,).
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.audiogram.listener import EARS
 from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.checks import Lengths, check_lengths
 from hlsim.dsp.fft import power, rfft
@@ -155,15 +156,21 @@ def _check_values(signals: Tensor) -> None:
         signals: Clean speech at the left and the right ear, then processed speech. Shape: (items,
             4, time).
     """
-    finite = signals.detach().isfinite().all(-1).all(0)
-    sounding = signals.detach()[:, :2].flatten(1).any(-1).all()
-    clean_left, clean_right, left, right, is_sounding = torch.cat((finite, sounding[None])).tolist()
-    if not (left and right):
-        raise ValueError("processed holds samples that are NaN or infinite")
-    if not (clean_left and clean_right):
-        raise ValueError("clean holds samples that are NaN or infinite")
-    if not is_sounding:
-        raise ValueError("clean is silent at both ears")
+    is_finite = signals.detach().isfinite().all(-1)
+    is_sounding = signals.detach()[:, :2].flatten(1).any(-1, keepdim=True)
+    names = [f"{signal} at the {ear} ear" for signal in ("clean", "processed") for ear in EARS]
+    for index, (*finite, sounding) in enumerate(torch.cat((is_finite, is_sounding), 1).tolist()):
+        item = f" of item {index}" if len(signals) > 1 else ""
+        if not all(finite):
+            raise ValueError(
+                f"{names[finite.index(False)]}{item} holds samples that are NaN or infinite; "
+                "remove them, or leave the item out"
+            )
+        if not sounding:
+            raise ValueError(
+                f"clean{item} is silent at the left and the right ear, so there is nothing to "
+                "compare with; leave the item out"
+            )
 
 
 def _resample_items(signals: Tensor, ends: list[int], rate: int) -> tuple[Tensor, Extent]:

@@ -85,12 +85,14 @@ class PreparedBatch(ABC):
             processed: Outputs for the items of all batches. Shape: (all items, time).
             noise: Kind of the internal noise of the ear.
             seeds: Seeds of the items of all batches.
-            ears: Hair cells for all items, if the outputs reach other ears than the clean signals.
-                Shape: (all items, 32).
+            ears: For HASPI one argument, the hair cells of the impaired ears of all items, with
+                shape (all items, 32); none for HASQI and HAAQI, where the outputs reach the same
+                ears as the clean signals.
 
         Returns:
-            Features of each item of this batch, from which its score follows. Shape: (items,
-            features).
+            For each item of this batch, the ten features from which ``HaspiReference`` computes
+            HASPI, or HASQI or HAAQI with its nonlinear and its linear part. Shape: (items, 10) or
+            (items, 3).
         """
 
 

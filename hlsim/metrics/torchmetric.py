@@ -287,15 +287,19 @@ class _MeanScore(_Metric):
 class HASPI(_MeanScore):
     """Mean HASPI v2, the intelligibility of processed speech, over all items since ``reset``.
 
-    It rewards any gain, so log ``level``, the mean level in dB SPL, next to it. The score of an
-    item is that of ``haspi`` with the same settings, in double precision. On a CPU one second of
-    audio takes about 0.12 s on one core; ``limit`` bounds the cost of a validation epoch.
+    HASPI rewards any gain, so log the mean level of the outputs, the attribute ``level``, as well.
+    The score of an item is that of ``haspi`` with the same settings, in double precision. On a CPU
+    one second of audio takes about 0.12 s on one core; ``limit`` bounds the cost of a validation
+    epoch.
 
     In a LightningModule, write ``self.haspi = HASPI(sample_rate=16000)`` in the constructor, and
     ``self.haspi.update(output, clean, audiogram); self.log("haspi", self.haspi)`` in
-    ``validation_step``.
+    ``validation_step``. The level of the outputs is then ``self.haspi.level``.
 
     Attributes:
+        level: Mean level in dB SPL of the outputs that were scored in this process.
+        ears: Mean score of the left and of the right ear in this process, with shape (2,); NaN if
+            the signals had one channel.
         count: Number of items that were scored.
         failed: Number of items that could not be scored.
         seen: Number of all items, with those beyond ``limit``.

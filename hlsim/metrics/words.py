@@ -87,7 +87,9 @@ class WordsChange(NamedTuple):
 
 @cache
 def load_curve() -> Curve:
-    """Load the parameters that were fitted to listeners' responses.
+    """Load the curve that predicts, from HASPI, the share of words that a listener understands.
+
+    It was fitted to the responses of 22 listeners to sentences through ten hearing aids.
 
     >>> len(load_curve().coefficients)
     3

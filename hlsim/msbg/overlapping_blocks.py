@@ -75,14 +75,20 @@ def in_blocks(
 
 
 def block_bounds(samples: int, rate: int) -> list[Block]:
-    """Divide the samples of a signal into overlapping blocks of 8 s.
+    """Divide the samples of a signal into overlapping blocks.
 
-    Each block begins where the frames of smearing and the values of envelopes lie at the same
-    samples as in the whole signal. The overlap is longer than the filters of MSBG take to settle.
+    Each block contributes about 8 s to the output. Its input begins at least 0.75 s earlier and
+    ends at least 0.55 s later, because MSBG's filters make the output depend on these margins, for
+    which the result is cut off. A signal that is hardly longer than a block is not divided. Each
+    block begins where the frames of smearing and the values of envelopes lie at the same samples as
+    in the whole signal.
 
     Args:
-        samples: Length of the signal.
+        samples: Length of the signal in samples.
         rate: Sample rate in Hz.
+
+    Returns:
+        Where the input and the output of each block begin and end.
 
     >>> [(block.input_start, block.input_stop) for block in block_bounds(320000, rate=16000)]
     [(0, 133120), (102400, 256000), (225280, 320000)]

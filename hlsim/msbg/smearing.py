@@ -62,8 +62,9 @@ _FRAMES_PER_CHUNK = 1200
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
     """Compute the auditory filters of an ear: how much of each frequency each filter passes.
 
-    The filters are rounded exponentials, (1 + g) exp(-g) for a distance g from the centre
-    frequency, divided by their bandwidths.
+    The filters are rounded exponentials, (1 + g) exp(-g), divided by their bandwidths. g is the
+    distance from the centre frequency in quarters of the filter's equivalent rectangular bandwidth,
+    which ``lower`` or ``upper`` widens.
 
     Args:
         lower: Factor by which the lower sides of the filters are wider than normal.

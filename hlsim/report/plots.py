@@ -246,14 +246,17 @@ def gain_picture(
 
 
 def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, over: str) -> Picture:
-    """Draw the mean of a column over a fact of the items, with one curve per condition.
+    """Draw mean scores against a property of the items, such as their SNR, per condition.
+
+    The curve of a condition has one point for each value of the property that occurs: the mean over
+    all items with this value.
 
     Args:
         evaluation: The evaluation.
-        column: Column of its table, such as ``"haspi"``.
-        fact: Column of the fact, such as ``"snr"``.
-        title: Title of the column.
-        over: Title of the fact.
+        column: Column of its table with the scores, such as ``"haspi"``.
+        fact: Column of its table with the property, such as ``"snr"``.
+        title: Title of the scores.
+        over: Title of the property.
 
     >>> import pandas
     >>> rows = [(0, "aid", 5.0, 0.5), (1, "aid", 10.0, 0.7)]

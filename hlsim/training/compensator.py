@@ -29,10 +29,11 @@ _NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
 class CompensatorTraining(TrainingModule):
     """Lightning module that trains a compensator in front of a frozen simulator.
 
-    A ``HearingAid`` has two parts, noise reduction and amplification. Each part is trained only by
-    its own criteria, and frozen if the recipe has none. Otherwise the criteria of noise reduction
-    would change the amplification, because HASPI rewards gain. The criteria of amplification would
-    weaken the noise reduction, because it lowers the level.
+    A ``HearingAid`` has two parts, noise reduction and amplification. The criteria ``"denoising"``
+    and ``"intelligibility"`` train the noise reduction, those of ``HearingLossLoss`` the
+    amplification; a part without criteria in the recipe is frozen. If the parts shared criteria,
+    those of noise reduction would change the amplification, because HASPI rewards gain, and those
+    of amplification would weaken the noise reduction, because it lowers the level.
 
     Args:
         recipe: Settings of the network and of the training.

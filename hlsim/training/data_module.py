@@ -28,11 +28,12 @@ _MANY_STEPS = 10_000_000
 
 
 class Step(NamedTuple):
-    """Index of a training batch.
+    """Index of a training batch, from which its random seed follows.
 
     Attributes:
-        number: Number of the step, from 0.
-        rank: Number of the process among those that train together.
+        number: Number of earlier optimiser steps in the training, 0 for the first batch.
+        rank: Number of the process among those that train together, from 0. Each draws batches of
+            its own.
 
     >>> Step(3)
     Step(number=3, rank=0)

@@ -26,8 +26,9 @@ def draw_sounds(
 ) -> Tensor:
     """Draw sounds that are not speech, without a calibrated level.
 
-    Items 0, 2, 4 and so on have one to four steady tones, which rise over 10 ms at a random time in
-    the first half of the item. The other items have one to eight clicks of one sample.
+    Items 0, 2, 4 and so on have one to four steady tones, which begin together at a random time, in
+    the first half of the item or before it, and rise over 10 ms. The other items have one to eight
+    clicks of one sample.
 
     The frequency of about half of the tones is a multiple of 250 Hz, as in audiometry. Such a tone
     has a whole number of periods in 4 or 8 ms, so that it has the same phase in every frame of a
@@ -38,8 +39,8 @@ def draw_sounds(
         samples: Length of each sound in samples.
         sample_rate: Sample rate in Hz.
         generator: Source of the random numbers.
-        early_share: Longest time before the first sample at which a tone may begin, relative to
-            half the length of the item. With 0, no tone begins early.
+        early_share: Longest time by which the tones may begin before the start of the item, as a
+            share of half its length. With 0, they begin within the item.
 
     Returns:
         Sounds with shape (items, samples).

@@ -154,15 +154,19 @@ def test_the_better_ear_counts(corpus: Path) -> None:
     ("old", "new", "message"),
     [
         ("5,N3\n", "5,N9\n", "line 2: .*N9"),
-        ("A,before", "../A,before", "line 2: expected a path below"),
-        ("L1,left,aided", "L1,left,unaided", "line 3: expected one row of L1 left"),
-        ("L1,left,aided", "L1,left,", "line 3: expected a condition"),
-        ("N3\nL2", "N4\nL2", "line 3: .*with the same audiogram"),
-        (",5,N3", ",x,N3", "line 2: .*'x'"),
+        ("A,before", "../A,before", "line 2: expected the path of a file below"),
+        (
+            "L1,left,aided",
+            "L1,left,unaided",
+            "line 3: expected one row of L1 left .* under condition unaided",
+        ),
+        ("L1,left,aided", "L1,left,", "line 3: expected the name of a condition"),
+        ("N3\nL2", "N4\nL2", r"line 3: expected the audiogram .* 'N3', got 'N4'"),
+        (",5,N3", ",x,N3", "line 2: expected a number of dB in the column snr, got 'x'"),
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
-        ("condition,", "treatment,", "expected rows with the columns clean, condition"),
-        (",snr,", ",spl,", "the level as an option"),
-        (",audiogram\n", ",ear_of\n", "line 2: .*an audiogram of listener 'L1'"),
+        ("condition,", "treatment,", "there is no column condition"),
+        (",snr,", ",spl,", "expected no column spl, .* pass the option --spl"),
+        (",audiogram\n", ",ear_of\n", "line 2: there is no audiogram of listener 'L1'"),
     ],
 )
 def test_the_line_of_an_invalid_row_is_named(
