@@ -95,14 +95,14 @@ def measure_gain_curve(
 ) -> dict[str, Any]:
     """Measure the gain of a hearing aid for speech over frequency, at each of several levels.
 
-    The gain of a band is the power of the output over that of the input, over all utterances. They
-    contain the pauses of speech, because an aid may treat a steady noise as noise.
+    The gain of a band is the mean power of the outputs over that of the inputs, in dB. The inputs
+    are speech with its pauses, because an aid may treat a steady sound as noise.
 
     Args:
         aid: The hearing aid.
         ear: The audiogram.
         speech: Utterances at 16 kHz. Shape: (utterances, time).
-        levels: Levels in dB SPL that every utterance has in turn.
+        levels: Levels in dB SPL. All utterances are processed at each of them.
 
     Returns:
         ``gain_db``, gains in dB of shape (levels, 24), and its axes ``levels`` (dB SPL) and
@@ -124,14 +124,16 @@ def measure_gain_curve(
 
 
 def mean_band_levels(signals: Sequence[Tensor], *, hearing_level: bool = False) -> list[float]:
-    """Compute the mean level of several signals in each of 24 ERB-wide bands.
+    """Compute the mean level of several signals in each of 24 bands of equal width in ERBs.
+
+    Powers are averaged over time and over the signals.
 
     Args:
         signals: Signals at 16 kHz in pascals. Shape of each: (time,).
         hearing_level: Return levels in dB HL, relative to the threshold of a normal ear, instead
             of dB SPL.
 
-    Returns: One level per band, for the frequencies of ``measure_gain_curve``.
+    Returns: One level per band, for the 24 ``frequencies`` that ``measure_gain_curve`` returns.
 
     >>> len(mean_band_levels([torch.ones(16000)]))
     24
@@ -180,9 +182,10 @@ def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
 
 
 def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str, Any]:
-    """Measure loudness errors and distortion of a hearing aid for tones of six frequencies.
+    """Measure loudness errors and distortion of a hearing aid for steady tones.
 
-    Speech does not reveal an aid that removes steady sounds.
+    The frequencies of the tones are the six ``TONES``. Measurements with speech do not reveal an
+    aid that removes steady sounds.
 
     Args:
         aid: The hearing aid.
@@ -220,8 +223,8 @@ def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, A
 
     Returns:
         ``look_ahead_ms``, by how many ms an output changes before its input; ``quiet_gain_db``, the
-        gains in dB for white noise at each of ``QUIET_LEVELS``; and ``cpu_ms``, the processor time
-        in ms for one second of sound on one thread.
+        gains in dB for white noise at 25 and at 40 dB SPL (``QUIET_LEVELS``); and ``cpu_ms``, the
+        processor time in ms for one second of sound on one thread.
 
     Raises:
         ValueError: The aid fails.
@@ -263,7 +266,7 @@ def measure_look_ahead(
     """Return how many samples ahead of its input an aid's output depends on.
 
     From a position on, another sound replaces the input. The result is how many samples before this
-    position the output changes, by more than 1e-4 of its peak.
+    position the output changes by more than 1e-4 of the output's peak.
 
     Args:
         aid: Function (signal, ear) -> output: a hearing aid for one ear, or aids for both ears.
@@ -315,7 +318,8 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
             kind = getattr(output, "shape", type(output).__name__)
             problem = "NaN or infinite samples" if is_waveform else kind
             raise ValueError(
-                f"expected a finite output of shape {tuple(signal.shape)}, got {problem}"
+                f"expected a finite output of shape {tuple(signal.shape)} from the aid, got "
+                f"{problem}"
             )
         lengths = len(signal), len(output)
         samples = common_length(lengths, NEURO_RATE, ("the input", "the output"))

@@ -55,7 +55,8 @@ class Unaided(nn.Module):
 class AtLevelOf(nn.Module):
     """Hearing aid whose output is scaled to the RMS level of another aid's output.
 
-    HASPI rewards any gain, so that aids are compared at equal level.
+    Both aids process the same input. HASPI rewards any gain, so that aids are compared at equal
+    level.
 
     Args:
         aid: The aid whose output is returned.
@@ -77,10 +78,10 @@ class AtLevelOf(nn.Module):
 class EqualiserLike(nn.Module):
     """Linear filter with the mean gain that a hearing aid has for speech, measured for each ear.
 
-    What the aid achieves beyond this filter is not due to gain.
+    The filter is used as a condition: where the aid has a higher score, the reason is not its gain.
 
     Args:
-        aid: The aid.
+        aid: The aid whose gain is measured.
         utterances: Speech at 16 kHz with which the gain is measured. Shape: (utterances, time).
         levels: Levels of the speech in dB SPL, over which the gain in dB is averaged.
 
@@ -105,7 +106,10 @@ class EqualiserLike(nn.Module):
         return _equalise_bands(waveform, _GAINS[key])
 
     def gains_db(self, audiogram: Audiogram) -> list[float]:
-        """Measure the aid's mean gain in dB in 24 bands, rounded to 0.1 dB."""
+        """Measure the aid's mean gain for an ear, in dB, rounded to 0.1 dB, in 24 bands.
+
+        The bands are those of ``measure_gain_curve``. The lowest gain is -100 dB.
+        """
         curve = measure_gain_curve(self.aid, audiogram, self.utterances, self.levels)
         mean = np.mean(curve["gain_db"], 0).clip(_LOWEST_GAIN_DB, None)
         return [round(gain, 1) for gain in mean.tolist()]
@@ -125,12 +129,11 @@ def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
 
 
 class PluginAid(nn.Module):
-    """Hearing aid of a user for two ears.
-
-    It is a function ``(waveform, listener, sample_rate) -> waveform``.
+    """Hearing aid for two ears that a user has written as a function, which is loaded by its name.
 
     Args:
-        name: ``package.module:name`` or ``path/to/file.py:name``.
+        name: ``package.module:name`` or ``path/to/file.py:name`` of a function ``(waveform,
+            listener, sample_rate) -> waveform``.
         sample_rate: Sample rate in Hz with which the function is called.
 
     >>> PluginAid("builtins:max", 16000)
@@ -159,10 +162,10 @@ class Enhanced(nn.Module):
     """Hearing aid behind an enhancer, which reduces the noise of the aid's input.
 
     Args:
-        enhancer: Enhancer of signals in pascals.
+        enhancer: Function ``(waveform, sample_rate) -> waveform`` for signals in pascals.
         aid: The aid.
-        sample_rate: Sample rate in Hz.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0 for the aid.
+        sample_rate: Sample rate of all signals in Hz.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0 in the inputs and outputs.
 
     >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
@@ -197,11 +200,11 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
         names: ``package.module:name`` or ``path/to/file.py:name`` of each function.
 
     Returns:
-        The enhancers by the part of their names after the colon.
+        The enhancers, each under the name of its function, the part of its name after the colon.
 
     Raises:
         ValueError: An enhancer cannot be loaded, its output for speech is not a waveform or not
-            time-aligned, or two have the same name after the colon.
+            time-aligned, or two functions have the same name.
 
     >>> load_enhancers([])
     {}
@@ -224,7 +227,8 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
 def output_limit_spl(aid: Any) -> float | None:
     """Return the peak in dB SPL that a hearing aid promises not to exceed, or None.
 
-    It is the attribute ``limit_spl`` of the aid or of its ``config``.
+    The peak is the attribute ``limit_spl`` of the aid's ``config`` if it has one, or else of the
+    aid.
 
     >>> output_limit_spl(Unaided()) is None
     True

@@ -133,7 +133,7 @@ def evaluate_scenes(
         out: Folder of the results.
         scenes_listeners: JSON file with the names of the listeners of each scene; by default all
             scenes and listeners are combined.
-        stride: N for every n-th pair of scene and listener. 15 gives the challenges' small test.
+        stride: Use every n-th pair of scene and listener. 15 gives the challenges' small test.
         enhancers: ``package.module:name`` of functions that reduce noise before each aid.
         measures: Measures in addition to HASPI and HASQI.
         linked: Whether one level sets the gains of both ears, in compensators that support it.
@@ -144,8 +144,8 @@ def evaluate_scenes(
             and of all scores.
 
     Returns:
-        The evaluation of all conditions, ``unaided`` first. Its detail ``look_ahead_ms`` is by
-        condition, and None for an aid that fails on the first pair.
+        The evaluation of all conditions, ``unaided`` first. Its ``details["look_ahead_ms"]`` has
+        the measured look-ahead by condition, and None for an aid that fails on the first pair.
 
     Raises:
         ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, or
@@ -231,7 +231,7 @@ def _read_pairs(
             used lacks an ear or has a name that no file can have.
     """
     if stride < 1:
-        raise ValueError(f"expected a stride of 1 or more, got {stride}")
+        raise ValueError(f"expected a stride (--every) of 1 or more, got {stride}; change it")
     if scenes_listeners is None:
         people = read_listeners(listeners)
         names = list(product(scenes, people))[::stride]
@@ -240,15 +240,25 @@ def _read_pairs(
         people = read_listeners(listeners, {name for _, name in names})
     for scene, name in names:
         if scene not in scenes:
-            raise ValueError(f"{scenes_listeners}: there is no scene {scene!r}")
-        has_ears = people[name].left is not None and people[name].right is not None
-        if Path(name).name != name or not has_ears:
             raise ValueError(
-                f"{listeners}: expected a left and a right ear of listener {name!r}, and a name "
-                "that a file can have"
+                f"{scenes_listeners}: there are no files of scene {scene!r}; correct its name, or "
+                "add its files to the folder of the scenes"
+            )
+        for ear in EARS:
+            if getattr(people[name], ear) is None:
+                raise ValueError(
+                    f"{listeners}: listener {name!r} has no {ear} ear; add its audiogram, or leave "
+                    "the listener out"
+                )
+        if Path(name).name != name:
+            raise ValueError(
+                f"{listeners}: expected a name that a file can have, got listener {name!r}; "
+                "rename the listener"
             )
     if not names:
-        raise ValueError(f"{scenes_listeners or listeners}: no scene has a listener")
+        raise ValueError(
+            f"{scenes_listeners or listeners}: no scene has a listener; add one to the file"
+        )
     return [_Pair(scene, scenes[scene], name, people[name]) for scene, name in names]
 
 
@@ -297,14 +307,23 @@ def _signal_folders(conditions: Sequence[Condition], root: Path) -> dict[str, Pa
     """Return the folder of each condition's signals.
 
     Raises:
-        ValueError: Two conditions would have the same folder.
+        ValueError: Two conditions would have the same folder, or one no folder.
     """
-    names = {c.name: re.sub(r"[^\w.+-]+", "-", c.name).strip(".-") for c in conditions}
-    if len({*names.values(), ""}) <= len(names):
-        raise ValueError(
-            f"two of the labels {', '.join(names)} would have the same folder; rename one of them"
-        )
-    return {condition: root / name for condition, name in names.items()}
+    labels: dict[str, str] = {}
+    for condition in conditions:
+        name = re.sub(r"[^\w.+-]+", "-", condition.name).strip(".-")
+        if not name:
+            raise ValueError(
+                f"expected a letter or a digit in the label {condition.name!r}, because it names a "
+                "folder; rename it"
+            )
+        if name in labels:
+            raise ValueError(
+                f"the labels {labels[name]!r} and {condition.name!r} would have the same folder, "
+                f"{root / name}; rename one of them"
+            )
+        labels[name] = condition.name
+    return {label: root / name for name, label in labels.items()}
 
 
 @torch.no_grad()
@@ -410,17 +429,26 @@ def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:
         signal[:, :samples].double().square().mean(-1, keepdim=True)
         for signal in (reference, in_room)
     )
-    if not bool(power.all()):
-        raise ValueError(f"expected sound in each channel of {scene.reference}, got silence")
+    for ear, is_sounding in zip(EARS, power.any(-1).tolist(), strict=True):
+        if not is_sounding:
+            raise ValueError(
+                f"{scene.reference}: the {ear} channel is silent, so it cannot get the level of "
+                f"{scene.in_room}; write the target to it"
+            )
     return mix, reference * (wanted / power).sqrt()
 
 
 def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:
     """Read a file with one of some numbers of channels. Shape: (channels, time)."""
     waveform, file_rate = read_audio(path)
-    if file_rate != rate or len(waveform) not in numbers:
+    if file_rate != rate:
         raise ValueError(
-            f"{path} has {len(waveform)} channels at {file_rate} Hz; expected "
-            f"{' or '.join(map(str, numbers))} channels at {rate} Hz, as in the first scene"
+            f"{path}: expected the sample rate of the first scene, {rate} Hz, got {file_rate} Hz; "
+            "resample the file"
+        )
+    if len(waveform) not in numbers:
+        raise ValueError(
+            f"{path}: expected {' or '.join(map(str, numbers))} channels, for a left and a right "
+            f"ear, got {len(waveform)}; replace the file"
         )
     return waveform

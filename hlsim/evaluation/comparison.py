@@ -38,16 +38,17 @@ class Comparison:
         overall: Statistics over all items, with p values that are not adjusted.
         level_before_mean, level_after_mean: Mean output levels of the same items in dB SPL; NaN if
             they are not known.
-        by_severity: The same statistics for the items of each degree of hearing loss that occurs.
+        by_severity: The same statistics for the items of each degree of hearing loss that occurs,
+            under its name, such as ``"mild"``.
         unit: Column of the table that several items share, such as ``"listener"``.
         unit_means: The same statistics over one mean score per unit, because items of one listener
             are not independent; None unless there are two units or more.
         left_out: Number of items that lack one of the two scores.
-        p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state.
-        planned: Whether the comparison was planned before the scores were known. Its p values are
-            not adjusted; those of all other comparisons are adjusted by Holm over the family of the
-            measure.
-        family: Number of comparisons by the measure for which the p values are adjusted.
+        p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state, adjusted by Holm
+            unless the comparison is planned; None if a test is not defined.
+        planned: Whether the comparison was planned before the scores were known, so that its p
+            values are not adjusted.
+        family: Number of comparisons by the same measure for which the p values are adjusted.
 
     >>> import pandas
     >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
@@ -83,7 +84,7 @@ class Comparison:
 
     @property
     def equal_level(self) -> bool:
-        """Whether the mean levels are too close to explain a change of the score."""
+        """Whether the mean output levels differ by less than 1 dB, too little to matter."""
         return abs(self.level_change) < _LEVEL_TOLERANCE_DB
 
     def to_dict(self) -> dict[str, Any]:
@@ -194,12 +195,13 @@ def compare(
     planned: Collection[PlannedComparison] = (),
     unit: str = "listener",
 ) -> list[Comparison]:
-    """Compare each condition of a study with every earlier one.
+    """Compare the conditions of a study in pairs, by one or more scores.
 
     Args:
         table: Table of ``run_study``, with one row per item and condition.
         measures: Columns of scores.
-        baseline: Name of the only condition with which all others are compared.
+        baseline: Name of the condition with which all others are compared. None compares each
+            condition with every earlier one.
         planned: Comparisons that were planned before the scores were known. The p values of all
             other comparisons by the same measure are adjusted by Holm.
         unit: Column that several items share, such as ``"listener"``; their means are compared too.

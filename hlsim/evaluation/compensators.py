@@ -88,7 +88,8 @@ def evaluate_compensators(
         store: File of scores, which is created if it does not exist; None stores nothing.
         audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3.
         audiogram: Single ear for everything instead, for a compensator that was trained for it.
-        noise: Folder of recordings of noise. Every second item is then noisy, at 2.5 to 17.5 dB.
+        noise: Folder of recordings of noise. Every second item is then noisy, at signal-to-noise
+            ratios of 2.5 to 17.5 dB.
         enhancers: Names ``package.module:name`` of functions ``(waveform, sample_rate) ->
             waveform`` that reduce noise before each aid, in conditions such as ``gtcrn + NAL-R``.
         simulator: Name or folder of the Neuro-MSBG whose training loss is compared with that of
@@ -104,9 +105,10 @@ def evaluate_compensators(
             and of all scores.
 
     Returns:
-        The evaluation with the groups ``clean``, ``noisy`` and ``hard`` if they have items, and the
-        details ``gain_curves``, ``steady_tones`` and ``wearing``, see the
-        ``measure_`` functions of ``aid_properties``.
+        The evaluation with the groups ``clean``, ``noisy`` and ``hard`` (unaided HASPI below 0.6)
+        if they have items, and the details ``gain_curves``, ``steady_tones`` and ``wearing``:
+        results of ``measure_aids`` with ``measure_gain_curve``, ``measure_steady_tones`` and
+        ``measure_wearability``.
 
     Raises:
         ValueError: Data or settings are not valid, or no item has all its scores.
@@ -183,9 +185,10 @@ def _choose_ears(
 ) -> tuple[list[tuple[str, Audiogram]], dict[str, Audiogram]]:
     """Return the ears of the items and those of gain curves and tones, by name."""
     if (audiograms is None) == (audiogram is None):
+        number = "neither" if audiogram is None else "both"
         raise ValueError(
-            "expected either audiograms, a CSV file of ears, or audiogram, one ear for all items; "
-            "pass one of the two"
+            "expected either audiograms, a CSV file of ears, or audiogram, one ear for all items, "
+            f"got {number}; pass one of the two"
         )
     if audiogram is None:
         ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
@@ -242,8 +245,8 @@ def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
     if table.empty:
         first = evaluation.failures.iloc[0]
         raise ValueError(
-            "every item lacks at least one value, so that nothing can be compared; the first "
-            f"failure: {first['failure']}"
+            "every item lacks at least one value, so that nothing can be compared; the first is "
+            f"{first['name']} under {first['condition']}: {first['failure']}"
         )
     unaided = table[table["condition"] == UNAIDED].set_index("item")
     members = {

@@ -15,6 +15,7 @@ from compensators.nalr import NALR
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
+from hlsim.checks import check_names
 from hlsim.evaluation.study import Item
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import compress, mix
@@ -144,7 +145,8 @@ def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     """Return names and audiograms of the ears N2 to N6 and S1 to S3, and of those in a CSV file.
 
     An ear of the file is named by its columns ``listener`` and ``ear``, and by the number of its
-    row if another ear has this name. A standard ear that is also in the file is returned once.
+    row if another ear has this name. A row with the name and the thresholds of an earlier ear is
+    left out.
 
     Args:
         audiograms: CSV file of ears, or None.
@@ -165,7 +167,7 @@ def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
 
 
 def ear_name(audiogram: Audiogram) -> str:
-    """Return the name of a standard ear, or the thresholds of another one.
+    """Return the name of an ear if it is a standard one, and its thresholds as text otherwise.
 
     >>> ear_name(Audiogram.standard("N4")), ear_name(Audiogram([30, 40], [500, 4000]))
     ('N4', '30, 40 dB HL')
@@ -204,11 +206,9 @@ def apply_treatments(
     }
     if compensator is not None:
         functions["compensated"] = compensator
-    if not functions.keys() >= set(treatments):
-        raise ValueError(
-            f"expected inputs of {', '.join(functions)}, got {', '.join(treatments)}; the input "
-            "compensated needs a compensator"
-        )
+    elif "compensated" in treatments:
+        raise ValueError("expected a compensator for the input compensated, got none; pass one")
+    check_names(treatments, functions, "inputs")
     treated = []
     for item, treatment in product(items, treatments):
         with torch.no_grad():

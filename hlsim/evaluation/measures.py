@@ -71,7 +71,7 @@ def _score_signal(
     """Compute STOI or PESQ, which do not depend on the ear."""
     value, reason = score(item.clean, output, item.sample_rate)
     if value is None:
-        raise ValueError(reason)
+        raise ValueError(f"{name.upper()} is not defined: {reason}")
     return {name: value}
 
 
@@ -118,10 +118,12 @@ def find_measures(names: Iterable[str]) -> list[Measure]:
     ['HASPI', 'HASQI']
     """
     unique = list(dict.fromkeys(names))
-    if not unique or not all(name in MEASURES or ":" in name for name in unique):
+    unknown = [name for name in unique if name not in MEASURES and ":" not in name]
+    if unknown or not unique:
+        problem = f"got {', '.join(unknown) or 'none'}"
         raise ValueError(
-            f"expected one measure or more of {', '.join(MEASURES)} or package.module:name, got "
-            f"{', '.join(unique) or 'none'}"
+            f"expected measures among {', '.join(MEASURES)} or package.module:name, {problem}; "
+            "pass one or more of these"
         )
     for name in _PACKAGES.keys() & unique:
         require(*_PACKAGES[name])
@@ -144,7 +146,10 @@ class _PluginMeasure:
     def __call__(self, item: Item, output: Tensor) -> Values:
         values = self.function(item, output)
         if not isinstance(values, Mapping):
-            raise ValueError(f"measure {self.name} returned {values!r}; expected a dict of numbers")
+            raise ValueError(
+                f"measure {self.name} returned {values!r}; expected a dict of numbers by the name "
+                "of the column"
+            )
         return {str(column): float(value) for column, value in values.items()}
 
 
@@ -155,7 +160,7 @@ def load_measure(name: str) -> Measure:
         name: ``package.module:name`` or ``path/to/file.py:name``.
 
     Raises:
-        ValueError: It cannot be loaded.
+        ValueError: The function cannot be loaded.
 
     >>> load_measure("builtins:max").name
     'builtins:max'
@@ -251,7 +256,8 @@ OTHER_COLUMNS = (
 def network_loss(simulator: nn.Module) -> Measure:
     """Return the measure of the column ``loss_neuro``, the training loss of an aid.
 
-    It is the loss ``loss_msbg`` of ``PERCEPTION`` with a network in place of the exact MSBG.
+    The loss is ``HearingLossLoss(criterion="bands")`` through a network. The column ``loss_msbg``
+    of the measure ``PERCEPTION`` has the same loss through the exact MSBG.
 
     Args:
         simulator: The network, a Neuro-MSBG.

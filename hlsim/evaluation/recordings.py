@@ -153,7 +153,8 @@ class Recording:
         output, output_rate = self._read_channel(path)
         if output_rate != rate:
             raise ValueError(
-                f"{path}: expected the sample rate of {self.clean}, {rate} Hz, got {output_rate} Hz"
+                f"{path}: expected the sample rate of {self.clean}, {rate} Hz, got {output_rate} "
+                "Hz; resample one of the files"
             )
         return output
 
@@ -250,14 +251,19 @@ def haspi_report(
         folders = {"before": before, "after": after}
         recordings = _read_folders(clean, folders, audiogram, audiograms, **settings)
     else:
+        sources = {"clean": clean, "before": before, "after": after, "manifest": manifest}
+        passed = ", ".join(name for name, source in sources.items() if source)
         raise ValueError(
-            "expected either the folders clean and after (and before), or a manifest; pass one of "
-            "the two"
+            "expected either the folders clean and after (and before), or a manifest, got "
+            f"{passed or 'none of them'}; pass one of the two"
         )
     names = list(dict.fromkeys(name for r in recordings for name in r.outputs))
     if baseline is not None:
         if baseline not in names:
-            raise ValueError(f"there is no condition {baseline!r}; expected {', '.join(names)}")
+            raise ValueError(
+                f"there is no condition {baseline!r} for the baseline; pass one of "
+                f"{', '.join(names)}"
+            )
         names.sort(key=lambda name: name != baseline)
     return score_recordings(
         recordings,
@@ -331,7 +337,8 @@ def _check_both_ears(recordings: Iterable[Recording]) -> None:
         if sorted(names) != sorted(EARS):
             raise ValueError(
                 f"expected one left and one right ear of {name} for the better ear, got "
-                f"{', '.join(ear or 'no name' for ear in names)}"
+                f"{', '.join(ear or 'an ear without a name' for ear in names)}; add the missing "
+                "rows, or leave out better_ear (--better-ear)"
             )
 
 
@@ -387,9 +394,10 @@ def _read_folders(
         ValueError: The names differ, or a file has no audiogram.
     """
     if (audiogram is None) == (audiograms is None):
+        number = "neither" if audiogram is None else "both"
         raise ValueError(
-            "expected either audiogram, the ear of all files, or audiograms, a CSV file of ears; "
-            "pass one of the two"
+            "expected either audiogram, the ear of all files, or audiograms, a CSV file of ears, "
+            f"got {number}; pass one of the two"
         )
     speech = _files_by_name(clean)
     outputs = {name: _files_by_name(folder) for name, folder in folders.items() if folder}
@@ -597,6 +605,8 @@ def _files_by_name(folder: str | Path) -> dict[str, Path]:
     for path in find_audio(folder):
         name = _without_extension(path.relative_to(folder))
         if name in files:
-            raise ValueError(f"{files[name]} and {path} have the same name; keep one of them")
+            raise ValueError(
+                f"{files[name]} and {path} differ in their extension only; keep one of them"
+            )
         files[name] = path
     return files

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from hlsim.checks import check_number
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
@@ -49,7 +50,7 @@ def evaluate_simulators(
     seed: int = 0,
     **running: Any,
 ) -> Evaluation:
-    """Compare simulators with the exact MSBG, or another teacher.
+    """Compare simulators with a teacher, whose output they should match: the exact MSBG by default.
 
     Values are stored as they become known. An interrupted run can be continued, and a run with one
     more simulator computes only its values.
@@ -95,13 +96,14 @@ def evaluate_simulators(
     """
     require("pandas", "eval")
     require("pystoi", "eval")
-    is_complete = items > 0 and simulators and inputs and levels and seconds >= _SHORTEST_SECONDS
-    if not is_complete or len(set(inputs)) < len(inputs):
-        raise ValueError(
-            f"expected at least one simulator, item and level, items of {_SHORTEST_SECONDS:g} s or "
-            f"more, and different inputs, got {len(simulators)} simulators, {items} items, "
-            f"{len(levels)} levels, {seconds:g} s and the inputs {', '.join(inputs) or 'none'}"
-        )
+    check_number("items", items, 1)
+    check_number("seconds", seconds, _SHORTEST_SECONDS)
+    for name, values in {"simulators": simulators, "levels": levels, "inputs": inputs}.items():
+        if not values:
+            raise ValueError(f"expected one or more {name}, got none; pass at least one")
+    for name in inputs:
+        if list(inputs).count(name) > 1:
+            raise ValueError(f"expected different inputs, got {name} twice; pass it once")
     settings: dict[str, Any] = {
         "items": items,
         "seconds": seconds,
@@ -205,8 +207,8 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
 def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
     """Return an item to be played on the page, and the teacher's output for it.
 
-    It has the first treatment and, if there are such items, a moderate loss and loud, clean speech:
-    much of it is lost, and much is still perceived.
+    The item has the first treatment and, if there are such items, a moderate loss and loud, clean
+    speech, of which the ear misses much and still perceives much.
 
     Args:
         evaluation: Evaluation of ``evaluate_simulators``.

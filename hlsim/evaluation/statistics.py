@@ -86,13 +86,18 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     0.1
     """
     first, second = (np.array(list(scores), dtype=np.float64) for scores in (before, after))
-    is_finite = np.isfinite(first).all() and np.isfinite(second).all()
-    if not (0 < len(first) == len(second) and is_finite):
+    if not 0 < len(first) == len(second):
         raise ValueError(
-            "expected finite scores before and after for the same items, got "
-            f"{np.isfinite(first).sum()} finite of {len(first)} scores before and "
-            f"{np.isfinite(second).sum()} of {len(second)} after"
+            "expected scores of one or more items before and after, got "
+            f"{len(first)} before and {len(second)} after; pass both scores of each item"
         )
+    for name, scores in (("before", first), ("after", second)):
+        if not np.isfinite(scores).all():
+            item = int(np.isfinite(scores).argmin())
+            raise ValueError(
+                f"expected finite scores {name}, got {scores[item]} for item {item}; leave the "
+                "item out of both"
+            )
     largest = max(float(np.abs(first).max()), float(np.abs(second).max()))
     tolerance = _RELATIVE_TOLERANCE * largest
     difference = second - first
@@ -160,7 +165,7 @@ def bootstrap_interval(
     data = np.asarray(list(values), dtype=np.float64)
     n = len(data)
     if n < MIN_ITEMS_FOR_INTERVAL:
-        raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}")
+        raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}; add items")
     generator = np.random.default_rng(seed)
     at_once = max(1, _DRAWN_INDICES // n)
     sizes = [min(at_once, resamples - start) for start in range(0, resamples, at_once)]

@@ -40,7 +40,10 @@ class ScoreStore:
         try:
             lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")
         except OSError as error:
-            raise ValueError(f"{path}: cannot read stored scores ({error})") from error
+            raise ValueError(
+                f"{path}: cannot read stored scores ({error}); pass the file that an earlier run "
+                "wrote, or the path of a new one"
+            ) from error
         for line in lines:
             # A line that is cut short, or is not a record, is ignored.
             with suppress(ValueError, KeyError, TypeError, AttributeError):

@@ -253,7 +253,8 @@ def run_study(
         measure has its values.
 
     Raises:
-        ValueError: No scheduler answers, or the store cannot be written.
+        ValueError: ``jobs`` is less than 1, no scheduler answers, the store cannot be written, or
+            two measures return the same column.
         MissingExtraError: A package is not installed.
 
     >>> signal = torch.ones(1600)
@@ -353,7 +354,7 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     output = condition.output(item)
     if not output.isfinite().all():
         raise ValueError(
-            f"expected finite samples of the output of {condition.name}, got NaN or infinite ones"
+            f"expected finite samples in the output of {condition.name}, got NaN or infinite ones"
         )
     lengths = item.clean.shape[-1], output.shape[-1]
     samples = common_length(lengths, item.sample_rate, (item.name, f"its output {condition.name}"))
@@ -388,7 +389,10 @@ def _make_table(
                 reasons.append(values)
                 continue
             for column in row.keys() & values.keys():
-                raise ValueError(f"{measure.name} returns {column}, a column that exists already")
+                raise ValueError(
+                    f"{measure.name} returns {column}, a column that exists already; rename it in "
+                    "the measure"
+                )
             row |= values
         rows.append({**row, "failure": "; ".join(dict.fromkeys(reasons)) or None})
     table = require("pandas", "eval").DataFrame(rows)
