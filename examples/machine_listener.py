@@ -193,6 +193,24 @@ class Whisper:
         tokeniser = Tokenizer(vocabulary, model.is_multilingual, **task)
         return model, tokeniser, FeatureExtractor()
 
+    @property
+    def prompt(self) -> list[int]:
+        """Tokens before each text: the start, the language and the task, and no timestamps."""
+        _, tokeniser, _ = self._parts
+        return [*tokeniser.sot_sequence, tokeniser.no_timestamps]
+
+    @property
+    def mel_filters(self) -> Tensor:
+        """Weights of the 201 frequencies of a spectrum in mel bands. Shape: (bands, 201)."""
+        _, _, compute_features = self._parts
+        return torch.from_numpy(np.asarray(compute_features.mel_filters, np.float32))
+
+    def encode(self, text: str) -> list[int]:
+        """Return the tokens of a text. A word's token begins with the space before it."""
+        _, tokeniser, _ = self._parts
+        tokens: list[int] = tokeniser.encode(text)
+        return tokens
+
     def __call__(self, waveform: NDArray[np.float32]) -> str:
         """Return the text of a waveform at 16 kHz. Shape: (time,)."""
         import ctranslate2
@@ -205,10 +223,9 @@ class Whisper:
         frames = math.ceil(frames / FRAMES_PER_STEP) * FRAMES_PER_STEP
         padded = np.pad(scaled, (0, frames * RATE // 100 - len(scaled)))
         features = compute_features(padded, padding=0)[None, :, :frames]
-        prompt = [*tokeniser.sot_sequence, tokeniser.no_timestamps]
         result = model.generate(
             ctranslate2.StorageView.from_array(np.ascontiguousarray(features, np.float32)),
-            [prompt],
+            [self.prompt],
             beam_size=1,
             max_length=100,
             no_repeat_ngram_size=5,
