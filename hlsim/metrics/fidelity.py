@@ -143,7 +143,7 @@ def _band_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarra
 def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
     """Compute the short-time objective intelligibility (STOI), about 0 to 1, with pystoi.
 
-    Silence and less than 0.4 s of speech have no score.
+    Silence and less than 0.4 s of speech have no score, but a reason instead.
 
     Source: Taal, Hendriks, Heusdens and Jensen (2011).
 
@@ -167,7 +167,8 @@ def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
 def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
     """Compute wide-band PESQ, the quality of speech from about 1 to 4.6, with the package pesq.
 
-    Signals are resampled to 16 kHz. Silence and signals without detectable speech have no score.
+    Signals are resampled to 16 kHz. Silence and signals without detectable speech have no score,
+    but a reason instead.
     Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts, which ends the process. If you
     score minutes of speech, use ``run_study`` or an evaluation command with ``jobs`` of 2 or more:
     only the scores of the item that crashes are then missing.
@@ -270,9 +271,17 @@ def _check_scores(
     x = np.array(list(expected_scores), dtype=np.float64)
     y = np.array(list(scores), dtype=np.float64)
     if x.shape != y.shape or x.ndim != 1:
-        raise ValueError(f"expected as many scores on both sides, got {x.size} and {y.size}")
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise ValueError("expected finite scores, got NaN or infinity")
+        raise ValueError(
+            f"expected as many scores as expected scores, got {y.size} and {x.size}; pass both of "
+            "each item"
+        )
+    for name, array in (("expected_scores", x), ("scores", y)):
+        if not np.isfinite(array).all():
+            item = int(np.isfinite(array).argmin())
+            raise ValueError(
+                f"expected finite numbers in {name}, got {array[item]} for item {item}; leave the "
+                "item out of both"
+            )
     return x, y
 
 
@@ -325,8 +334,11 @@ def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.
         ValueError: The shapes differ, a sample is not finite, or the reference is silent.
     """
     x, y = _as_equal_length(reference, estimate)
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise ValueError("expected finite samples, got NaN or infinity")
+    for name, samples in (("reference", x), ("estimate", y)):
+        if not np.isfinite(samples).all():
+            raise ValueError(
+                f"expected finite samples of the {name}, got NaN or infinity; remove them"
+            )
     if not x.any():
         raise ValueError(
             "expected a reference that is not silent, because errors are relative to it"

@@ -95,7 +95,8 @@ def haaqi(
         Scores. Shape: (...,).
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Signals of other shapes, too short, or not finite; clean music that is silent or
+            below 20 dB SPL; a rate, level, audiogram, length or seed out of range.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> chord = sum(torch.sin(2 * torch.pi * hz * seconds) for hz in (220.0, 277.2, 329.6))
@@ -134,7 +135,8 @@ class HaaqiReference(QualityReference):
             are computed for each score.
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Clean music that lasts less than 0.7 s, is not finite, silent or below 20 dB
+            SPL; a rate, level, audiogram or length out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

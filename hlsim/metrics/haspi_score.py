@@ -115,8 +115,8 @@ def haspi(
 class HaspiReference(Reference):
     """Clean speech that is prepared once for the HASPI of many outputs of aids.
 
-    It does not depend on an audiogram, because the clean speech is that of a normal ear. In float32
-    it takes about 4 MB per second of speech.
+    Clean speech reaches a normal ear, so that the impaired ear is an argument of ``score`` only. In
+    float32 the features of clean speech take about 4 MB per second.
 
     Args:
         clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
@@ -129,7 +129,8 @@ class HaspiReference(Reference):
             takes less memory.
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Clean speech that lasts less than 0.7 s, is not finite, silent or below 20 dB
+            SPL; a rate, level or length out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -189,7 +190,8 @@ class HaspiReference(Reference):
             Scores, 0 to 1. Shape: (...,).
 
         Raises:
-            ValueError: As for ``haspi``.
+            ValueError: Outputs of another shape, not finite or on another device; an audiogram or
+                seed out of range.
         """
         ears = ear_model.hair_cells(self._signals.thresholds(audiogram))
         return _intelligibility(self._compare(processed, noise, seed, ears))

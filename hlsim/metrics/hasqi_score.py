@@ -60,7 +60,8 @@ def hasqi(
         Scores. Shape: (...,).
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
+            or below 20 dB SPL; a rate, level, audiogram, length or seed out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -95,7 +96,8 @@ class HasqiReference(QualityReference):
             are computed for each score.
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Clean speech that lasts less than 0.7 s, is not finite, silent or below 20 dB
+            SPL; a rate, level, audiogram or length out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

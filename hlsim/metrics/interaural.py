@@ -54,15 +54,18 @@ class Interaural(NamedTuple):
 
 
 def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
-    """Compute the differences of level and time between two ears over a whole signal.
+    """Compute the differences of level and time between two ears over a whole signal, per octave.
 
-    The time difference is the delay with the largest
-    cross-correlation of the waveforms. Above 1.5 kHz, listeners perceive delays of the envelope
-    instead.
+    The time difference is the delay with the largest cross-correlation of the waveforms in the
+    octave. Above 1.5 kHz, listeners perceive delays of the envelope instead.
 
     Args:
         waveform: Waveforms of the left and the right ear. Shape: (..., 2, time).
-        sample_rate: Sample rate in Hz.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+
+    Returns:
+        Level difference in dB, time difference in microseconds, and coherence. Shape of each:
+        (..., 5).
 
     Raises:
         ValueError: The waveform has another shape, or the rate is out of range.
@@ -123,8 +126,9 @@ def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tenso
     """Compute how much an aid changes the differences between the ears, as a loss for training.
 
     Gains and delays that are equal in both ears are ignored. The loss of an octave is the error of
-    the level difference in bels, plus 1 minus the cosine of the error of the phase difference. The
-    result is a mean over octaves, in which octaves where clean speech is soft have less weight.
+    the level difference in bels (10 dB), plus 1 minus the cosine of the error of the phase
+    difference. The result is a mean over octaves, in which octaves where clean speech is soft have
+    less weight.
 
     Args:
         processed: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).

@@ -75,12 +75,16 @@ def cut_to_common_length(
     """
     check_waveform(processed, "processed")
     check_waveform(clean, "clean")
-    if processed.shape[:-1] != clean.shape[:-1] or processed.device != clean.device:
+    if processed.shape[:-1] != clean.shape[:-1]:
         raise ValueError(
-            "expected processed and clean of the same shape and on the same device, got "
-            f"{tuple(processed.shape)} on {processed.device} and {tuple(clean.shape)} on "
-            f"{clean.device}; pass one clean signal for each processed one, and move both with "
-            ".to(device)"
+            "expected processed and clean of the same shape, got "
+            f"{tuple(processed.shape)} and {tuple(clean.shape)}; pass one clean signal for each "
+            "processed one"
+        )
+    if processed.device != clean.device:
+        raise ValueError(
+            f"expected processed and clean on the same device, got {processed.device} and "
+            f"{clean.device}; move both with .to(device)"
         )
     times = processed.shape[-1], clean.shape[-1]
     time = common_length(times, check_rate(sample_rate), ("processed", "clean"))

@@ -67,9 +67,11 @@ class QualityParts(NamedTuple):
 class Comparison(NamedTuple):
     """Features of a clean signal and of the output of an aid in one ear, which give a score.
 
+    The ear divides sounds into 32 channels, bands of frequencies.
+
     Attributes:
-        clean_levels: Smoothed levels of the clean signal in dB over threshold. Shape: (items, 32,
-            segments).
+        clean_levels: Levels of the clean signal in dB over threshold, smoothed over segments of 16
+            ms (HASQI) or 8 ms (HAAQI). Shape: (items, 32, segments).
         processed_levels: The same of the output.
         coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
             (items, 32, segments).
@@ -108,7 +110,8 @@ class QualityReference(Reference):
             are computed for each score.
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Clean signals that last less than 0.7 s, are not finite, silent or below 20 dB
+            SPL; a rate, level, audiogram or length out of range.
 
     >>> from hlsim import example_speech
     >>> from hlsim.metrics import HasqiReference

@@ -332,8 +332,8 @@ class HASPI(_MeanScore):
 class HASQI(_MeanScore):
     """Mean HASQI v2, the quality of processed speech, over all items since the last ``reset``.
 
-    The arguments and attributes are those of ``HASPI``. The reference is clean speech amplified by
-    NAL-R, and the score falls with every difference from it. On a CPU one second of audio takes
+    The arguments and attributes are those of ``HASPI``. Outputs are compared with clean speech that
+    NAL-R has amplified, and every difference lowers the score. On a CPU one second of audio takes
     about 0.2 s.
 
     >>> from hlsim import example_speech
@@ -348,8 +348,9 @@ class HASQI(_MeanScore):
 class HAAQI(_MeanScore):
     """Mean HAAQI v1, the quality of processed music, over all items since the last ``reset``.
 
-    The arguments and attributes are those of ``HASPI``. The reference is clean music amplified by
-    NAL-R. With stereo music the better ear counts, and ``ears`` has the mean of each ear.
+    The arguments and attributes are those of ``HASPI``. Outputs are compared with clean music that
+    NAL-R has amplified. With stereo music the better ear counts, and the attribute ``ears`` has the
+    mean of each ear.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> music = 0.02 * torch.sin(2 * torch.pi * 220.0 * seconds) * torch.exp(-3 * seconds)

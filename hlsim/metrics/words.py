@@ -144,24 +144,33 @@ def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
         ValueError: There are no scores, or they are not HASPI scores.
     """
     array = np.asarray(scores, dtype=np.float64)
-    if array.ndim != 1 or not len(array) or not ((array >= 0.0) & (array <= 1.0)).all():
+    if array.ndim != 1 or not len(array):
         raise ValueError(
-            f"expected {name} to be one or more HASPI scores from 0 to 1 of shape (items,), "
-            f"got {scores!r}"
+            f"expected {name} to be HASPI scores of one or more items, shape (items,), got shape "
+            f"{array.shape}; pass one score per item"
+        )
+    is_score = (array >= 0.0) & (array <= 1.0)
+    if not is_score.all():
+        item = int(is_score.argmin())
+        raise ValueError(
+            f"expected {name} to be HASPI scores from 0 to 1, got {array[item]:g} for item {item}; "
+            "leave the item out"
         )
     return array, float(array.mean())
 
 
 def simulate_changes(curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0) -> Array:
-    """Simulate by how much listeners understand more words with the second of two aids.
+    """Simulate how the share of words that listeners understand changes from one aid to another.
 
     Args:
         curve: Parameters of the model.
-        aids: For each aid, HASPI of each sentence and the mean HASPI of the aid.
+        aids: For the first and the second aid, a pair: HASPI of each sentence with shape (items,),
+            and their mean.
         seed: Seed of the simulated listeners.
 
     Returns:
-        Change of the proportion of words for each listener. Shape: (4000,).
+        Proportion of words with the second aid minus that with the first, for each simulated
+        listener. Shape: (4000,).
 
     >>> scores = np.full(20, 0.6)
     >>> simulate_changes(load_curve(), [(scores, 0.6), (scores, 0.6)]).shape

@@ -141,7 +141,7 @@ def test_undefined_values_are_none_and_never_nan(
     [([0.1, 0.2], [0.1]), ([], []), ([0.1, math.nan], [0.1, 0.2]), ([0.1, 0.2], [math.inf, 0.2])],
 )
 def test_invalid_scores_are_rejected(before: list[float], after: list[float]) -> None:
-    with pytest.raises(ValueError, match="expected (finite )?scores"):
+    with pytest.raises(ValueError, match=r"expected (finite )?scores"):
         paired_comparison(before, after)
     with pytest.raises(ValueError, match="expected 6 values or more"):
         bootstrap_interval(before)

@@ -77,6 +77,12 @@ class CleanSpeech:
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         score_name: Name of the score, for messages.
 
+    Attributes:
+        shape: Shape of ``clean`` without time.
+        batches: Clean signals in groups that are computed together.
+        dtype: Precision of the scores, float32 or float64.
+        device: Device of the clean signals and of the scores.
+
     Raises:
         ValueError: The signals are too short or not finite, or a rate, level or length is out of
             range.
@@ -158,26 +164,28 @@ class CleanSpeech:
         if seconds < SHORTEST_SECONDS:
             raise ValueError(
                 f"{label} lasts {seconds:.2g} s; expected {SHORTEST_SECONDS} s or more, because "
-                f"{self._score_name} means nothing below"
+                f"{self._score_name} means nothing below; pass longer signals"
             )
         if not is_finite:
-            raise ValueError(f"{label} holds samples that are NaN or infinite")
+            raise ValueError(
+                f"{label} holds samples that are NaN or infinite; leave this signal out"
+            )
         level = 10.0 * math.log10(max(variance, 1e-30)) + self.full_scale
         length = last - first + 1
         reason = ""
         if not is_sounding:
-            reason = "is silent, every sample is zero"
+            reason = "is silent, every sample is zero; leave this signal out"
         elif level < LOWEST_REFERENCE_SPL:
             reason = (
                 f"is at {level:.1f} dB SPL with full_scale_spl {self.full_scale:g}; expected "
                 f"{LOWEST_REFERENCE_SPL:g} dB SPL or more, because {self._score_name} means "
-                "nothing below"
+                "nothing below; calibrate the signal, for example with hlsim.load_audio"
             )
         elif length < MIN_AUDIBLE_SAMPLES:
             reason = (
                 f"has sound for only {1000.0 * length / RATE:.2g} ms; expected "
                 f"{1000.0 * MIN_AUDIBLE_SAMPLES / RATE:g} ms or more, as {self._score_name} "
-                "requires"
+                "requires; leave this signal out"
             )
         if reason:
             raise UnscorableError(f"{label} {reason}")
@@ -198,8 +206,12 @@ class CleanSpeech:
         """
         check_waveform(processed, "processed", full_scale_spl=self.full_scale)
         processed, clean = cut_to_common_length(processed, self.clean, self._input_rate)
-        if not bool(processed.detach().isfinite().all()):
-            raise ValueError("processed holds samples that are NaN or infinite")
+        is_finite = processed.detach().isfinite().all(-1).flatten()
+        if not bool(is_finite.all()):
+            item = f", item {int(is_finite.int().argmin())}," if len(is_finite) > 1 else ""
+            raise ValueError(
+                f"processed{item} holds samples that are NaN or infinite; leave this signal out"
+            )
         time, signals = clean.shape[-1], self
         if time < self.clean.shape[-1]:
             ends = torch.tensor(self._ends).clamp_max(time).reshape(self.shape)
@@ -207,7 +219,7 @@ class CleanSpeech:
         return processed.reshape(-1, time), signals
 
     def thresholds(self, audiogram: AudiogramLike | None, *, host: bool = False) -> Tensor:
-        """Return the thresholds of the ear that hears each item.
+        """Return the thresholds of the ear of each item.
 
         Args:
             audiogram: One ear, or one for each item; None raises ValueError.

@@ -102,7 +102,7 @@ def _smoothing() -> NDArray[np.float64]:
 def mean_amplitude(levels: Tensor) -> Tensor:
     """Return the contribution of some channels to the mean amplitude over all 32 channels.
 
-    The mean, the sum of the contributions of all channels, tells whether a frame is audible.
+    The mean, the sum of the contributions of all channels, shows whether a frame is audible.
 
     Args:
         levels: Frames of these channels in dB over threshold. Shape: (items, channels, frames).
@@ -124,10 +124,10 @@ def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
 
     Args:
         levels: Frames of these channels in dB over threshold. Shape: (..., channels, frames).
-        channels: The channels.
+        channels: Which of the 32 channels of the ear these are.
 
     Returns:
-        Coefficients. Shape: (..., 5, frames).
+        Contributions. Shape: (..., 5, frames).
 
     >>> cepstrum(torch.ones(32, 4)).shape
     torch.Size([5, 4])
@@ -159,7 +159,10 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
     is_audible = frames_of.cut(amplitude) > 10.0 ** (SILENCE_DB / 20.0)
     audible = Extent(tuple(is_audible.sum(-1).tolist()))
     if min(audible.ends) < 2:
-        raise UnscorableError("clean is below the threshold of hearing")
+        raise UnscorableError(
+            "clean is below the threshold of hearing in all frames or all but one; raise its "
+            "level, or leave the item out"
+        )
     indices = (~is_audible).byte().argsort(dim=-1, stable=True)
     return indices[:, : audible.longest], audible
 
@@ -313,7 +316,9 @@ def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -
     folded normal distribution.
 
     Args:
-        reference, processed, extent: The arguments of ``correlation``.
+        reference, processed: Cepstral coefficients of the audible frames of clean speech and of the
+            output. Shape: (items, 5, audible).
+        extent: Number of audible frames of each item.
 
     Returns:
         Mean correlation at each rate of modulation. Shape: (items, 10).

@@ -58,6 +58,8 @@ NEPERS_PER_DB = math.log(10.0) / 20.0
 def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
     """Return the number of segments of each item.
 
+    Segments overlap by half. The first and the last one are half as long.
+
     Args:
         extent: Number of samples of each item before padding.
         segment: Length of a segment in samples, an even number.
@@ -191,7 +193,7 @@ def _segment_kinds(counts: Extent, device: torch.device) -> Tensor:
 def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
     """Compute the spectrum and the energy of each segment of the fine structure.
 
-    Segments are windowed, and their means are subtracted.
+    Segments of 16 ms are windowed, and their means are subtracted.
 
     Args:
         motion: Motion of the basilar membrane, zero after the end of each item. Shape: (items,
@@ -240,9 +242,9 @@ def _inside() -> NDArray[np.float64]:
 def coherence(
     reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor], counts: Extent
 ) -> Tensor:
-    """Compute how similar the fine structures of two signals are in each segment.
+    """Compute how similar the fine structures of two signals are in each segment of 16 ms.
 
-    It is the largest normalised cross-covariance over delays of up to 1 ms.
+    The similarity is the largest normalised cross-covariance over delays of up to 1 ms.
 
     Args:
         reference, processed: Spectra and mean squares of both signals by ``segment_spectra``.
@@ -330,8 +332,8 @@ def channel_shares(levels: Tensor) -> Tensor:
 def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
     """Compute the similarity of two long-term spectra from their differences.
 
-    It is 1 - 32 s / scale, where s is the standard deviation of the differences over the 32
-    channels, and at least 0.
+    The similarity is 1 - 32 s / scale, where s is the standard deviation of the differences over
+    the 32 channels, and at least 0.
 
     Args:
         differences: One spectrum minus the other. Shape: (..., channels).

@@ -138,6 +138,8 @@ def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
     """Find the first and the last sample of each clean signal that is not silent.
 
+    A sample is not silent if its magnitude is above a thousandth of the signal's maximum.
+
     Args:
         references: Clean signals. Shape: (items, time).
 

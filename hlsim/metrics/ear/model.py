@@ -143,7 +143,11 @@ def hair_cells(thresholds: Tensor) -> HairCells:
     Source: Moore et al. 1999, J. Acoust. Soc. Am. 106(5), 2761-2778.
 
     Args:
-        thresholds: Audiogram at ``hlsim.audiogram.FREQUENCIES`` in dB HL. Shape: (..., 8).
+        thresholds: Audiogram at 250, 500, 1000, 2000, 3000, 4000, 6000 and 8000 Hz in dB HL. Shape:
+            (..., 8).
+
+    Returns:
+        Hair cells of the 32 channels. Shape of each attribute: (..., 32).
 
     >>> float(hair_cells(torch.full((8,), 40.0)).inner[0].round())
     26.0
@@ -560,8 +564,8 @@ def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
 def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tensor:
     """Return the longest group delay of all channels, to which the scores delay every channel.
 
-    It is that of one of the first three channels: their filters widen by a factor of 1.28 at most,
-    and the fourth filter is 1.37 times as wide as the first.
+    One of the first three channels has the longest delay, because their filters widen by a factor
+    of 1.28 at most, and the fourth filter is 1.37 times as wide as the first.
 
     Args:
         signal: Sound behind the middle ear. Shape: (items, padded).
