@@ -12,6 +12,8 @@ or float32 (model.bin, config.json, tokenizer.json, vocabulary.txt):
     python examples/train_by_recogniser.py speech/train noise/train --model TINY \\
         --audiograms audiograms/train.csv --device cuda --out trained
 
+A step of 32 clips needs 6 GB of memory. On a CPU, take smaller steps, such as `--batch 4`.
+
 An aid is not to be judged by the recogniser that trained it. Judge it by another one, on other
 speakers:
 
@@ -104,7 +106,10 @@ def draw_text_clips(
     count: int,
     generator: torch.Generator,
 ) -> list[TextClip]:
-    """Draw clips in which the recogniser finds three or more words, of which it is sure."""
+    """Draw clips in which the recogniser finds three or more words without noise.
+
+    Clips of whose words it is not sure, by the mean log likelihood of their tokens, are left out.
+    """
     clips: list[TextClip] = []
     while len(clips) < count:
         clip = speech.draw(1, generator)
@@ -228,8 +233,9 @@ def train(
         on_device = Batch(*(tensor.to(device) for tensor in batch))
         terms = loss_terms(aid, untrained, on_device, likelihood, simulator)
         means = {name: term.mean() for name, term in terms.items()}
+        loss: Tensor = sum(weight * means[name] for name, weight in WEIGHTS.items())
         optimiser.zero_grad()
-        sum(weight * means[name] for name, weight in WEIGHTS.items()).backward()
+        loss.backward()
         nn.utils.clip_grad_norm_(aid.parameters(), 1.0)
         optimiser.step()
         schedule.step()

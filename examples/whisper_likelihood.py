@@ -34,8 +34,9 @@ def read_weights(path: str | Path, device: str = "cpu") -> dict[str, Tensor]:
         def read_text() -> str:
             return file.read(read_number("H"))[:-1].decode()
 
-        # Versions of the format and of the model stand around the model's name.
-        read_number("I"), read_text(), read_number("I")
+        read_number("I")  # version of the format
+        read_text()  # name of the kind of model
+        read_number("I")  # version of this kind
         for _ in range(read_number("I")):
             name = read_text()
             shape = [read_number("I") for _ in range(read_number("B"))]
@@ -81,6 +82,7 @@ class TextLikelihood:
         x = self._apply_layers("decoder", embedding[inputs], sound)
         # The last token of the prompt predicts the first token of the text.
         logits = x[:, len(self.prompt) - 1 : -1] @ embedding.T
+        # cross_entropy(logits.mT, tokens) is less accurate: 1e-4 with Whisper's 51,864 tokens.
         return logits.log_softmax(-1).gather(-1, tokens.unsqueeze(-1)).squeeze(-1)
 
     def _encode(self, waveform: Tensor) -> Tensor:
