@@ -56,7 +56,10 @@ def evaluate_simulator(parser: Parser) -> None:
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
     if options.compensator and "compensated" not in options.inputs:
-        raise ValueError("--compensator has no effect without --inputs compensated")
+        raise ValueError(
+            "--compensator has no effect without --inputs compensated; add that input, or leave "
+            "--compensator out"
+        )
     _check_installed(options)
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
@@ -209,7 +212,10 @@ def _read_labels(texts: Sequence[str]) -> dict[str, str]:
         if Path(text).exists() or not (sign and label):
             label, name = text, text
         if label in labels:
-            raise ValueError(f"two names have the label {label}; write LABEL=NAME")
+            raise ValueError(
+                f"{labels[label]} and {name} have the same label, {label}; write one of them as "
+                "LABEL=NAME with another label"
+            )
         labels[label] = name
     return labels
 

@@ -70,9 +70,10 @@ def _read_listener(text: str) -> Listener:
         )
     (listener,) = listeners.values()
     if listener.left is None or listener.right is None:
+        missing, other = ("left", "right") if listener.left is None else ("right", "left")
         raise ValueError(
-            f"--listener {text}: expected two ears, but one is missing; use --audiogram for the "
-            "other ear and a file with its channel"
+            f"--listener {text}: expected two ears, but the {missing} one is missing; use "
+            f"--audiogram for the {other} ear and a file with its channel"
         )
     return listener
 

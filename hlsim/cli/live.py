@@ -61,8 +61,10 @@ def _live(options: argparse.Namespace) -> None:
         sounddevice = _import_sounddevice()
         print(sounddevice.query_devices() or "no devices")
         return
-    if options.simulate and read_sliders(options):
-        raise ValueError("--noise-reduction and --amplification have no effect with --simulate")
+    if options.simulate:
+        for slider in read_sliders(options):
+            option = slider.replace("_", "-")
+            raise ValueError(f"--{option} has no effect with --simulate; leave one of them out")
     ears: Any = read_ears(options)
     sounddevice = _import_sounddevice()
     import torch

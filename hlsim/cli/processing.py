@@ -181,7 +181,10 @@ def _process_file(
     is_linked = getattr(options, "linked", False)
     if channels != 2 and (options.listener or is_linked):
         option = "--linked" if is_linked else "--listener"
-        raise ValueError(f"{source}: {option} requires 2 channels, left and right, got {channels}")
+        raise ValueError(
+            f"{source}: {option} requires 2 channels, left and right, got {channels}; leave it out "
+            "for such files"
+        )
 
     def level(signal: Tensor) -> float:
         return float(level_spl(signal.flatten(), options.full_scale_spl))

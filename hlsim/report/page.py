@@ -131,13 +131,13 @@ class Sound:
 class Player:
     """A player with which a reader of a page compares sounds, such as outputs of hearing aids.
 
-    Another sound continues at the same position.
+    A sound to which the reader switches continues at the position of the one before.
 
     Attributes:
         groups: Sounds by the heading of their group, which may be empty. The sounds of a group are
             played with one gain.
         seconds: Length of the sounds in seconds.
-        full_scale: Level in dB SPL of a peak in the first group that is played at full scale.
+        full_scale: Level in dB SPL for which full scale stands in the sounds of the first group.
         sentence: Words that are spoken.
 
     >>> player = Player({"": [Sound("unaided", 10.2, b"fLaC")]}, seconds=4.0, full_scale=94.0)

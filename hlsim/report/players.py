@@ -130,8 +130,8 @@ def make_player(
     Without Pillow and matplotlib there are no spectrograms.
 
     Args:
-        groups: Signals in pascals by the label of their button, for each heading of a group, which
-            may be empty. Shape of each signal: (time,) or (channels, time).
+        groups: For each group, under its heading, which may be empty, the signals in pascals, each
+            under the label of its button. Shape of each signal: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
         sentence: Words that are spoken, shown above the sounds.
         lowest_peak: Peak in pascals for which the gain leaves room, even if all signals are softer.
@@ -190,7 +190,10 @@ def _peak(group: Mapping[str, Tensor]) -> float:
     """Return the largest magnitude of a sample in a group of signals."""
     peak = max(float(signal.abs().max()) for signal in group.values())
     if not peak:
-        raise ValueError("all sounds are silent; pass a signal with samples other than zero")
+        raise ValueError(
+            f"all sounds are silent ({', '.join(group)}); pass a signal with samples other than "
+            "zero"
+        )
     return peak
 
 

@@ -94,7 +94,8 @@ def _draw_picture(
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     """Return the names of conditions with a colour of matplotlib for each.
 
-    A condition that belongs to another one, such as NAL-R at an aid's level, has its colour, paler.
+    A condition that belongs to another one by its attribute ``of``, such as NAL-R at an aid's
+    level, has a paler version of that one's colour.
 
     >>> condition_colours([Condition("unaided", kind="unaided"), Condition("mine")])
     {'unaided': '#7d828a', 'mine': '#2f7ed8'}
@@ -191,7 +192,8 @@ def curves_picture(
     """Draw curves, with a legend below them.
 
     Args:
-        curves: Curves, each under the name that the legend shows.
+        curves: Horizontal values, vertical values and a dictionary of matplotlib's line properties
+            for each curve, under the name that the legend shows.
         title: Heading above the picture.
         axis: Title of the vertical axis.
         over: Title of the horizontal axis; by default, it is frequency in Hz.
@@ -225,10 +227,13 @@ def gain_picture(
 ) -> Picture:
     """Draw the gain of aids for one ear over frequency, with one curve per aid and level.
 
+    An aid whose gains at all levels differ by less than 0.5 dB has a single curve.
+
     Args:
         title: Heading above the picture.
-        results: Gain curve of each aid with its name ``aid``, see ``measure_gain_curve``.
-        colours: Colour of each aid.
+        results: For each aid, a dictionary of its name ``aid``, ``levels`` in dB SPL,
+            ``frequencies`` in Hz, and ``gain_db`` with shape (levels, frequencies).
+        colours: Colour of matplotlib for each aid.
 
     >>> curve = {"aid": "mine", "levels": [65.0], "frequencies": [250, 4000], "gain_db": [[5, 20]]}
     >>> gain_picture("Gain, ear N3", [curve], {"mine": "#2f7ed8"}).title

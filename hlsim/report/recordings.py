@@ -24,7 +24,7 @@ from hlsim.report.results import (
 def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) -> Path:
     """Write three files: ``report.html``, a page; ``report.md``, its text; and ``report.json``.
 
-    The last one contains the settings, comparisons and scores, see ``Evaluation.to_dict``.
+    ``report.json`` contains the settings, comparisons and scores, see ``Evaluation.to_dict``.
 
     Args:
         evaluation: Evaluation of ``haspi_report``.

@@ -51,7 +51,8 @@ def statistic(column: str, name: str = "mean") -> Callable[[DataFrame], Any]:
 
     Args:
         column: Name of the column.
-        name: Name of a method of a pandas series, such as ``"median"``, or of ``_STATISTICS``.
+        name: ``"mean absolute"``, ``"median absolute"``, ``"worst tenth"`` (the 10th percentile),
+            ``"mean ± std"`` (as text), or a method of a pandas series, such as ``"median"``.
 
     >>> import pandas
     >>> float(statistic("haspi", "median")(pandas.DataFrame({"haspi": [0.2, 0.4, 0.9]})))
@@ -86,7 +87,8 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
 
     Args:
         table: The table.
-        fact: Column of a fact of the items, such as ``"snr"``, whose values are separated too.
+        fact: Column with a property of the items, such as ``"snr"``, by whose values the rows are
+            split, too.
 
     >>> import pandas
     >>> rows = [("unaided", 5.0), ("aid", 5.0), ("unaided", 0.0), ("aid", 0.0)]
@@ -104,7 +106,7 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
 
 
 def sort_facts(values: Sequence[Any]) -> list[Any]:
-    """Return the values of a fact in ascending order; degrees of loss range from none to severe.
+    """Return the values of a property of items in ascending order, degrees of loss by severity.
 
     >>> sort_facts(["severe", "mild"]), sort_facts([10.0, 5.0])
     (['mild', 'severe'], [5.0, 10.0])
@@ -146,6 +148,10 @@ def summary_table(
 
 def format_number(value: Any, form: str) -> str:
     """Format a number; return a text as it is, and "n/a" for None and NaN.
+
+    Args:
+        value: Number, text or None.
+        form: Format in the notation of f-strings, such as ``".1f"``.
 
     >>> format_number(0.25, ".0%"), format_number(None, ".1f")
     ('25%', 'n/a')
@@ -350,7 +356,9 @@ def _items_table(evaluation: Evaluation, caption: str) -> Table:
 
 
 def describe_software(evaluation: Evaluation) -> str:
-    """Return a sentence that says which software computed HASPI and HASQI, if they were.
+    """Return a sentence that says which software computed HASPI and HASQI.
+
+    The sentence is empty if the evaluation has neither.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES

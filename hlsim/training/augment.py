@@ -67,7 +67,7 @@ def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None =
 
 
 def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rate: int) -> Tensor:
-    """Filter signals with gains that are known at a few frequencies, without a delay.
+    """Filter signals without a delay, with gains that are stated at a few frequencies.
 
     The gains in dB are interpolated over log frequency. Below the lowest and above the highest
     frequency they are constant.
@@ -148,7 +148,8 @@ def augment_speech(
         treated: Whether to compress, equalise and amplify.
 
     Returns:
-        Signals in pascals with shape (items, time), of at most 115 dB SPL.
+        Signals in pascals with shape (items, time), whose RMS level is at most 115 dB SPL if
+        ``treated``.
 
     >>> speech, ears = torch.randn(2, 1600), torch.full((2, 8), 40.0)
     >>> augment_speech(speech, None, ears, 16000, torch.Generator()).shape

@@ -252,10 +252,11 @@ class _SimulatorBatches(_RandomBatches):
 class CompensatorBatches(_RandomBatches):
     """Data set of random batches for a compensator: clean or noisy speech, tones and clicks.
 
-    Its index is a ``Step``, the number of the training step. An entry is a batch, a dictionary:
-    ``clean`` is the reference and ``signal`` the input of the aid, both in pascals with shape
-    (items, time); ``thresholds`` are the ears in dB HL. For tones and clicks, both signals are the
-    same.
+    The index of the data set is a ``Step``, the number of the training step. An entry is a batch, a
+    dictionary: ``clean`` is the reference and ``signal`` the input of the aid, both in pascals with
+    shape (items, time); ``thresholds`` are the ears in dB HL with shape (items, 8). For tones and
+    clicks, both signals are the same. If ``recipe.unreduced`` is above 0, ``noise_reduction`` is 0
+    for items without noise reduction and 1 for others, with shape (items,).
 
     Args:
         recipe: Settings of the training.

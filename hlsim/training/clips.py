@@ -42,6 +42,10 @@ class Clips:
         repeat: Whether recordings that are shorter than a clip are repeated; otherwise silence
             follows them.
 
+    Attributes:
+        files: Paths of the recordings.
+        samples: Length of a clip in samples.
+
     Raises:
         ValueError: The folder does not exist or has no audio in it, or the clips have no samples.
 
@@ -68,7 +72,8 @@ class Clips:
         self.samples = round(seconds * sample_rate)
         if self.samples < 1:
             raise ValueError(
-                f"expected clips of {1.0 / sample_rate:.2g} s or more, got {seconds} s"
+                f"expected clips of {1.0 / sample_rate:.2g} s or more, got {seconds} s; increase "
+                "seconds"
             )
         self._recordings: dict[int, Tensor] = {}  # 16-bit samples by index of the file
         self._errors: dict[int, str] = {}  # messages by index of the file
@@ -201,9 +206,14 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
     torch.Size([1, 64320])
     """
     noisy, rate = read_audio(path)
-    if (noisy.shape, rate) != (clean.shape, clean_rate):
+    if rate != clean_rate:
         raise ValueError(
-            f"{path}: expected the shape {tuple(clean.shape)} and the sample rate {clean_rate} Hz "
-            f"of the clean version, got {tuple(noisy.shape)} and {rate} Hz"
+            f"{path}: expected the sample rate of the clean version, {clean_rate} Hz, got {rate} "
+            "Hz; resample one of them"
+        )
+    if noisy.shape != clean.shape:
+        raise ValueError(
+            f"{path}: expected as many channels and samples as in the clean version, "
+            f"{tuple(clean.shape)}, got {tuple(noisy.shape)}; replace one of them"
         )
     return noisy

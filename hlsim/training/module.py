@@ -88,7 +88,7 @@ class TrainingModule(L.LightningModule):
         if not math.isfinite(float(loss.detach())):
             raise ValueError(
                 f"the loss is {float(loss.detach())} at step {self.global_step}, expected a finite "
-                "value; lower the learning rate"
+                "value; lower learning_rate in the recipe"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
@@ -129,9 +129,10 @@ class TrainingModule(L.LightningModule):
 
 
 def relative_learning_rate(step: int, steps: int) -> float:
-    """Compute the learning rate at a step, relative to the highest one.
+    """Compute the learning rate at a step, relative to the recipe's ``learning_rate``.
 
-    It rises over the first 50 steps, and falls along half a period of a cosine to 1 % at the end.
+    The rate rises over the first 50 steps, and falls along half a period of a cosine to 1 % at the
+    end.
 
     Args:
         step: Number of the step, from 0.

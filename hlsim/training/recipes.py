@@ -75,10 +75,11 @@ class TrainingRecipe:
             self._require(name, low <= high, "the lowest value first")
             object.__setattr__(self, name, (low, high))  # In YAML, it is a list.
         self._require("seed", abs(self.seed) < 2**62, "less than 2**62")
-        are_known = set(self.weights) <= set(self.criteria)
-        self._require("weights", are_known, f"weights of {', '.join(self.criteria)}")
-        are_useful = any(self.weights.values()) and min(self.weights.values()) >= 0.0
-        self._require("weights", are_useful, "no negative weight, and at least one above 0")
+        for name, weight in self.weights.items():
+            expected = f"weights of {', '.join(self.criteria)}, not of {name}"
+            self._require("weights", name in self.criteria, expected)
+            self._require("weights", weight >= 0.0, f"a weight of 0 or more for {name}")
+        self._require("weights", any(self.weights.values()), "at least one weight above 0")
 
     def _require(self, name: str, is_valid: bool, expected: str) -> None:
         if not is_valid:

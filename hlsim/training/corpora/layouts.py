@@ -198,12 +198,16 @@ def recognise(
     """
     if folders is not None:
         layout = f"folders {'/'.join(folders)}"
-        meanings = [level for level in folders if level != "other"]
-        if not set(folders) <= set(_LEVELS) or len(set(meanings)) < len(meanings):
-            raise ValueError(
-                f"{layout}: expected some of {', '.join(_LEVELS)}, separated by /, each at most "
-                "once except 'other', such as --folders split/speaker"
-            )
+        for level in folders:
+            if level not in _LEVELS:
+                raise ValueError(
+                    f"{layout}: expected some of {', '.join(_LEVELS)}, separated by /, got "
+                    f"{level!r}; write, for example, --folders split/speaker"
+                )
+            if level != "other" and folders.count(level) > 1:
+                raise ValueError(
+                    f"{layout}: expected {level} once, got it twice; write other for one of them"
+                )
         pattern = "/".join(_LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
         return layout, _read_utterances(files, pattern, layout)
     top = {file.split("/")[0] for file in files}
@@ -239,12 +243,15 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
     speakers = sorted({row.speaker for row in utterances if row.split == "train"})
     count = max(1, round(share * len(speakers)))
-    if "" in speakers or count >= len(speakers):
-        names = ", ".join(name or "unknown" for name in speakers[:5])
+    if "" in speakers:
+        raise ValueError(
+            "cannot move speakers to the validation split, because the speaker of some training "
+            f"utterances is unknown; leave --valid-share out, or {_ADVICE}"
+        )
+    if count >= len(speakers):
         raise ValueError(
             f"cannot move {count} of {len(speakers)} training speakers to the validation split, "
-            f"because others must remain and all must be known, got {names}; lower --valid-share, "
-            f"or leave it out, or {_ADVICE}"
+            "because one at least must remain; lower --valid-share, or leave it out"
         )
     valid_speakers = set(Random(0).sample(speakers, count))
     rows = []

@@ -70,11 +70,15 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
             row.get("speaker", ""),
             row.get("split", "train"),
         )
-        if not utterance.path or utterance.split not in SPLITS:
+        if not utterance.path:
             raise ValueError(
-                f"{path}, line {line}: expected a file in the column 'path' and, if there is a "
-                f"column 'split', train, valid or test in it, got {utterance.path!r} and "
-                f"{utterance.split!r}"
+                f"{path}, line {line}: expected a file in the column 'path', got none; add the "
+                "column or the value"
+            )
+        if utterance.split not in SPLITS:
+            raise ValueError(
+                f"{path}, line {line}: expected train, valid or test in the column 'split', got "
+                f"{utterance.split!r}; correct it"
             )
         utterances.append(utterance)
     folder = Path(path).parent if root is None else Path(root)
