@@ -29,23 +29,61 @@ def test_conv_tasnet_trains(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", ["gru-mask", "waveform"])
-def test_networks_are_trained_and_judged_beside_nalr(
+@pytest.mark.parametrize(
+    ("network", "loss"),
+    [("gru-mask", "with-haspi"), ("gru-mask-8ms", "haspi"), ("waveform", "default")],
+)
+def test_networks_are_trained_and_compared_with_nalr(
     network: str,
+    loss: str,
     speech_dir: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(TRAINING)
     folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
-    load_example("training/networks.py").main(
-        [*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "1", "--noisy"]
-    )
+    options = f"--loss {loss} --steps 1 --rate 1e-9 --items 1 --noisy".split()
+    load_example("training/networks.py").main(["train", *folders, network, *options])
     out = capsys.readouterr()
     assert out.err.startswith("step 1: ")
     name, unaided, nalr, aided, _, _, *_, follows, as_it_is = out.out.strip("| \n").split(" | ")
     assert name == network and float(unaided) < float(nalr)
     assert aided == unaided and follows == as_it_is == "1.00"  # they start as what changes nothing
+
+
+def test_saved_networks_are_judged_at_the_level_of_nalr(
+    tmp_path: Path,
+    speech_dir: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(TRAINING)
+    listener = load_example("machine_listener.py")
+    networks = load_example("training/networks.py")
+    sentence = listener.Sentence("flite-rms-01.flac", 0.0, 1.0, "a b")
+    monkeypatch.setattr(listener, "Whisper", lambda folder: lambda waveform: "a")
+    monkeypatch.setattr(listener, "read_sentences", lambda path: [sentence])
+    train, valid, out = str(speech_dir / "train"), str(speech_dir / "valid"), str(tmp_path / "out")
+    options = "gru-mask-8ms --loss snr --steps 1 --rate 1e-9 --items 1".split()
+    networks.main(["train", train, valid, *options, "--noise", valid, "--out", out])
+    networks.main(["judge", out, valid, valid, "--model", "", "--snrs", "5"])
+    printed = capsys.readouterr().out.replace("-0.000", "+0.000")
+    assert "| NAL-R | 0.500 [" in printed
+    # The network changes nothing, and NAL-R follows it.
+    assert printed.count("| gru-mask-8ms.snr minus NAL-R | +0.000 [+0.000, +0.000]") == 2
+
+
+def test_a_mask_looks_one_window_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(TRAINING)
+    torch.manual_seed(0)
+    network = load_example("training/networks.py").gru_mask(128)
+    torch.nn.init.normal_(network.layers[-1].weight)
+    signal = torch.randn(1, 1600)
+    changed = signal.clone()
+    changed[:, 1000:] = 0.0
+    difference = (network(changed) - network(signal)).abs()[0]
+    assert difference[: 1000 - 128].max() < 1e-6 and difference[1000 - 64 : 1000].max() > 1e-2
 
 
 def test_a_criterion_of_ones_own_trains(capsys: pytest.CaptureFixture[str]) -> None:
