@@ -54,7 +54,7 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     (torch.Size([1, 64320]), 16000)
     """
     if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"expected the path of an audio file, got {type(path).__name__}")
+        raise ValueError(f"expected the path of an audio file, got {type(path).__name__}; pass one")
     if os.path.isdir(path):
         raise ValueError(
             f"{path}: expected an audio file, got a folder; pass the path of a file in it"
@@ -70,17 +70,18 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
         reason = getattr(error, "error_string", error)
         raise ValueError(f"{path}: cannot be read as audio: {reason}") from error
     if not len(samples):
-        raise ValueError(f"{path}: the file has no samples")
+        raise ValueError(f"{path}: the file has no samples; replace or remove it")
     highest = HIGHEST_FILE_RATE if any_rate else HIGHEST_RATE
     if not LOWEST_RATE <= rate <= highest:
         raise ValueError(
-            f"{path}: the sample rate is {rate} Hz, expected {LOWEST_RATE} to {highest} Hz"
+            f"{path}: the sample rate is {rate} Hz, expected {LOWEST_RATE} to {highest} Hz; "
+            "resample the file"
         )
     waveform = torch.from_numpy(samples.T.copy())
     if not bool(waveform.isfinite().all()):
-        raise ValueError(f"{path}: some samples are NaN or infinite")
+        raise ValueError(f"{path}: some samples are NaN or infinite; replace or remove the file")
     if not bool(waveform.any()):
-        raise ValueError(f"{path}: the file is silent, every sample is zero")
+        raise ValueError(f"{path}: the file is silent, every sample is zero; replace or remove it")
     if len(samples) < expected:
         warnings.warn(
             f"{path}: the file is truncated; its header states {expected} samples per channel, but "
@@ -234,7 +235,7 @@ def list_files(folder: str | Path) -> tuple[list[Path], list[Path]]:
     """
     root = Path(folder)
     if not root.is_dir():
-        raise ValueError(f"{folder}: there is no such folder")
+        raise ValueError(f"{folder}: there is no such folder; correct the path")
     audio: list[Path] = []
     other_files: list[Path] = []
     for path in sorted(root.rglob("*")):

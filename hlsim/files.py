@@ -153,13 +153,16 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
             reader.fieldnames = names
             for name in names:
                 if name and names.count(name) > 1:
-                    raise ValueError(f"{path}, line 1: the column {name} appears twice")
+                    raise ValueError(
+                        f"{path}, line 1: the column {name} appears twice; rename one of the two"
+                    )
             for row in reader:
                 surplus_values = row.pop(None, ())
                 if any(surplus_values):
                     raise ValueError(
                         f"{path}, line {reader.line_num}: expected {len(names)} values, one for "
-                        f"each column of the header, got {len(names) + len(surplus_values)}"
+                        f"each column of the header, got {len(names) + len(surplus_values)}; put "
+                        "values that contain the separator into quotes"
                     )
                 values = {name: value.strip() for name, value in row.items() if name}
                 rows.append((reader.line_num, values))

@@ -168,7 +168,7 @@ class WaveformPlugin:
         if abs(delay) > MAX_DELAY_SECONDS * sample_rate:
             raise ValueError(
                 f"{self.kind} {self.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
-                "an output that is time-aligned with the input"
+                "an output that is time-aligned with the input; shift the output in your code"
             )
 
 

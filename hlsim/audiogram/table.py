@@ -135,7 +135,7 @@ def _group_rows(path: str | Path) -> dict[str, list[tuple[str, dict[str, str]]]]
         columns = {column.lower(): text for column, text in row.items()}
         name = columns.get("listener")
         if not name:
-            raise ValueError(f"{place}: expected a name in the column listener")
+            raise ValueError(f"{place}: expected a name in the column listener, got none; add it")
         rows.setdefault(name, []).append((place, columns))
     return rows
 
@@ -146,10 +146,14 @@ def _join_ears(rows: Sequence[tuple[str, dict[str, str]]]) -> Listener:
     for place, row in rows:
         text = row.get("ear", "")
         ear = EAR_NAMES.get(text.lower())
-        if ear is None or ears[ear] is not None:
+        if ear is None:
             raise ValueError(
-                f"{place}: expected left or right in the column ear and one row for each, "
-                f"got {text!r}"
+                f"{place}: expected left or right in the column ear, got {text!r}; correct it"
+            )
+        if ears[ear] is not None:
+            raise ValueError(
+                f"{place}: expected one row for the {ear} ear of listener {row['listener']}, got a "
+                "second one; remove one of them"
             )
         ears[ear] = convert_at(place, Audiogram.from_row, row)
     return Listener(**ears)

@@ -259,7 +259,8 @@ class Audiogram:
                 continue
             if frequency in columns:
                 raise ValueError(
-                    f"columns {columns[frequency]!r} and {column!r} have the same frequency"
+                    f"columns {columns[frequency]!r} and {column!r} have the same frequency; "
+                    "remove one of them"
                 )
             columns[frequency] = column
             if str(text).strip().lower() not in _UNMEASURED:
@@ -267,7 +268,7 @@ class Audiogram:
         if not points:
             raise ValueError(
                 "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got "
-                f"the columns {', '.join(row)}"
+                f"the columns {', '.join(row)}; add columns or thresholds"
             )
         frequencies = tuple(sorted(points))
         return cls(tuple(points[frequency] for frequency in frequencies), frequencies)

@@ -26,7 +26,10 @@ PACKAGES = {
 
 
 def check_extras(*extras: str) -> None:
-    """Raise MissingExtraError unless extras are installed, before any work and without imports."""
+    """Raise MissingExtraError unless extras of hlsim, such as ``"eval"``, are installed.
+
+    The packages are not imported, so that this takes no time before the work of a command.
+    """
     for extra in extras:
         for package in PACKAGES[extra]:
             if not is_installed(package):
@@ -131,6 +134,6 @@ def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
-    """Return the values of ``--noise-reduction`` and ``--amplification``, if set, under names."""
+    """Return ``noise_reduction`` and ``amplification``, if a user has set them, by name."""
     values = {name: getattr(options, name) for name in ("noise_reduction", "amplification")}
     return {name: value for name, value in values.items() if value is not None}

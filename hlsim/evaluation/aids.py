@@ -48,7 +48,7 @@ class Unaided(nn.Module):
     """
 
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
-        """Return the waveform."""
+        """Return the waveform as it is."""
         return waveform
 
 
@@ -99,7 +99,10 @@ class EqualiserLike(nn.Module):
         self._identifier = uuid.uuid4().hex  # the same in every process that receives a copy
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Filter a waveform at 16 kHz. The gains of an ear are measured once per process."""
+        """Filter a waveform at 16 kHz with the aid's mean gain for an ear.
+
+        The gains of an ear are measured once per process.
+        """
         key = self._identifier, audiogram
         if key not in _GAINS:
             _GAINS[key] = self.gains_db(audiogram)

@@ -68,8 +68,8 @@ def run_parallel(
             run.
         tasks: Arguments of the function.
         jobs: Number of processes; all cores by default. With 1, tasks run in this process.
-        dask: Address of a Dask scheduler, whose workers replace the processes. They import hlsim
-            and see the same files.
+        dask: Address of a Dask scheduler, whose workers replace the processes. The workers must be
+            able to import hlsim and to read the same files.
 
     Raises:
         ValueError: ``jobs`` is less than 1, or no scheduler answers.

@@ -404,9 +404,12 @@ def _read_folders(
     for condition, files in outputs.items():
         different_names = sorted(files.keys() ^ speech.keys())
         if different_names:
+            name = different_names[0]
+            owner = clean if name in speech else folders[condition]
             raise ValueError(
                 f"{clean} and {folders[condition]}: expected files with the same names, but only "
-                f"one of them has {different_names[0]} ({len(different_names)} differences)"
+                f"{owner} has {name} ({len(different_names)} differences); rename, add or remove "
+                "files"
             )
     ears = {} if audiograms is None else _read_ears(audiograms, "file")
     recordings = []

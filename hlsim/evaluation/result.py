@@ -128,7 +128,11 @@ class Evaluation:
         return installed_versions(["hlsim", *packages, "scipy"])
 
     def wide(self, column: str) -> DataFrame:
-        """Return a column of the table with one row per item and one column per condition."""
+        """Return a column of the table, such as ``"haspi"``, by item and condition.
+
+        The result has one row per item and one column per condition, and NaN where a value is
+        missing.
+        """
         table = self.table.pivot(index="item", columns="condition", values=column)
         return table.reindex(columns=self.names)
 
@@ -179,7 +183,7 @@ def predict_words(scores: Iterable[float]) -> float:
     """Predict from HASPI which share of words a listener understands, from 0 to 1.
 
     Args:
-        scores: HASPI of several items; NaN is ignored.
+        scores: HASPI of one or more items; NaN is ignored.
 
     >>> predict_words([0.2]) < predict_words([0.8, math.nan])
     True

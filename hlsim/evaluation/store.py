@@ -55,7 +55,11 @@ class ScoreStore:
         return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Store a record under a key. It is in the file when this method returns.
+        """Store a record under a key. The file, if any, has the record when this method returns.
+
+        Args:
+            key: Hash of everything that decides the score.
+            record: Entries of the line, such as ``values``, the measured values by column.
 
         Raises:
             ValueError: The file cannot be written, or JSON cannot represent the record.

@@ -164,7 +164,7 @@ class Measure:
     Args:
         name: Name in options and files. If the measure has one value, it is also its column.
         compute: Function ``(item, output) -> values by column``, for an ``Item`` and an output with
-            shape (time,). It raises ValueError if there are no values.
+            shape (time,). The function raises ValueError if there are no values.
         title: Name in tables and plots.
         packages: Packages whose versions decide the values.
         revision: Number to be increased when a change of hlsim changes a value.
@@ -342,7 +342,9 @@ def _measure_item(task: _Task) -> list[Values | str]:
                 values = measure.compute(*pairs[condition.name])
             for name, value in values.items():
                 if isinstance(value, float) and not math.isfinite(value):
-                    raise ValueError(f"expected a finite number for {name}, got {value}")
+                    raise ValueError(
+                        f"expected a finite number for {name} from {measure.name}, got {value}"
+                    )
             results.append(values)
         except Exception as error:
             results.append(describe_error(error))

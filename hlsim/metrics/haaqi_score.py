@@ -75,8 +75,8 @@ def haaqi(
     """Compute HAAQI version 1 of each item: how good processed music sounds, from 0 to 1.
 
     The score compares the processed music with clean music that NAL-R has amplified for the same
-    impaired ear. It is differentiable in ``processed``. Stereo signals have one score per ear: take
-    the better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
+    impaired ear, and is differentiable in ``processed``. Stereo signals have one score per ear:
+    take the better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
 
     Args:
         processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).

@@ -41,7 +41,7 @@ def hasqi(
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean speech that NAL-R has amplified for the same impaired
-    ear. It is differentiable in ``processed``.
+    ear, and is differentiable in ``processed``.
 
     Args:
         processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).

@@ -72,8 +72,8 @@ def mbstoi(
     """Compute MBSTOI of each item: the intelligibility of speech at two ears, about 0 to 1.
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
-    gradient: which frames are speech, the interaural delays and levels, and the better ear. It is
-    computed in float64 where the device supports it.
+    gradient: which frames are speech, the interaural delays and levels, and the better ear. Scores
+    are computed in float64 where the device supports it.
 
     Args:
         processed: Processed speech at the left and the right ear. Shape: (..., 2, time).
@@ -241,7 +241,8 @@ def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, tuple[int,
         item = f" in item {counts.index(min(counts))}" if len(counts) > 1 else ""
         raise ValueError(
             f"expected at least {_seconds(SEGMENT + 1):.2g} s of clean speech within "
-            f"{RANGE_DB:g} dB of its loudest frame{item}, got {_seconds(min(counts)):.2g} s"
+            f"{RANGE_DB:g} dB of its loudest frame{item}, got {_seconds(min(counts)):.2g} s; pass "
+            "longer signals"
         )
     order = (~is_active).byte().argsort(dim=-1, stable=True)[:, : max(counts)]
     is_used = Extent(counts).inside(rows.device)

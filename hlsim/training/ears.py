@@ -26,10 +26,11 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
     """Draw random ears that resemble measured ones, from no loss to severe.
 
     Each ear starts between two neighbours in one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ...
-    S3). It is tilted by up to 20 dB at 250 Hz. Gaussian deviations are added, whose standard
-    deviation is 2.4 to 8 dB and which correlate at neighbouring frequencies. Three in four ears are
-    rounded to 5 dB, as in audiometry. By MSBG's definition, 27 % have no loss, 18 % a mild one, 19
-    % a moderate one and 36 % a severe one.
+    S3). Its thresholds from 250 to 2000 Hz are shifted together, by up to 20 dB up or down at 250
+    Hz and less at higher frequencies. Gaussian deviations are added, whose standard deviation is
+    2.4 to 8 dB and which correlate at neighbouring frequencies. Three in four ears are rounded to 5
+    dB, as in audiometry. By MSBG's definition, 27 % have no loss, 18 % a mild one, 19 % a moderate
+    one and 36 % a severe one.
 
     Args:
         count: Number of ears.

@@ -24,7 +24,8 @@ class TrainingRecipe:
     Attributes:
         model: Settings of the network by name, such as ``channels``.
         start: Name or folder of a checkpoint to start from, instead of random weights. The network
-            has its settings. It remains the best network until training finds a better one.
+            has the settings of the checkpoint, which remains the best network until training finds
+            a better one.
         steps: Number of training steps. The learning rate falls over them.
         batch: Number of clips per step.
         seconds: Duration of a clip.

@@ -78,7 +78,8 @@ class SimulatorTraining(TrainingModule):
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
         """Compute the median and the 10th percentile of the ratios, and a score for the network.
 
-        The score weights speech and sounds by their shares in training.
+        The score is the median plus half the 10th percentile in dB. Those of speech and of sounds
+        are weighted by their shares in training.
         """
         summary: dict[str, float] = {}
         score = 0.0

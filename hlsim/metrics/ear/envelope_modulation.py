@@ -310,10 +310,10 @@ def correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
 def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
     """Compute the mean of ``correlation`` over the ear's internal noise, without drawing noise.
 
-    HASPI adds noise to the levels of both signals. It increases the energies by which the
-    covariance is divided. Its contribution to the covariance itself has mean zero. The mean and the
-    variance of the quotient are computed to second order. The mean of its magnitude is that of a
-    folded normal distribution.
+    HASPI adds noise to the levels of both signals. The noise increases the energies by which the
+    covariance is divided, and contributes zero on average to the covariance itself. The mean and
+    the variance of the quotient are computed to second order. The mean of the quotient's magnitude
+    is that of a folded normal distribution.
 
     Args:
         reference, processed: Cepstral coefficients of the audible frames of clean speech and of the

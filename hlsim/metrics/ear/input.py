@@ -176,7 +176,7 @@ def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
 def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -> Tensor:
     """Return the delay that each output of an aid needs to lie 2 ms behind its clean signal.
 
-    It follows from the largest magnitude of the cross-covariance of the whole signals.
+    The delay is found by the largest magnitude of the cross-covariance of the whole signals.
 
     Args:
         reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``.

@@ -404,8 +404,9 @@ def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
 def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     """Return the spectrum of a clean signal's channels with which ``align_channels`` aligns others.
 
-    It is the spectrum of the differences of neighbouring samples. Near its maximum, a correlation
-    hardly changes from lag to lag: single precision resolves its steps, but not its values.
+    The result is the spectrum of the differences of neighbouring samples, from which follow the
+    steps of a correlation from lag to lag. Near its maximum, a correlation hardly changes: single
+    precision resolves the steps, but not the values.
 
     Args:
         reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).

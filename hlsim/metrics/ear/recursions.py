@@ -164,8 +164,8 @@ def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
 
-    It is a low-pass of first order at 5 kHz and a high-pass of second order at 350 Hz, both
-    Butterworth.
+    The filter is a low-pass of first order at 5 kHz and a high-pass of second order at 350 Hz, both
+    Butterworth. Its matrices are on ``device`` in the precision ``dtype``.
 
     Source: Kates 2013, Proceedings of Meetings on Acoustics 19, 050184.
 
@@ -182,7 +182,8 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter that smooths the gain of the outer hair cells over 0.2 ms.
 
-    It is a Butterworth low-pass of first order at 800 Hz, for gains at 24 kHz.
+    The filter is a Butterworth low-pass of first order at 800 Hz, for gains at 24 kHz. Its matrices
+    are on ``device`` in the precision ``dtype``.
 
     >>> gain_lowpass(torch.device("cpu"), torch.float32).step.shape
     torch.Size([1, 1])
@@ -204,7 +205,8 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
 
     The response to an onset is twice the steady response, and decays with time constants of 2 and
     60 ms. Kates describes it by an electrical circuit of two resistors and two capacitors, which is
-    solved by backward differences. Negative outputs must be set to zero.
+    solved by backward differences. Negative outputs must be set to zero. The filter's matrices are
+    on ``device`` in the precision ``dtype``.
 
     >>> adaptation(torch.device("cpu"), torch.float32).step.shape
     torch.Size([2, 2])

@@ -276,7 +276,7 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
         for kind, name in ((split, split_name), ("version", groups.get("version", ""))):
             if names.setdefault(kind, name) != name:
                 raise ValueError(
-                    f"{file}: expected one name for each part of the corpus, got "
+                    f"{file}: expected one name for the {kind} part of the corpus, got "
                     f"{names[kind]!r} and {name!r}"
                 )
         key = os.path.splitext(file)[0]
