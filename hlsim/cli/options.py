@@ -46,7 +46,12 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def set_command(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
-        """Set the function that runs the command, and the arguments of the examples in the help."""
+        """Set the function that runs the command, and the examples in the help.
+
+        Args:
+            run: Function of the parsed options.
+            examples: Options of each example, without the name of the command.
+        """
         self.set_defaults(run=run)
         self._examples = examples
 
@@ -126,7 +131,12 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, action="store_true", help=text)
 
     def teacher(self, text: str, default: str) -> None:
-        """Declare ``--teacher``, a simulator. The help text begins with ``text``."""
+        """Declare ``--teacher``, a simulator with which others are compared or which they learn.
+
+        Args:
+            text: Beginning of the help text.
+            default: Value if the option is missing.
+        """
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
             "path/to/file.py:name, a function (waveform, audiogram) -> waveform or a class that is "

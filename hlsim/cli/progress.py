@@ -14,8 +14,9 @@ _LINE_INTERVAL = 30.0
 def show_progress(unit: str) -> Callable[[int, int], None]:
     """Return a function that shows the progress of long work and the time when it will end.
 
-    In a terminal, it overwrites one line. Elsewhere, it writes a line every 30 seconds. The time of
-    the end is estimated from the pace since the first call, without the work of an earlier run.
+    In a terminal, the function overwrites one line. Elsewhere, it writes a line every 30 seconds.
+    The time of the end is estimated from the pace since the first call, without the work of an
+    earlier run.
 
     Args:
         unit: Plural noun for what is counted, such as "items".

@@ -71,14 +71,15 @@ class AtLevelOf(nn.Module):
         self.aid, self.other = aid, other
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Return the output of the first aid at the level of the second."""
+        """Return the output of ``aid`` at the RMS level of the output of ``other``."""
         return set_level(self.aid(waveform, audiogram), level_spl(self.other(waveform, audiogram)))
 
 
 class EqualiserLike(nn.Module):
     """Linear filter with the mean gain that a hearing aid has for speech, measured for each ear.
 
-    The filter is used as a condition: where the aid has a higher score, the reason is not its gain.
+    The filter is used as a condition: if the aid has a higher score, the reason is not its mean
+    gain.
 
     Args:
         aid: The aid whose gain is measured.

@@ -86,8 +86,9 @@ def evaluate_compensators(
             ``config.limit_spl``, its peaks are compared with that limit in dB SPL.
         speech: Folder of recordings of clean speech.
         store: File of scores, which is created if it does not exist; None stores nothing.
-        audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3.
-        audiogram: Single ear for everything instead, for a compensator that was trained for it.
+        audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3. Either this
+            or ``audiogram`` is required.
+        audiogram: Single ear for everything, for a compensator that was trained for this ear.
         noise: Folder of recordings of noise. Every second item is then noisy, at signal-to-noise
             ratios of 2.5 to 17.5 dB.
         enhancers: Names ``package.module:name`` of functions ``(waveform, sample_rate) ->
@@ -95,7 +96,7 @@ def evaluate_compensators(
         simulator: Name or folder of the Neuro-MSBG whose training loss is compared with that of
             the exact MSBG, because an aid may exploit errors of the network.
         measures: Names of measures in addition to HASPI and HASQI.
-        items: Number of items. 400 items give each main row of the page 200 pairs.
+        items: Number of items. With noise, 400 items are 200 of clean and 200 of noisy speech.
         seconds: Length of an item in seconds. HASPI is not reliable much below 3.
         levels: Levels of the clean speech in dB SPL, in turn.
         gain_ears: Names of the standard ears for gain curves and steady tones.
@@ -106,7 +107,7 @@ def evaluate_compensators(
 
     Returns:
         The evaluation with the groups ``clean``, ``noisy`` and ``hard`` (unaided HASPI below 0.6)
-        if they have items, and the details ``gain_curves``, ``steady_tones`` and ``wearing``:
+        if they have items. Its ``details`` are ``gain_curves``, ``steady_tones`` and ``wearing``:
         results of ``measure_aids`` with ``measure_gain_curve``, ``measure_steady_tones`` and
         ``measure_wearability``.
 

@@ -67,15 +67,18 @@ class Recording:
     Args:
         utterance: Name of the utterance, the same for both ears of a listener.
         clean: File of clean speech.
-        outputs: File of the output, by condition.
+        outputs: File of the output under each condition, by the name of the condition.
         audiogram: The ear.
         listener: Name of the listener; empty if unknown.
-        ear: ``"left"``, ``"right"`` or empty. It selects the channel of a file with two channels.
+        ear: ``"left"``, ``"right"`` or empty, which selects the channel of a file with two
+            channels.
         snr: Signal-to-noise ratio in dB; NaN if unknown.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
-        spl: Level of the clean file in dB SPL, which replaces ``full_scale_spl``.
-        seed: Seed of the study. The seed of each clean file depends on this one and its contents.
-        problems: Reason why there is no output, by condition.
+        spl: Level of the clean file in dB SPL, which replaces ``full_scale_spl``; None uses
+            ``full_scale_spl``.
+        seed: Seed of the study. The seed of an item depends on this seed and on the contents of its
+            clean file.
+        problems: Reason why there is no output under a condition, by the name of the condition.
 
     >>> ear = Audiogram.standard("N3")
     >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name

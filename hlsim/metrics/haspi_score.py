@@ -183,7 +183,8 @@ class HaspiReference(Reference):
             processed: Outputs of the shape, rate and scale of the clean speech. Lengths that differ
                 by 0.1 s at most are cut to the shorter one, with a warning. Shape: (..., time).
             audiogram: The impaired ear, or one for each item, as in ``haspi``.
-            noise: Internal noise of the ear, as in ``haspi``.
+            noise: Internal noise of the ear: ``"expected"``, its mean effect; ``"seeded"``, the
+                noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise, or one seed for each item.
 
         Returns:

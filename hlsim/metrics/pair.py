@@ -94,7 +94,9 @@ def cut_to_common_length(
 def match_pair(
     processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
 ) -> tuple[Tensor, Tensor, Lengths | None]:
-    """Prepare the arguments of a score: one length, and the wider precision for clean speech.
+    """Cut an output and clean speech to one length, and raise the precision of clean speech.
+
+    The precision of clean speech becomes that of the output if this is higher.
 
     Args:
         processed: Output of an aid. Shape: (..., time).
@@ -106,7 +108,8 @@ def match_pair(
         Output, clean speech, and lengths that are limited to the common length.
 
     Raises:
-        ValueError: As for ``cut_to_common_length``, or ``lengths`` do not fit.
+        ValueError: A signal is not a waveform, the shapes or devices differ, the lengths differ by
+            more than 0.1 s, the rate is out of range, or ``lengths`` do not fit.
 
     >>> output, clean, _ = match_pair(torch.ones(8000).double(), torch.ones(8000), 16000, None)
     >>> clean.dtype

@@ -142,7 +142,8 @@ class QualityReference(Reference):
             processed: Outputs of the shape, rate and scale of the clean signals. Lengths that
                 differ by 0.1 s at most are cut to the shorter one, with a warning. Shape: (...,
                 time).
-            noise: Noise at the threshold of hearing, as in ``hasqi``.
+            noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
+                ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise, or one seed for each item.
 
         Returns:

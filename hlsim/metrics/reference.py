@@ -100,18 +100,22 @@ class Reference(ABC):
     """Clean signals that are prepared for the scores of many outputs of aids.
 
     On a CPU the items of a batch are distributed over as many threads as torch uses, unless a
-    gradient is needed. The scores do not depend on it.
+    gradient is needed. The scores do not depend on the number of threads.
 
     Args:
         clean: Clean signals. The scores have their dtype and their device. Their gradient is not
             computed. Shape: (..., time).
         audiogram: Ear that receives the clean signals, or one for each item; None for a normal ear.
-        sample_rate, full_scale_spl, lengths, whole_khz: The arguments of ``haspi``.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        lengths: Number of samples of each item in a padded batch. Shape: (...).
+        whole_khz: Round the rate to whole kHz, as pyclarity does.
         keep: Store the clean signals' features; otherwise they are computed for each score, which
             takes less memory.
 
     Raises:
-        ValueError: As for ``haspi``.
+        ValueError: Clean signals that last less than 0.7 s, are not finite, silent or below 20 dB
+            SPL; a rate, level, audiogram or length out of range.
 
     >>> from hlsim.metrics import HaspiReference
     >>> issubclass(HaspiReference, Reference)

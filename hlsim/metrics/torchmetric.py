@@ -307,10 +307,10 @@ class HASPI(_MeanScore):
     Args:
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
-        noise: Internal noise of the ear, as in ``haspi``. ``"seeded"`` gives the scores
-            of pyclarity.
-        seed: Seed of the first item since the last reset, for ``noise="seeded"``. It rises by 1
-            with each item, so that epochs can be compared.
+        noise: Internal noise of the ear: ``"expected"``, its mean effect (for HASQI and HAAQI a
+            noise that is always the same); ``"seeded"``, that of pyclarity; or ``"none"``.
+        seed: Seed of the first item since the last reset, for ``noise="seeded"``. The seed rises by
+            1 with each item, so that epochs can be compared.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         limit: Number of items that are scored from one reset to the next in each process; the
             others are passed over. None scores all.

@@ -34,15 +34,16 @@ DRAWS = 4000
 class Curve(NamedTuple):
     """Parameters of the model that predicts the share of words that a listener understands.
 
-    The logit of the share is linear in HASPI: an intercept, and slopes that differ within and
-    between aids. Intercepts and slopes differ between listeners, and intercepts between aids.
+    The logit of the share is linear in HASPI: an intercept, and two slopes, one over the sentences
+    of an aid and one over the means of aids. Intercepts and slopes differ between listeners, and
+    intercepts between aids.
 
     Attributes:
-        coefficients: Intercept of the logit at a HASPI of 0.5, slope within an aid, and slope
-            between the means of aids.
+        coefficients: Intercept of the logit at a HASPI of 0.5, slope over the sentences of an aid,
+            and slope over the means of aids.
         covariance: Covariance of the three coefficients.
         dispersion: Parameter of the beta-binomial distribution of the words understood in a
-            sentence. The smaller it is, the more sentences differ.
+            sentence. The smaller the dispersion, the more sentences differ.
         listener: Standard deviation of the intercepts of listeners.
         listener_slope: Standard deviation of the slopes of listeners.
         aid: Standard deviation of the intercepts of aids.
@@ -64,7 +65,7 @@ class Curve(NamedTuple):
 class WordsChange(NamedTuple):
     """Proportion of words that a new listener understands with a first and with a second aid.
 
-    ``words_change`` predicts it from HASPI.
+    The function ``words_change`` predicts these proportions from HASPI.
 
     Attributes:
         before: Mean proportion with the first aid, 0 to 1.
@@ -89,7 +90,7 @@ class WordsChange(NamedTuple):
 def load_curve() -> Curve:
     """Load the curve that predicts, from HASPI, the share of words that a listener understands.
 
-    It was fitted to the responses of 22 listeners to sentences through ten hearing aids.
+    The curve was fitted to the responses of 22 listeners to sentences through ten hearing aids.
 
     >>> len(load_curve().coefficients)
     3

@@ -57,9 +57,11 @@ def demo_page(
         evaluation: Study of the demo's conditions. Its ``details`` hold the gains of the aids under
             ``gain_curves``, its ``settings`` the number of ``training_steps``.
         ear_name: Name of the ear, for the title.
-        outputs: Outputs of the aid for each item in pascals, by condition. Shape of each: (time,).
-        perceived: The same outputs as the ear perceives them, by condition, after clean speech as a
-            normal ear perceives it, under ``NORMAL_EAR``.
+        outputs: Outputs for all items in pascals under the name of each condition. Shape of each:
+            (time,).
+        perceived: Perceived signals for all items in pascals: first, under the name ``NORMAL_EAR``,
+            what a normal ear perceives of clean speech; then, under the name of each condition,
+            what this ear perceives of ``outputs``. Shape of each: (time,).
         sentence: Transcript of the last item, which is played.
     """
     headline = evaluation.headline
@@ -92,8 +94,11 @@ def demo_page(
 def result_table(evaluation: Evaluation) -> Table:
     """Return the table of ``hlsim demo``, with one row per condition.
 
-    The columns are the means of HASPI, of the share of words that it predicts to be understood, of
-    the level of the aid's output and of the error of loudness.
+    The columns are the mean HASPI, the share of words that is predicted from HASPI to be
+    understood, the mean output level in dB SPL, and the mean loudness error in dB.
+
+    Args:
+        evaluation: Study of the demo's conditions.
     """
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),

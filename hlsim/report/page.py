@@ -36,7 +36,7 @@ class Table:
     Attributes:
         caption: Caption.
         header: Titles of the columns.
-        rows: Texts of each row. The first one is the name of the row.
+        rows: Texts of each row, of which the first is the name of the row.
         folded: Whether a page shows only the caption until a reader opens the table.
 
     >>> Table("Scores", ("Aid", "HASPI"), [("NAL-R", "0.93")]).markdown()
@@ -113,7 +113,7 @@ class Sound:
         loudness: Level in dB relative to full scale with which the sound is played.
         spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram; empty if
             there is none.
-        note: Words over the spectrogram.
+        note: Words that are shown on the spectrogram.
 
     >>> Sound("unaided", 10.2, b"fLaC").note
     ''
@@ -168,8 +168,8 @@ class Card:
         title: Name of the number.
         value: The number, as text.
         meaning: Sentence that explains the number.
-        bars: Name, number as text and length from 0 to 1 for each condition. The last one is
-            highlighted.
+        bars: For each condition its name, its number as text, and the length of its bar from 0 to
+            1. The bar of the last condition is highlighted.
 
     >>> card = Card("HASPI", "0.93", "Predicted intelligibility.", [("NAL-R", "0.93", 0.93)])
     >>> "width: 93.0%" in Page("Aids", "", [], [card]).html()

@@ -149,7 +149,7 @@ def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Pi
     """Draw the median, the quartiles and all values of each group of items.
 
     Args:
-        groups: Values as a pandas series, by the name of the group.
+        groups: Values of each group as a pandas series, under the name of the group.
         measure: Title of the values.
         by: Noun for the groups, such as "condition".
 

@@ -72,7 +72,7 @@ class TrainingData:
     def from_manifest(
         cls, manifest: str | Path, root: str | Path | None = None, **attributes: Any
     ) -> TrainingData:
-        """Use the splits ``train`` and ``valid`` of a manifest.
+        """Return the training data of a manifest: its splits ``train`` and ``valid``.
 
         The difference between the manifest's noisy and clean speech is the noise, unless there is
         an attribute ``noise``.
@@ -80,8 +80,8 @@ class TrainingData:
         Args:
             manifest: CSV file, see ``read_manifest``.
             root: Folder to which its paths are relative; by default the folder of the manifest.
-            attributes: Attributes other than ``speech`` by name. They replace what the manifest
-                has.
+            attributes: Attributes of ``TrainingData`` other than ``speech``, such as ``noise`` or
+                ``audiograms``, which replace what the manifest has.
 
         Raises:
             ValueError: The manifest is invalid, or has no training speech.
@@ -113,7 +113,10 @@ class TrainingData:
         return cls(speech["train"], **attributes)
 
     def validation(self) -> TrainingData:
-        """Return what validation uses, in the attributes ``speech``, ``noise`` and ``audiograms``.
+        """Return the data for validation as ``speech``, ``noise`` and ``audiograms``.
+
+        They are ``valid_speech``, ``valid_noise`` and ``valid_audiograms`` where these are set, and
+        otherwise the data for training.
 
         Raises:
             ValueError: Training and validation share files of speech or noise.

@@ -99,7 +99,7 @@ class CompensatorTraining(TrainingModule):
         return {"valid_loss": self.training_loss(batch)[None]}
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Compute the mean loss over the validation batches. The score is its negative."""
+        """Compute ``valid_loss``, the mean over validation batches, and ``score``, minus that."""
         mean = float(values["valid_loss"].double().mean())
         return {"score": -mean, "valid_loss": mean}
 
@@ -113,7 +113,7 @@ def train_compensator(
     simulator: Simulator = "neuro-msbg",
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a compensator, or resume its training, and save its state with the best validation.
+    """Train a compensator, or resume its training, and save it as it is when it validates best.
 
     Args:
         data: Speech, noise and ears for training and validation.

@@ -29,7 +29,7 @@ _POWER_FLOOR = 1e-18
 class SimulatorTraining(TrainingModule):
     """Lightning module that trains a Neuro-MSBG on the output of a teacher.
 
-    Batches contain that output as ``impaired``.
+    Batches contain the output of the teacher as ``impaired``.
 
     Args:
         recipe: Settings of the network and of the training.
@@ -102,7 +102,7 @@ def train_simulator(
     teacher: str = "msbg",
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a simulator, or resume its training, and save the one with the best validation.
+    """Train a simulator, or resume its training, and save it as it is when it validates best.
 
     Args:
         data: Speech, noise and ears for training and validation.

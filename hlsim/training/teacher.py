@@ -18,10 +18,10 @@ class PluginTeacher:
     """Teacher that calls a user's simulator of hearing loss.
 
     The simulator is a function ``(waveform, audiogram) -> waveform``, or a class whose objects can
-    be called in this way and which is constructed without arguments. It receives signals in pascals
-    with shape (items, time) and thresholds in dB HL with shape (items, 8), and returns the
-    perceived signals, time-aligned with its input. Its sample rate is its attribute ``sample_rate``
-    or else 16000 Hz.
+    be called in this way and which is constructed without arguments. The simulator receives signals
+    in pascals with shape (items, time) and thresholds in dB HL with shape (items, 8), and returns
+    the perceived signals, time-aligned with its input. The sample rate is its attribute
+    ``sample_rate`` or else 16000 Hz.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``, see ``load_plugin``.

@@ -45,7 +45,7 @@ class CleanBatch:
         extent: Number of samples of each item at the input's rate.
         resampled: Number of samples of each item at 24 kHz.
         starts: For each item, the first sample at 24 kHz that is not silent.
-        audible: Number of samples at 24 kHz from there to the last one that is not silent.
+        audible: Number of samples at 24 kHz from the first to the last one that is not silent.
         spectrum: Spectra from which the delays of outputs are computed.
         signals: Audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
 

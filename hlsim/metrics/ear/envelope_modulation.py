@@ -274,8 +274,8 @@ def normalised_covariance(xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
     """Return the magnitude of the correlation of two signals; 0 where one of them is constant.
 
     Args:
-        xx, yy: Energies of both signals without their means. Any shape.
-        xy: Sums of their products, of the same shape.
+        xx, yy: Sum of squares of each signal, from which its mean was subtracted. Any shape.
+        xy: Sum of the products of both signals, of the same shape.
 
     >>> normalised_covariance(torch.tensor(4.0), torch.tensor(9.0), torch.tensor(-3.0))
     tensor(0.5000)
@@ -286,10 +286,10 @@ def normalised_covariance(xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
 
 
 def correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
-    """Compute the features of HASPI from two signals without internal noise of the ear.
+    """Compute the features of HASPI: how much an output is correlated with clean speech.
 
-    The magnitude of the correlation is averaged over the five cepstral coefficients. A coefficient
-    that is constant over time counts as 0.
+    Both signals have no internal noise of the ear. The magnitude of the correlation is averaged
+    over the five cepstral coefficients. A coefficient that is constant over time counts as 0.
 
     Args:
         reference, processed: Cepstral coefficients of the audible frames of clean speech and of the

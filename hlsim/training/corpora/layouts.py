@@ -117,8 +117,8 @@ def prepare(
         source: Folder of a known layout, or a CSV file, see ``read_manifest``.
         out: CSV file to write. Its paths are relative to the folder of the corpus, or to that of
             the CSV file.
-        folders: Meanings of the levels of folders, instead of a known layout: ``split``,
-            ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
+        folders: Meaning of each level of folders, the top first, instead of a known layout:
+            ``split``, ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
         valid_share: Share of the training speakers that are moved to the validation split, if the
             corpus has none.
 
@@ -151,7 +151,8 @@ def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
 
     Args:
         root: Folder of the corpus.
-        folders: Meanings of the levels of folders, see ``prepare``.
+        folders: Meaning of each level of folders, the top first, instead of a known layout:
+            ``split``, ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
 
     Raises:
         ValueError: The layout is unknown or contradictory.
@@ -184,7 +185,8 @@ def recognise(
 
     Args:
         files: Paths of audio files relative to the corpus, with forward slashes.
-        folders: Meanings of the levels of folders, see ``prepare``.
+        folders: Meaning of each level of folders, the top first, instead of a known layout:
+            ``split``, ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
 
     Returns:
         The name of the layout, and the utterances.

@@ -134,8 +134,8 @@ def check_utterances(utterances: Sequence[Utterance], root: Path) -> None:
         root: Folder to which their paths are relative.
 
     Raises:
-        ValueError: There are none, they contradict each other, noise is listed as speech, or a path
-            leads out of the root.
+        ValueError: There are no rows, rows contradict each other, noise is listed as speech, or a
+            path leads out of the root.
 
     >>> check_utterances([Utterance("noise/1.wav")], Path("corpus"))
     Traceback (most recent call last):
