@@ -126,8 +126,8 @@ def evaluate_scenes(
             waveform`` for signals with shape (2, time) at the scale of the files.
         scenes: Folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``) with two channels, and
             ``SCENE_target_anechoic_CH1.wav`` (or ``_target_anechoic``, ``_reference``) with one or
-            two. If there is a ``SCENE_target_CH1.wav``, each channel of the reference gets its
-            level.
+            two. If there is a ``SCENE_target_CH1.wav``, the target in the room, each channel of the
+            reference gets the level of that file, unless the reference is ``_reference``.
         listeners: Clarity's ``listeners.json``, or a CSV file, see ``read_listeners``. Only
             listeners that are used are validated.
         out: Folder of the results.

@@ -207,7 +207,7 @@ def compare(
         unit: Column that several items share, such as ``"listener"``; their means are compared too.
 
     Returns:
-        The comparisons of each measure in turn, without pairs that have both scores of no item.
+        The comparisons of each measure in turn. A pair is left out if no item has both scores.
 
     >>> import pandas
     >>> rows = [(i, c, 0.1 * i + 0.2 * (c == "b")) for i in range(6) for c in "ab"]

@@ -184,7 +184,9 @@ def apply_treatments(
 
     Args:
         items: Items without processing.
-        treatments: Names of ways to process the input, see ``TREATMENTS``.
+        treatments: Names of ways to process the input: ``"as-is"``, ``"louder"`` (by 20 dB),
+            ``"nal-r"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
+            ``"compensated"`` (by ``compensator``).
         compensator: The compensator of the treatment ``"compensated"``.
 
     Returns: Each item under each treatment in turn, which is its fact ``treatment``.

@@ -233,8 +233,8 @@ def haspi_report(
             and of all scores.
 
     Returns:
-        The evaluation. The comparison of the last condition with the first counts as planned
-        before the scores were known, so its p values are not adjusted.
+        The evaluation. The comparison of the last condition with the first by the first measure
+        counts as planned before the scores were known, so its p values are not adjusted.
 
     Raises:
         ValueError: Files do not match, a row of the manifest is not valid, or nothing could be

@@ -61,14 +61,17 @@ def evaluate_simulators(
         speech: Folder of recordings of clean speech.
         audiograms: CSV file of ears, see ``draw_simulator_items``.
         store: File of scores, which is created if it does not exist; None stores nothing.
-        noise: Folder of recordings of noise. Every second item is then noisy.
+        noise: Folder of recordings of noise. Every second item is then noisy, at signal-to-noise
+            ratios of 2.5 to 17.5 dB.
         teacher: The simulator to compare with: ``"msbg"``, the exact one, or
             ``package.module:name``.
         measures: Further measures, ``package.module:name``.
         items: Number of items, each of which is measured for each of ``inputs``.
         seconds: Length of an item in seconds; PESQ and STOI need 2 or more.
         levels: Levels of the input in dB SPL that the items have in turn.
-        inputs: Names of ways to process the input before the simulator, see ``TREATMENTS``.
+        inputs: Names of ways to process the input before the simulator: ``"as-is"``, ``"louder"``
+            (by 20 dB), ``"nal-r"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
+            ``"compensated"`` (by ``compensator``).
         compensator: Module of the treatment ``"compensated"``.
         seed: Seed of all random draws.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the

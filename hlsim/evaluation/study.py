@@ -75,7 +75,8 @@ class Item:
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
         seed: Seed of the random numbers that a measure draws.
         facts: Further columns of the table that describe the item, such as ``listener`` or ``snr``.
-        recorded: For outputs that were recorded, a function that reads them, by condition.
+        recorded: For each condition whose output was recorded, under its name, a function that
+            reads the output.
 
     >>> clean = torch.ones(8)
     >>> Item("item 1", clean, clean, Audiogram.standard("N3")).sample_rate

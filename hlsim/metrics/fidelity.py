@@ -168,10 +168,9 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
     """Compute wide-band PESQ, the quality of speech from about 1 to 4.6, with the package pesq.
 
     Signals are resampled to 16 kHz. Silence and signals without detectable speech have no score,
-    but a reason instead.
-    Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts, which ends the process. If you
-    score minutes of speech, use ``run_study`` or an evaluation command with ``jobs`` of 2 or more:
-    only the scores of the item that crashes are then missing.
+    but a reason instead. Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts, which ends
+    the process. If you score minutes of speech, use ``run_study`` or an evaluation command with
+    ``jobs`` of 2 or more: only the scores of the item that crashes are then missing.
 
     Source: ITU-T P.862.2.
 

@@ -42,7 +42,7 @@ class Interaural(NamedTuple):
         time: Time in microseconds by which the left ear receives the sound earlier, from -1000 to
             1000.
         coherence: Correlation of both ears' signals after a shift by this time, from 0 to 1. The
-            time difference is meaningful where it is close to 1.
+            time difference is meaningful where the coherence is close to 1.
 
     >>> Interaural(torch.zeros(5), torch.zeros(5), torch.ones(5)).coherence
     tensor([1., 1., 1., 1., 1.])

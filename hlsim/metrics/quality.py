@@ -160,7 +160,14 @@ class QualityReference(Reference):
         """Return the score of each output of an aid with its nonlinear and its linear part.
 
         Args:
-            processed, noise, seed: The arguments of ``score``.
+            processed: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
+                time).
+            noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
+                ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
+            seed: Seed of the drawn noise, or one seed for each item.
+
+        Raises:
+            ValueError: Outputs of another shape, not finite or on another device.
         """
         return QualityParts(*self._compare(processed, noise, seed).unbind(-1))
 

@@ -22,9 +22,9 @@ CHECKPOINT = "checkpoint"
 class WeightAverage(WeightAveraging):
     """Exponential moving average of the weights, which replaces them in validation and checkpoints.
 
-    Unlike Lightning's ``EMAWeightAveraging``, it forgets faster at first: the decay is at most
-    (1 + n) / (10 + n) after n steps. The random initial weights would otherwise dominate the
-    average of a short training.
+    Unlike that of Lightning's ``EMAWeightAveraging``, this average forgets faster at first: the
+    decay is at most (1 + n) / (10 + n) after n steps. The random initial weights would otherwise
+    dominate the average of a short training.
 
     Args:
         decay: Weight of the previous average in the new one, from 0 to below 1.

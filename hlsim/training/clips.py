@@ -32,8 +32,8 @@ class Clips:
     """Clips of equal length from the first channels of recordings, at one sample rate.
 
     Recordings are decoded when they are first drawn, and kept as 16-bit samples, up to 2 GB. A file
-    that is broken, silent, or has an unsupported sample rate causes one warning. Whenever it is
-    drawn, another file is drawn instead.
+    that is broken, silent, or has an unsupported sample rate causes one warning. Whenever this file
+    is drawn, another one is drawn instead.
 
     Args:
         source: Folder or files, see ``Source``.

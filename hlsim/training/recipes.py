@@ -98,9 +98,9 @@ class SimulatorRecipe(TrainingRecipe):
             ``magnitude``, ``phase``, ``complex`` and ``time``.
         unit_power: Signal by whose power all signals are divided before the criteria, ``truth`` or
             ``input``. ``truth`` is the target, with which soft items count as much as loud ones.
-            ``input`` is the choice of MP-SENet. The paper's criteria require it for networks
-            without a prior: at first, their errors for severe ears are 50 dB above the target, and
-            they would learn to be silent.
+            ``input`` is the choice of MP-SENet. The paper's criteria require ``input`` for networks
+            without a prior: at first, the errors of these networks for severe ears are 50 dB above
+            the target, and they would learn to be silent.
         levels: Lowest and highest level of the speech in dB SPL, before amplification.
         treated: Whether clips are equalised, amplified and compressed at random, like the outputs
             of compensators.
@@ -141,8 +141,8 @@ class CompensatorRecipe(TrainingRecipe):
             ``hasqi``, ``denoising`` and ``intelligibility``. The first five are those of
             ``HearingLossLoss``; ``haspi`` and ``hasqi`` (1 - score) require clips of 0.7 s or more.
             The last two train a hearing aid's noise reduction alone, and the others its
-            amplification alone: ``denoising`` is the error of its gains, ``intelligibility`` is 1 -
-            HASPI at equal level.
+            amplification alone: ``denoising`` is the error of the gains of noise reduction,
+            ``intelligibility`` is 1 - HASPI at equal level.
         reference: Signal with which the paper's criterion compares, ``clean`` or
             ``normal-hearing``.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without

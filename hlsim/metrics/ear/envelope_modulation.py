@@ -308,7 +308,7 @@ def correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
 
 
 def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
-    """Compute the mean of ``correlation`` over the ear's internal noise, without drawing noise.
+    """Compute the features of HASPI in the mean over the ear's internal noise, without drawing it.
 
     HASPI adds noise to the levels of both signals. The noise increases the energies by which the
     covariance is divided, and contributes zero on average to the covariance itself. The mean and
