@@ -39,6 +39,15 @@ def test_values_that_are_not_ears_for_a_simulator_are_rejected(audiogram: Any) -
         as_thresholds(audiogram)
 
 
+def test_the_error_for_a_level_names_its_frequency() -> None:
+    levels = torch.zeros(2, 8)
+    levels[1, 6] = torch.nan
+    with pytest.raises(ValueError, match="got nan at 6000 Hz; replace it"):
+        as_thresholds(levels)
+    with pytest.raises(ValueError, match="got 130 at 4000 Hz; limit it"):
+        Audiogram((20.0, 130.0), (500.0, 4000.0))
+
+
 @pytest.mark.parametrize("ear", [[20.0] * 6, np.zeros(6), torch.zeros(2, 6)])
 def test_another_number_of_thresholds_suggests_a_dictionary(ear: Any) -> None:
     with pytest.raises(ValueError, match=r"pass a dictionary .* such as \{500: 20, 4000: 50\}"):

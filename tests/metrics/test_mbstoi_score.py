@@ -171,3 +171,12 @@ def test_bad_arguments_raise_value_error(change: dict[str, Any]) -> None:
     arguments = {"processed": torch.randn(2, 16000), "clean": torch.randn(2, 16000)} | change
     with pytest.raises(ValueError):
         mbstoi(**arguments)
+
+
+def test_errors_name_signal_item_and_ear(scenes: tuple[Tensor, Tensor]) -> None:
+    clean, processed = (signal.clone() for signal in scenes)
+    processed[1, 1, 100] = math.nan
+    with pytest.raises(ValueError, match=r"^processed at the right ear of item 1 holds"):
+        mbstoi(processed, clean)
+    with pytest.raises(ValueError, match=r"^clean of item 2 is silent at the left and"):
+        mbstoi(clean, clean * torch.tensor([1.0, 1.0, 0.0])[:, None, None])
