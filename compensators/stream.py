@@ -50,7 +50,7 @@ class Stream:
         if aid.sample_rate != RATE:
             raise ValueError(
                 f"expected an aid with sample_rate={RATE} for a stream, got {aid.sample_rate}; "
-                "resample the signal to that rate"
+                f"use such an aid, and resample the signal to {RATE} Hz"
             )
         as_thresholds(audiogram, consumer=type(aid).__name__)
         self._aid = aid

@@ -43,8 +43,8 @@ class Live:
 
     Args:
         stream: Function from a block to its output, both with shape (time,) for one ear or
-            (2, time) for two. Its attributes ``noise_reduction`` and ``amplification``, if it has
-            them, are moved by keys.
+            (2, time) for two. If it has attributes ``noise_reduction`` and ``amplification``, keys
+            of the keyboard change them while it runs.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, at microphone and headphones.
         ears: Number of ears, 1 or 2. If there are two microphones, each ear has its own.
         latency: Delay of the stream's output in samples, which is displayed.

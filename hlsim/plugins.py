@@ -27,7 +27,7 @@ _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 
 
 def load_plugin(name: str, kind: str) -> Any:
-    """Import a function, a module or another object of your own code by its name.
+    """Import a function, a PyTorch module or another object of your own code by its name.
 
     A class is called without arguments, and the object is returned. Python searches for modules in
     the working directory first, and a file can import modules beside it. This holds during the

@@ -62,8 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ["MPLBACKEND"] = "Agg"
     warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
 
-    def stop(number: int, frame: object) -> None:
-        raise KeyboardInterrupt(number)
+    def stop(signal_number: int, frame: object) -> None:
+        raise KeyboardInterrupt(signal_number)
 
     is_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGTERM, stop) if is_main_thread else None

@@ -189,7 +189,7 @@ class Enhanced(nn.Module):
         self.limit_spl = output_limit_spl(aid)
 
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
-        """Return the output of the aid for the enhanced waveform, with shape (..., time)."""
+        """Enhance the waveform, and return the aid's output for the result, (..., time)."""
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
         aided: Tensor = self.aid(enhanced, ear)
         return aided

@@ -93,7 +93,7 @@ class _Pair(NamedTuple):
     listener: Listener
 
     def output_file(self, folder: Path) -> Path:
-        """Return the file of an output in the folder of its condition."""
+        """Return the path of the aid's output in ``folder``, which holds those of one condition."""
         return folder / f"{self.scene}_{self.name}_HA-output.wav"
 
 

@@ -88,7 +88,7 @@ class Comparison:
         return abs(self.level_change) < _LEVEL_TOLERANCE_DB
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes and the sentences for ``report.json``."""
+        """Return the attributes, and ``verdict`` and ``limits`` as text, for ``report.json``."""
         return asdict(self) | {"in_words": f"{self.verdict()} {self.limits()}"}
 
     def verdict(self, subject: str = "", rival: str = "") -> str:
@@ -122,7 +122,7 @@ class Comparison:
         return f"{text}: {means} ({facts}; {self._describe_tests()})."
 
     def limits(self) -> str:
-        """Return sentences about levels, dependent items and other limits of the verdict."""
+        """Return sentences on the output levels, dependent items and other limits of the verdict."""
         sentences = [self._describe_level(), self._describe_units()]
         if self.left_out:
             sentences.append(f"{_count_items(self.left_out)} without both scores are left out.")

@@ -306,7 +306,7 @@ def score_recordings(
         The evaluation; with ``better_ear``, its group ``ears`` has the scores of each ear.
 
     Raises:
-        ValueError: Nothing could be scored, or an utterance lacks one of both ears.
+        ValueError: Nothing could be scored, or ``better_ear`` is set and an utterance lacks an ear.
 
     >>> from hlsim.shortcuts import EXAMPLE_FILE
     >>> outputs = {"unaided": EXAMPLE_FILE}

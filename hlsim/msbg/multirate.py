@@ -218,7 +218,7 @@ def multirate_bank(
     dtype: torch.dtype,
     device: torch.device,
 ) -> MultirateBank:
-    """Build a filter bank for signals of one length, with each channel at its own sample rate.
+    """Build a filter bank for signals of one length, in bands of channels that share a sample rate.
 
     Args:
         bank: Parameters of the filter bank.

@@ -99,7 +99,8 @@ class MaskDecoder(Decoder):
 class PhaseDecoder(Decoder):
     """Decoder of the shift of the phase at each point of a spectrogram.
 
-    The shift is the angle of 1 + x + j y for two decoded values x and y.
+    The shift is the angle of 1 + x + j y for two decoded values x and y. ``factor`` returns the
+    complex factor by which the spectrogram is multiplied: the gain that it is given, and the shift.
 
     Args:
         channels: Number of channels of the feature maps.

@@ -6,13 +6,14 @@ from torch.nn import functional
 
 
 def log_magnitude(squared: Tensor) -> Tensor:
-    """Compute half the natural logarithm of magnitudes, an input channel of the networks.
+    """Compute an input channel of the networks: half the natural logarithm of magnitudes.
 
     Args:
-        squared: Squared magnitudes, any shape. For 0, the result is -6.3.
+        squared: Squared magnitudes, any shape, so the result is ``log(squared) / 4``; for 0 it is
+            -6.3.
 
-    >>> log_magnitude(torch.tensor([1.0, 0.0])).round(decimals=1)
-    tensor([ 0.0000, -6.3000])
+    >>> log_magnitude(torch.tensor([100.0, 1.0, 0.0])).round(decimals=2)
+    tensor([ 1.1500,  0.0000, -6.3300])
     """
     return (squared + 1e-11).log() / 4.0
 

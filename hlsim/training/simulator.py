@@ -68,8 +68,8 @@ class SimulatorTraining(TrainingModule):
         """Compute the ratio of the teacher's output to the network's error for each item.
 
         Returns:
-            The ratios in dB with shape (items,), as ``valid_snr`` for speech and as
-            ``valid_sounds_snr`` for tones and clicks.
+            The ratios in dB, (items,), under one name: ``valid_snr`` for a batch of speech, or
+            ``valid_sounds_snr`` for a batch of tones and clicks.
         """
         perceived = self.network(batch["signal"], batch["thresholds"])
         name = "valid_sounds_snr" if "sounds" in batch else "valid_snr"

@@ -38,7 +38,7 @@ class UnscorableError(ValueError):
 
 @dataclass(frozen=True)
 class CleanBatch:
-    """Clean signals that are computed together, cut to their audible parts.
+    """Clean signals of a batch, cut to their audible parts: one on a CPU, all of them on a GPU.
 
     Attributes:
         items: Indices of the signals among all items.

@@ -147,7 +147,7 @@ def prepare(
 
 
 def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
-    """Recognise the layout of a folder, and validate the utterances in it.
+    """Recognise the layout of a folder, and list its utterances, whose audio is not read.
 
     Args:
         root: Folder of the corpus.
