@@ -122,7 +122,7 @@ class Comparison:
         return f"{text}: {means} ({facts}; {self._describe_tests()})."
 
     def limits(self) -> str:
-        """Return sentences on the output levels, dependent items and other limits of the verdict."""
+        """Return sentences on output levels, dependent items and other limits of the verdict."""
         sentences = [self._describe_level(), self._describe_units()]
         if self.left_out:
             sentences.append(f"{_count_items(self.left_out)} without both scores are left out.")
