@@ -73,9 +73,11 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
         raise ValueError(f"{path}: the file has no samples; replace or remove it")
     highest = HIGHEST_FILE_RATE if any_rate else HIGHEST_RATE
     if not LOWEST_RATE <= rate <= highest:
+        fix = "resample the file"
+        if rate < LOWEST_RATE:
+            fix = f"use another recording, because this one has no sound above {rate / 2:g} Hz"
         raise ValueError(
-            f"{path}: the sample rate is {rate} Hz, expected {LOWEST_RATE} to {highest} Hz; "
-            "resample the file"
+            f"{path}: the sample rate is {rate} Hz, expected {LOWEST_RATE} to {highest} Hz; {fix}"
         )
     waveform = torch.from_numpy(samples.T.copy())
     if not bool(waveform.isfinite().all()):

@@ -179,7 +179,8 @@ def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHE
     if not accepted or int(sample_rate) != sample_rate:
         raise ValueError(
             f"expected a sample rate that is a whole number from {lowest} to {highest} Hz, got "
-            f"{describe(sample_rate)}; use signals at such a rate"
+            f"{describe(sample_rate)}; use signals at such a rate; "
+            "hlsim.load_audio(path, sample_rate=16000) resamples a recording to 16000 Hz"
         )
     return int(sample_rate)
 

@@ -240,7 +240,8 @@ def check_two_channels(waveform: Tensor) -> None:
     if waveform.shape[-2:-1] != (2,):
         raise ValueError(
             "expected a waveform of shape (..., 2, time) for two ears, left first, "
-            f"got {tuple(waveform.shape)}"
+            f"got {tuple(waveform.shape)}; pass torch.stack([left, right], -2), with the same "
+            "signal twice if it is mono"
         )
 
 

@@ -71,8 +71,9 @@ class Audiogram:
         if len(levels) != len(frequencies):
             raise ValueError(
                 f"expected one level per frequency, got {len(levels)} levels for "
-                f"{len(frequencies)} frequencies; for other frequencies pass a dictionary of each "
-                "frequency in Hz to its threshold, such as {500: 20, 4000: 50}"
+                f"{len(frequencies)} frequencies, {join_numbers(frequencies)} Hz; for other "
+                "frequencies pass a dictionary of each frequency in Hz to its threshold, such as "
+                "{500: 20, 4000: 50}"
             )
         is_measured = ~np.isnan(levels)
         levels, frequencies = levels[is_measured], frequencies[is_measured]

@@ -126,6 +126,12 @@ def evaluate_compensators(
     require("pandas", "eval")
     if not compensators:
         raise ValueError("expected at least one compensator, got none; pass one under its name")
+    for name, compensator in compensators.items():
+        if not isinstance(compensator, nn.Module):
+            raise ValueError(
+                f"{name}: expected an nn.Module that is called with a waveform and an ear, got "
+                f"{type(compensator).__name__}; write a module whose forward calls it"
+            )
     if items < 1:
         raise ValueError(f"expected at least one item, got {items}; set items to 1 or more")
     if not levels or not all(0.0 <= level <= 120.0 for level in levels):

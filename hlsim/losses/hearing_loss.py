@@ -109,7 +109,8 @@ class HearingLossLoss(nn.Module):
     - ``"paper"``: Equations 2 to 9 of the Neuro-MSBG paper, which are not balanced between ears and
       levels (``hlsim.losses.paper``)
     - ``"haspi"`` and ``"hasqi"``: 1 minus the score of the compensated speech
-      (``hlsim.metrics.score_loss``). They ignore the level, so combine them with another criterion.
+      (``hlsim.metrics.score_loss``). They do not penalise loudness, so combine them with another
+      criterion.
     - ``"interaural"``: change of the differences between the ears of a listener
       (``hlsim.metrics.interaural``), to be combined with another criterion
     - names of several of these with their weights, ``{"coherent-bands": 1.0, "haspi": 0.3}``

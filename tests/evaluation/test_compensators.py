@@ -163,6 +163,7 @@ def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
     [
         {"compensators": {}},
         {"compensators": {"NAL-R": Unaided()}},
+        {"compensators": {"mine": lambda waveform, ear: waveform}},
         {"audiogram": None},
         {"items": 0},
         {"levels": (130.0,)},

@@ -265,7 +265,7 @@ def test_the_keyboard_reaches_everything(report: Any) -> None:
     report.keyboard.press("Tab")
     element = "document.activeElement"
     focus = f"[{element}.className || {element}.tagName, {element}.innerText]"
-    assert report.evaluate(focus) == ["skip", "Skip to the report"]
+    assert report.evaluate(focus) == ["skip", "Skip to the content"]
     assert report.evaluate(f"{element}.getBoundingClientRect().left") >= 0
     report.keyboard.press("Enter")
     assert report.evaluate(f"{element}.id") == "main"
