@@ -26,8 +26,7 @@ from hlsim.calibration import PASCAL_SPL
 DEFAULT_NOISE_REDUCTION = 0.5
 """Share of the attenuation by default.
 
-HASPI is highest with all of it, but a speech recogniser behind the simulated ear finds most words
-with half of it (docs/measured.md).
+Whisper base behind the simulated ear finds most words in noise with half of it (docs/measured.md).
 """
 
 QUIET_FADE_DB = 15.0
