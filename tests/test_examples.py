@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from compensators import HearingAid, save_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import level_spl, set_level
@@ -94,16 +95,19 @@ def test_sliders_trade_noise_for_level(
     for score in ("haspi", "hasqi"):  # Only levels are compared.
         monkeypatch.setattr(example, score, lambda output, clean, ear: output.mean())
     ears = write_ears(tmp_path / "ears.csv", "N2")
-    with torch.no_grad():
-        example.main(valid, valid, str(ears), "2")
-    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    levels = {tuple(row[:4]): float(row[6]) for row in rows}
-    assert len(levels) == 10
-    for condition in ("clean", "noisy"):
-        whole = levels["| 1", "1", "0.1", condition]
-        assert levels["| 1", "0", "0.1", condition] < whole < levels["| 0", "1", "0.1", condition]
-        # A slower release holds peaks, to which the trained correction may answer with more gain.
-        assert levels["| 1", "1", "2", condition] != whole
+    save_compensator(HearingAid(), tmp_path / "untrained")
+    for name in ("hearing-aid", str(tmp_path / "untrained")):
+        with torch.no_grad():
+            example.main(valid, valid, str(ears), "2", name)
+        rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+        levels = {tuple(row[:4]): float(row[6]) for row in rows}
+        assert len(levels) == 10
+        for condition in ("clean", "noisy"):
+            whole = levels["| 1", "1", "0.1", condition]
+            unamplified = levels["| 1", "0", "0.1", condition]
+            assert unamplified < whole < levels["| 0", "1", "0.1", condition]
+    for condition in ("clean", "noisy"):  # of the untrained aid, in which peaks are held
+        assert levels["| 1", "1", "2", condition] < levels["| 1", "1", "0.1", condition]
 
 
 def test_similarity_of_neurograms() -> None:

@@ -139,8 +139,8 @@ def _cards(evaluation: Evaluation) -> list[Card]:
             _decibels(errors[TRAINED]),
             "Perceived level minus that of a normal ear; a picture below shows each frequency "
             f"band. NAL-R gets {_decibels(change['level'])} to reach the same level, perceived as "
-            f"{_decibels(change['loudness_error'])}, because this ear's loudness grows too fast "
-            "(recruitment).",
+            f"{_decibels(change['loudness_error'])}. In an ear with recruitment, loudness grows "
+            "faster than the level.",
             [(name, _decibels(e), abs(e) / errors.abs().max()) for name, e in errors.items()],
         ),
     ]
