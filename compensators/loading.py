@@ -12,7 +12,7 @@ from compensators.wdrc import WDRC
 from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
-from hlsim.checkpoint import checkpoint_about, read_checkpoint, save_checkpoint
+from hlsim.checkpoint import read_checkpoint, read_record, save_checkpoint
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.version import __version__
 
@@ -85,7 +85,7 @@ def load_compensator(
     else:
         build = partial(build_compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
         kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
-        compensator = read_checkpoint(name, kinds, build, other_names=tuple(UNTRAINED))
+        compensator = read_checkpoint(name, kinds, build)
     compensator.eval().requires_grad_(False)
     if isinstance(compensator, Wearable):
         compensator.linked = linked
@@ -148,5 +148,5 @@ def trained_for(name: str | Path) -> Audiogram | None:
     """
     if _untrained(name) is not None:
         return None
-    audiogram = checkpoint_about(name).get("audiogram")
+    audiogram = read_record(name).get("about", {}).get("audiogram")
     return None if audiogram is None else Audiogram.from_dict(audiogram)

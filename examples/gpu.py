@@ -71,7 +71,7 @@ from torch import Tensor, nn
 from compensators import load_compensator
 from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
-from hlsim.checkpoint import SIMULATOR, shipped_checkpoints
+from hlsim.checkpoint import list_pretrained
 from hlsim.losses.criteria import CRITERIA, weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics import haspi, hasqi, mbstoi
@@ -197,12 +197,16 @@ def compensators() -> list[Subject]:
     return [Subject(name, lambda name=name: load_compensator(name), process) for name in names]
 
 
+def simulator_names() -> list[str]:
+    return [name for name, loader in list_pretrained().items() if loader == "load_pretrained"]
+
+
 def simulators() -> list[Subject]:
     subjects = [
         Subject("MSBG 16 kHz", lambda: MSBG(sample_rate=16000), process),
         Subject("MSBG 44.1 kHz", lambda: MSBG(sample_rate=44100), process, 44100),
     ]
-    for name in shipped_checkpoints([SIMULATOR]):
+    for name in simulator_names():
         subjects.append(Subject(name, lambda name=name: load_pretrained(name), process))
     return subjects
 
@@ -542,7 +546,7 @@ def table_two(run: Run) -> None:
                 NeuroMSBG(NeuroConfig(**settings), sample_rate=44100), PAPER_GPU_MS.get(name)
             ),
         )
-    for name in shipped_checkpoints([SIMULATOR]):
+    for name in simulator_names():
         run.add_row(
             "table-2", name, lambda name=name: measure(load_pretrained(name, sample_rate=44100))
         )

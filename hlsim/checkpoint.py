@@ -8,8 +8,7 @@ says which class of model it holds.
 
 import hashlib
 import json
-import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +25,6 @@ Settings = Mapping[str, Any]
 
 WEIGHTS = "model.safetensors"
 CONFIG = "config.json"
-CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
 """Kind of the checkpoints of simulators. All other kinds are compensators."""
@@ -42,8 +40,8 @@ def list_pretrained() -> dict[str, str]:
     >>> list_pretrained()["neuro-msbg"]
     'load_pretrained'
     """
-    folders = shipped_checkpoints()
-    return {name: _loader_name(_read_record(folder)["kind"]) for name, folder in folders.items()}
+    folders = sorted(path.parent for path in checkpoints_folder().glob(f"*/{CONFIG}"))
+    return {folder.name: _loader_name(read_record(folder)["kind"]) for folder in folders}
 
 
 def _loader_name(kind: str) -> str:
@@ -54,18 +52,14 @@ def read_checkpoint(
     name: str | Path,
     kinds: Mapping[str, Callable[[Settings], Config]],
     build: Callable[[Config], Model],
-    other_names: Sequence[str] = (),
 ) -> Model:
-    """Load a model from a checkpoint.
-
-    The model is on torch's default device, or on the CPU if that is ``meta``.
+    """Load a model from a checkpoint. The model is on torch's default device.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
         kinds: Accepted kinds of checkpoints. The value of each is a function from the settings in
             ``config.json`` to the object with which the model is built.
         build: Function from this object to the model, whose weights are then loaded.
-        other_names: Names that the caller accepts in addition, for the error message.
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, or its kind is not accepted.
@@ -75,17 +69,15 @@ def read_checkpoint(
     >>> read_checkpoint("neuro-msbg-light", kinds, NeuroMSBG).config.blocks
     2
     """
-    folder = find_checkpoint(name, kinds, other_names)
-    record = _read_record(folder)
-    kind = record.get("kind")
-    if not isinstance(kind, str) or kind not in kinds:
-        hint = f"; load it with {_loader_name(kind)}" if isinstance(kind, str) else ""
-        expected = " or ".join(repr(accepted) for accepted in kinds)
-        raise ValueError(f"{folder}: expected a checkpoint of kind {expected}, got {kind!r}{hint}")
-    try:
-        weights = (folder / WEIGHTS).read_bytes()
-    except OSError as error:
-        raise ValueError(f"{folder}: cannot read the checkpoint: {error}") from error
+    folder = _find_folder(name)
+    record = read_record(folder)
+    kind = str(record.get("kind"))
+    if kind not in kinds:
+        raise ValueError(
+            f"{folder}: expected a checkpoint of kind {' or '.join(kinds)}, got {kind}; load it "
+            f"with {_loader_name(kind)}"
+        )
+    weights = (folder / WEIGHTS).read_bytes()
     settings: Any = record.get("config")
     digests = {
         WEIGHTS: (hashlib.sha256(weights).hexdigest(), record.get("sha256")),
@@ -98,103 +90,51 @@ def read_checkpoint(
                 f"SHA-256 is not that in {CONFIG}; download or save the checkpoint again"
             )
     try:
-        config = kinds[kind](settings)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{folder / CONFIG}: {error}") from error
-    device = torch.get_default_device()
-    try:
-        # Gradients may flow through the model later, hence no inference mode. A default device
-        # "meta" would discard the weights. Initialisation must not advance the caller's random
-        # numbers.
+        # Gradients may flow through the model later, hence no inference mode. Initialisation must
+        # not advance the caller's random numbers.
         with torch.inference_mode(False), torch.device("cpu"), torch.random.fork_rng(devices=[]):
-            model = build(config)
+            model = build(kinds[kind](settings))
             model.load_state_dict(safetensors.torch.load(weights))
-    except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
+    except (TypeError, ValueError, RuntimeError, safetensors.SafetensorError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"{folder}: weights and configuration do not fit: {reason}") from error
     with torch.inference_mode(False):
-        return model if device.type == "meta" else model.to(device)
+        return model.to(torch.get_default_device())
 
 
-def find_checkpoint(
-    name: str | Path, kinds: Collection[str] | None = None, other_names: Sequence[str] = ()
-) -> Path:
-    """Return the folder of a checkpoint of any kind.
+def read_record(name: str | Path) -> dict[str, Any]:
+    """Read what ``config.json`` records of a checkpoint of any kind.
 
     Args:
-        name: Folder of a checkpoint or, if there is no such folder, the name of a checkpoint that
-            ships with hlsim.
-        kinds: Kinds of checkpoints that the error message suggests; all by default. Only the
-            message depends on them.
-        other_names: Names that the error message suggests in addition.
+        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
+
+    Returns:
+        Among others ``kind``; ``sha256``, which identifies the weights; and ``about``, which says
+        how the model was trained: data, seed, command, time, measures and version.
 
     Raises:
-        ValueError: There is no such checkpoint.
+        ValueError: There is no such checkpoint, or the file cannot be read.
 
-    >>> find_checkpoint("neuro-msbg").name
+    >>> read_record("neuro-msbg")["kind"]
     'neuro-msbg'
     """
-    folder = Path(str(name))
-    if (folder / CONFIG).is_file():
-        return folder
-    checkpoints = shipped_checkpoints()
-    if str(name) in checkpoints:
-        return checkpoints[str(name)]
-    if (folder / "checkpoint" / CONFIG).is_file():
-        raise ValueError(
-            f"no checkpoint {str(name)!r}; use {str(folder / 'checkpoint')!r}, where training "
-            "saved it"
-        )
-    names = ", ".join([*other_names, *shipped_checkpoints(kinds)])
-    raise ValueError(f"no checkpoint {str(name)!r}; expected {names}, or a folder with {CONFIG}")
+    folder = _find_folder(name)
+    try:
+        return dict(json.loads((folder / CONFIG).read_text(encoding="utf-8")))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{folder}: cannot read {CONFIG}: {error}") from error
 
 
-def checkpoint_digest(name: str | Path) -> str:
-    """Return the SHA-256 of a checkpoint's weights, which identifies it.
-
-    Args:
-        name: Name or folder of the checkpoint.
-
-    Raises:
-        ValueError: There is no such checkpoint.
-
-    >>> len(checkpoint_digest("neuro-msbg"))
-    64
-    """
-    return str(_read_record(find_checkpoint(name)).get("sha256"))
-
-
-def checkpoint_about(name: str | Path) -> dict[str, Any]:
-    """Return how a checkpoint was trained: data, seed, command, time, measures and version.
-
-    Args:
-        name: Name or folder of the checkpoint.
-
-    Returns: Entries, each under its name; an empty dictionary if the checkpoint has no record.
-
-    Raises:
-        ValueError: There is no such checkpoint.
-
-    >>> "minutes" in checkpoint_about("neuro-msbg")
-    True
-    """
-    about = _read_record(find_checkpoint(name)).get("about")
-    return dict(about) if isinstance(about, dict) else {}
-
-
-def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]:
-    """Return the folders of the checkpoints that ship with hlsim, each under its name.
-
-    Args:
-        kinds: Kinds of checkpoints to include, such as ``hearing-aid``; all by default.
-
-    >>> [*shipped_checkpoints(["hearing-aid"])]
-    ['hearing-aid']
-    """
-    folders = [path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))]
-    if kinds is not None:
-        folders = [folder for folder in folders if _read_record(folder).get("kind") in kinds]
-    return {folder.name: folder for folder in folders}
+def _find_folder(name: str | Path) -> Path:
+    """Return the folder of a checkpoint, also if the name is that of the folder of a training."""
+    path = Path(str(name))
+    for folder in (path, checkpoints_folder() / path, path / "checkpoint"):
+        if (folder / CONFIG).is_file():
+            return folder
+    raise ValueError(
+        f"no checkpoint {str(name)!r}; expected {', '.join(list_pretrained())}, or a folder with "
+        f"{CONFIG}"
+    )
 
 
 def checkpoints_folder() -> Path:
@@ -216,11 +156,10 @@ def save_checkpoint(
     model: nn.Module,
     config: Settings,
     about: Settings,
-    card: str = "",
 ) -> None:
     """Save a model as a checkpoint, in place of an older one in the same folder.
 
-    If writing fails, the folder stays as it was.
+    If writing fails, an older checkpoint stays as it was. Its card and other files always stay.
 
     Args:
         folder: Folder to write.
@@ -228,68 +167,26 @@ def save_checkpoint(
         model: Model whose state dict is saved.
         config: Settings with which the model can be built again, as JSON values.
         about: Record of the training: data, seed, command, time, measures and version.
-        card: Text of README.md. If it is empty, the card of an older checkpoint is kept.
 
     Raises:
-        ValueError: The folder contains other files, or cannot be written.
+        ValueError: The folder cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     save_checkpoint(f"{folder}/mine", "linear", nn.Linear(1, 1), {}, {"seed": 0})
-    ...     checkpoint_about(f"{folder}/mine")
+    ...     read_record(f"{folder}/mine")["about"]
     {'seed': 0}
     """
-    target = check_replaceable(folder)
     state = {
         name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
     }
     weights = safetensors.torch.save(state)
-    settings = dict(config)
-    hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
-    record = {"kind": kind, "config": settings, **hashes, "about": dict(about)}
-    with atomic_path(target) as temporary:
-        temporary.mkdir()
-        (temporary / WEIGHTS).write_bytes(weights)
-        (temporary / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-        if card:
-            (temporary / CARD).write_text(card, encoding="utf-8")
-        elif (target / CARD).is_file():
-            shutil.copy(target / CARD, temporary / CARD)
-
-
-def check_replaceable(folder: str | Path) -> Path:
-    """Check that saving a checkpoint in a folder deletes nothing but an older checkpoint.
-
-    Returns: The folder as a path.
-
-    Raises:
-        ValueError: The folder contains other files, or is a file itself.
-
-    >>> check_replaceable("new/checkpoint").name
-    'checkpoint'
-    """
+    hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(config)}
+    record = {"kind": kind, "config": config, **hashes, "about": about}
     target = Path(folder)
-    if target.is_dir():
-        names = {path.name for path in target.iterdir()}
-        other_files = sorted(names - {WEIGHTS, CONFIG, CARD})
-    else:
-        other_files = [target.name] if target.exists() else []
-    if other_files:
-        raise ValueError(
-            f"{target}: saving would delete the file {other_files[0]}; choose a new folder, or "
-            "that of a checkpoint"
-        )
-    return target
-
-
-def _read_record(folder: Path) -> dict[str, Any]:
-    try:
-        record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-        if not isinstance(record, dict):
-            raise ValueError(f"{CONFIG} is not a JSON object")
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{folder}: cannot read the checkpoint: {error}") from error
-    return record
+    with atomic_path(target / WEIGHTS) as new_weights, atomic_path(target / CONFIG) as new_config:
+        new_weights.write_bytes(weights)
+        new_config.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
 def _digest(config: Any) -> str:

@@ -12,24 +12,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-EXTENSIONS = tuple(
-    ".wav .flac .ogg .oga .opus .mp3 .aif .aiff .aifc .au .snd .caf .w64 .rf64 .sph .voc".split()
-)
-"""Extensions by which audio files are found in folders. libsndfile reads all of these formats."""
-
-WRITTEN_EXTENSIONS = (".wav", ".flac", ".ogg")
-"""Extensions of the audio files that hlsim writes."""
-
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Write a file or folder all at once, from a ``with`` block that writes to a temporary path.
+    """Write a file all at once, from a ``with`` block that writes to a temporary path.
 
-    When the block ends, the temporary file or folder replaces ``path``. If the block raises,
-    ``path`` stays as it was.
+    When the block ends, the temporary file replaces ``path``. If the block raises, ``path`` stays
+    as it was.
 
     Args:
-        path: File or folder to write.
+        path: File to write. Its folder is made if there is none.
 
     Yields:
         The temporary path.
@@ -48,16 +40,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".hlsim-", dir=path.parent) as folder:
             temporary = Path(folder) / path.name
-            previous = Path(folder) / "previous"
             yield temporary
-            if path.is_dir():
-                os.replace(path, previous)
-            try:
-                os.replace(temporary, path)
-            except OSError:
-                if previous.exists():
-                    os.replace(previous, path)
-                raise
+            os.replace(temporary, path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -80,35 +64,6 @@ def write_atomically(path: str | Path, data: str | bytes) -> None:
     contents = data.encode() if isinstance(data, str) else data
     with atomic_path(path) as temporary:
         temporary.write_bytes(contents)
-
-
-def resolve_links(path: str | Path) -> Path:
-    """Return a path as an absolute path with all symbolic links replaced by what they point to.
-
-    Unlike ``Path.resolve`` before Python 3.13, this raises nothing for a link to itself.
-
-    >>> resolve_links("/tmp/../missing").name
-    'missing'
-    """
-    return Path(os.path.realpath(path))
-
-
-def check_extension(path: str | Path) -> str:
-    """Validate the extension of an audio file to write, and return it in lower case.
-
-    Args:
-        path: File to write.
-
-    Raises:
-        ValueError: The extension is not .wav, .flac or .ogg.
-
-    >>> check_extension("speech.WAV")
-    '.wav'
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in WRITTEN_EXTENSIONS:
-        raise ValueError(f"{path}: expected the extension .wav, .flac or .ogg, got {suffix!r}")
-    return suffix
 
 
 def sha256(path: Path) -> str:

@@ -58,7 +58,7 @@ def load_audio(
         >>> speech.ndim, rate
         (1, 16000)
     """
-    channels, rate = read_audio(path, any_rate=sample_rate is not None)
+    channels, rate = read_audio(path)
     if sample_rate is not None:
         sample_rate = check_rate(sample_rate)
         channels = resample(channels, rate, sample_rate)

@@ -18,30 +18,6 @@ def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
     assert os.listdir(tmp_path / "new") == ["a"] and (tmp_path / "new" / "a").read_text() == "new"
 
 
-def test_a_folder_is_replaced_as_a_whole_or_keeps_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_atomically(tmp_path / "folder" / "old", "old")
-
-    def fill() -> None:
-        with atomic_path(tmp_path / "folder") as temporary:
-            temporary.mkdir()
-            (temporary / "new").touch()
-
-    def fail_at_the_second_rename(source: Path, target: Path) -> None:
-        if source.name == "folder" and target.name == "folder" and source != tmp_path / "folder":
-            raise OSError("disk full")
-        rename(source, target)
-
-    rename = os.replace
-    with monkeypatch.context() as patch, pytest.raises(ValueError, match="disk full"):
-        patch.setattr(os, "replace", fail_at_the_second_rename)
-        fill()
-    assert os.listdir(tmp_path) == ["folder"] and os.listdir(tmp_path / "folder") == ["old"]
-    fill()
-    assert os.listdir(tmp_path) == ["folder"] and os.listdir(tmp_path / "folder") == ["new"]
-
-
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match=f"^{tmp_path}/file/a: cannot be written"):

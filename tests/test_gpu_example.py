@@ -27,7 +27,7 @@ def test_gpu_measurement_on_a_cpu(
     example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paper = {"cnn": {"channels": 8, "blocks": 1}}
-    monkeypatch.setattr(example, "shipped_checkpoints", lambda kinds: ["neuro-msbg-light"])
+    monkeypatch.setattr(example, "simulator_names", lambda: ["neuro-msbg-light"])
     monkeypatch.setattr(example, "CRITERIA", ["interaural"])
     timed = example.speed_subjects()[::4]
     monkeypatch.setattr(example, "speed_subjects", lambda: timed)

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from hlsim.audio import find_audio, read_audio
+from hlsim.audio import EXTENSIONS, find_audio, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import EAR_NAMES, EARS
 from hlsim.audiogram.table import read_rows
@@ -36,7 +36,7 @@ from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.store import content_hash
 from hlsim.evaluation.study import Condition, Item
-from hlsim.files import EXTENSIONS, read_table, resolve_links
+from hlsim.files import read_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -447,7 +447,7 @@ def _read_manifest(
     Raises:
         ValueError: A row is not valid; the message names its line.
     """
-    folder = resolve_links(Path(path).parent if root is None else root)
+    folder = Path(Path(path).parent if root is None else root).resolve()
     rows = read_table(path, "the manifest")
     if not rows:
         raise ValueError(f"{path}: the manifest has no rows; add one for each output file")
@@ -552,7 +552,7 @@ def _path_below(root: Path, name: str) -> Path:
     Raises:
         ValueError: The path leads out of the folder.
     """
-    path = resolve_links(root / name)
+    path = (root / name).resolve()
     if not name or not path.is_relative_to(root):
         raise ValueError(
             f"expected the path of a file below {root}, got {name!r}; move the file there, or pass "

@@ -14,7 +14,6 @@ from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.devices import on_device
-from hlsim.checkpoint import SIMULATOR, find_checkpoint
 from hlsim.checks import broadcast_shape, check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
@@ -283,8 +282,7 @@ def build_simulator(
         )
     if str(simulator) == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    folder = find_checkpoint(simulator, [SIMULATOR], ("msbg",))
-    return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
 @lru_cache

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from compensators.hearing_aid import HearingAid
 from compensators.loading import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
-from hlsim.checkpoint import checkpoint_digest
+from hlsim.checkpoint import read_record
 from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.training.batches import TrainingData, compensator_data
 from hlsim.training.data_module import Batch
@@ -143,7 +143,7 @@ def train_compensator(
     }
     if not is_module and str(simulator) != "msbg":
         # The folder may contain another simulator when the training resumes.
-        about["simulator_sha256"] = checkpoint_digest(simulator)  # type: ignore[arg-type]
+        about["simulator_sha256"] = read_record(simulator)["sha256"]  # type: ignore[arg-type]
     return train_network(
         module,
         batches,

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from hlsim.checkpoint import checkpoint_digest
+from hlsim.checkpoint import read_record
 from hlsim.training.callbacks import CHECKPOINT, BestCheckpoint
 from hlsim.training.data_module import BatchData
 from hlsim.training.module import TrainingModule
@@ -90,7 +90,7 @@ def train_network(
     """
     recipe = module.recipe
     folder = Path(out)
-    start = {"start_sha256": checkpoint_digest(recipe.start)} if recipe.start else {}
+    start = {"start_sha256": read_record(recipe.start)["sha256"]} if recipe.start else {}
     record = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about}
     module.description = asdict(recipe) | start | dict(identity)
 

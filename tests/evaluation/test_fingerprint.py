@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import nn
 
+import hlsim
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
-from hlsim.checkpoint import SIMULATOR, shipped_checkpoints
+from hlsim.checkpoint import list_pretrained
 from hlsim.evaluation.fingerprint import fingerprint, value_hash
-from hlsim.neuro import load_pretrained
 
 N3 = Audiogram.standard("N3")
 
@@ -28,9 +28,9 @@ def test_settings_and_ears_distinguish_modules() -> None:
     assert fingerprint(MSBG()) == fingerprint(modules[0])
 
 
-@pytest.mark.parametrize("name", [*shipped_checkpoints([SIMULATOR])])
-def test_a_checkpoint_has_one_fingerprint(name: str) -> None:
-    first, second = load_pretrained(name), load_pretrained(name)
+@pytest.mark.parametrize(("name", "load"), list_pretrained().items())
+def test_a_checkpoint_has_one_fingerprint(name: str, load: str) -> None:
+    first, second = (getattr(hlsim, load)(name) for _ in range(2))
     second(torch.full((1600,), 0.01), N3)  # Use changes nothing.
     assert fingerprint(first) == fingerprint(second) is not None
 

@@ -51,8 +51,8 @@ def test_audio(tmp_path: Path, ending: str) -> None:
     for seed in range(TRIALS):
         path.write_bytes(damaged(data, Random(seed)))
         with suppress(ValueError):
-            waveform, rate = read_audio(path, any_rate=True)
-            assert 16000 <= rate <= 384_000 and bool(torch.isfinite(waveform).all())
+            waveform, rate = read_audio(path)
+            assert rate >= 16000 and bool(torch.isfinite(waveform).all())
 
 
 def test_audiograms(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ pytest.importorskip("lightning")
 
 from compensators import HearingAid, MappingCompensator, load_compensator
 from hlsim import Audiogram
-from hlsim.checkpoint import checkpoint_about, checkpoint_digest, save_checkpoint
+from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.training.batches import CompensatorBatches, TrainingData, compensator_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
@@ -53,7 +53,7 @@ def noisy(data: TrainingData) -> TrainingData:
 def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None:
     recipe = replace(SMALL, steps=20, seconds=0.4, learning_rate=0.01)
     folder = train(data, recipe, tmp_path, audiogram=N3)
-    about = checkpoint_about(folder)
+    about = read_record(folder)["about"]
     assert about["audiogram"] == N3.to_dict() and about["simulator"] == "msbg"
     assert about["validation"]["valid_loss"] < 0.95 * about["start_validation"]["valid_loss"]
     module = CompensatorTraining(recipe, simulator="msbg")
@@ -87,10 +87,10 @@ def test_a_personal_compensator_starts_from_a_general_one(
     ear = Audiogram.standard("N4")
     folder = train(data, started, tmp_path / "started", audiogram=ear)
     random_folder = train(data, SMALL, tmp_path / "random", audiogram=ear)
-    about, random = checkpoint_about(folder), checkpoint_about(random_folder)
+    about, random = read_record(folder)["about"], read_record(random_folder)["about"]
     random_loss = random["start_validation"]["valid_loss"]
     assert about["start_validation"]["valid_loss"] < 0.7 * random_loss
-    assert about["start_sha256"] == checkpoint_digest("compensator-general")
+    assert about["start_sha256"] == read_record("compensator-general")["sha256"]
     start, trained = load_compensator("compensator-general"), load_compensator(folder)
     for initial, final in zip(start.parameters(), trained.parameters(), strict=True):
         assert float((initial - final).abs().max()) < 1e-5
@@ -99,7 +99,7 @@ def test_a_personal_compensator_starts_from_a_general_one(
 def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_path: Path) -> None:
     recipe = replace(SMALL, model={}, start="compensator-general", learning_rate=10.0)
     folder = train(data, recipe, tmp_path)
-    assert checkpoint_about(folder)["steps"] == 0
+    assert read_record(folder)["about"]["steps"] == 0
     start, saved = load_compensator("compensator-general"), load_compensator(folder)
     for initial, final in zip(start.parameters(), saved.parameters(), strict=True):
         assert torch.equal(initial, final)
@@ -164,7 +164,7 @@ def test_a_hearing_aid_learns_to_amplify_and_to_reduce_noise(
         noisy=1.0,
     )
     folder = train(noisy, recipe, tmp_path)
-    about = checkpoint_about(folder)
+    about = read_record(folder)["about"]
     assert about["validation"]["valid_loss"] < 0.9 * about["start_validation"]["valid_loss"]
     assert isinstance(load_compensator(folder), HearingAid)
 

@@ -11,7 +11,7 @@ pytest.importorskip("lightning")
 
 from hlsim.audio import find_audio, write_audio
 from hlsim.calibration import level_spl
-from hlsim.checkpoint import checkpoint_about
+from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
 from hlsim.training.batches import TrainingData, simulator_data, simulator_validation
 from hlsim.training.data_module import Batch, Step
@@ -60,7 +60,7 @@ def validation(module: SimulatorTraining, data: TrainingData) -> dict[str, float
 
 def test_a_training_leaves_a_checkpoint_with_its_record(data: TrainingData, tmp_path: Path) -> None:
     folder = train_simulator(data, SMALL, out=tmp_path / "out", accelerator="cpu")
-    about = checkpoint_about(folder)
+    about = read_record(folder)["about"]
     assert about["recipe"]["batch"] == 2 and about["steps"] in (4, 8)
     module = SimulatorTraining(SMALL)
     for name in ("start_validation", "validation"):
@@ -74,7 +74,7 @@ def test_a_training_leaves_a_checkpoint_with_its_record(data: TrainingData, tmp_
 
 def test_the_average_is_validated_and_saved(data: TrainingData, tmp_path: Path) -> None:
     folder = train_simulator(data, replace(SMALL, steps=4), out=tmp_path, accelerator="cpu")
-    assert checkpoint_about(folder)["steps"] == 4
+    assert read_record(folder)["about"]["steps"] == 4
     released = load_pretrained(folder).state_dict()
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)
     average, current = state["state_dict"], state["current_model_state"]
@@ -94,7 +94,7 @@ def test_a_short_training_beats_the_untrained_network(data: TrainingData, tmp_pa
         validate_every=60,
         validation_items=16,
     )
-    about = checkpoint_about(train_simulator(data, recipe, out=tmp_path, accelerator="cpu"))
+    about = read_record(train_simulator(data, recipe, out=tmp_path, accelerator="cpu"))["about"]
     gain = about["validation"]["valid_snr_median"] - about["start_validation"]["valid_snr_median"]
     assert gain > 0.5
 
@@ -140,7 +140,7 @@ def test_another_teacher_is_recorded_and_needs_another_folder(
     settings: dict[str, Any] = {"out": tmp_path, "accelerator": "cpu"}
     recipe = replace(SMALL, steps=1)
     folder = train_simulator(data, recipe, teacher="dead_region:DeadRegion", **settings)
-    assert checkpoint_about(folder)["teacher"] == "dead_region:DeadRegion"
+    assert read_record(folder)["about"]["teacher"] == "dead_region:DeadRegion"
     with pytest.raises(ValueError, match="differs in teacher;"):
         train_simulator(data, recipe, **settings)
     targets = []

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
-from hlsim.audio import list_files
+from hlsim.audio import find_audio
 from hlsim.training.corpora.manifest import (
     SPLITS,
     Utterance,
@@ -312,6 +312,7 @@ def _list_files(root: Path) -> tuple[list[str], list[str]]:
             raise ValueError(
                 f"{path}: links to folders are not followed; move the folder itself there"
             )
-    audio, other_files = list_files(root)
+    audio = find_audio(root)
     names = [path.relative_to(root).as_posix() for path in audio]
-    return names, [path.name for path in other_files]
+    other_files = {path for path in root.rglob("*") if path.is_file()}.difference(audio)
+    return names, sorted(path.name for path in other_files)

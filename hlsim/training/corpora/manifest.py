@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path, PurePosixPath
 
-from hlsim.files import read_table, resolve_links, write_atomically
+from hlsim.files import read_table, write_atomically
 
 SPLITS = ("train", "valid", "test")
 """Names of the splits."""
@@ -150,7 +150,7 @@ def _find_problems(utterances: Sequence[Utterance], root: Path) -> Iterator[str]
     """Yield a description of each problem for which the rows of a manifest are rejected."""
     if not utterances:
         yield "there are no utterances, expected one per row"
-    inside = resolve_links(root)
+    inside = root.resolve()
     clean = {utterance.path for utterance in utterances}
     splits: dict[str, dict[str, str]] = {"file": {}, "speaker": {}}
     pairs = Counter((utterance.path, utterance.noisy) for utterance in utterances)
@@ -169,7 +169,7 @@ def _find_problems(utterances: Sequence[Utterance], root: Path) -> Iterator[str]
         for name in (utterance.path, utterance.noisy):
             path = PurePosixPath(name)
             leads_out = path.is_absolute() or ".." in path.parts
-            if leads_out or not resolve_links(root / path).is_relative_to(inside):
+            if leads_out or not (root / path).resolve().is_relative_to(inside):
                 yield (
                     f"{name} is outside {root}; expected a path relative to that folder, without "
                     "'..'"
