@@ -40,7 +40,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, help="number of processes; one per core by default")
     options = parser.parse_args(arguments)
     out = options.out
-    test = [row for row in find_corpus(options.corpus).utterances if row.split == "test"]
+    _, utterances = find_corpus(options.corpus)
+    test = [row for row in utterances if row.split == "test"]
     if options.audiograms is None:
         ears = draw_ears(2 * len(test), "test")
     else:

@@ -44,7 +44,6 @@ def _prepare(options: argparse.Namespace) -> None:
     from hlsim.training.corpora.layouts import prepare
 
     folders = options.folders.split("/") if options.folders else None
-    corpus = prepare(options.corpus, options.out, folders=folders, valid_share=options.valid_share)
+    print(prepare(options.corpus, options.out, folders=folders, valid_share=options.valid_share))
     root = options.corpus if options.corpus.is_dir() else options.corpus.parent
-    print(corpus.to_text())
     print(f"written: {options.out}; train on it with --manifest {options.out} --root {root}")

@@ -18,8 +18,7 @@ VOICEBANK = [
 VOICEBANK_TEXT = """layout: VoiceBank-DEMAND
 split  speakers  utterances  pairs
 train         1           1      1
-test          1           1      1
-not used: 1 other files, .txt"""
+test          1           1      1"""
 
 SPEAKERS = ["id1/a/1.wav", "id1/b/1.wav", "id2/a/1.wav"]
 SPEAKERS_TEXT = """layout: folders speaker

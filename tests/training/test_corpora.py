@@ -1,21 +1,13 @@
 """Layouts of corpora are recognised, and corpora that deviate from them are rejected."""
 
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from hlsim.training.corpora.layouts import (
-    find_corpus,
-    hold_out_speakers,
-    prepare,
-    recognise,
-)
+from hlsim.training.corpora.layouts import find_corpus, hold_out_speakers, prepare, recognise
 from hlsim.training.corpora.manifest import Utterance, check_utterances, read_manifest
 from tests.helpers import touch_files
-
-Tree = Callable[..., Path]
 
 
 def voicebank(suffix: str = "", within: str = "", train: str = "trainset_28spk") -> list[str]:
@@ -35,12 +27,6 @@ def splits_and_speakers(utterances: list[Utterance]) -> str:
     )
 
 
-@pytest.fixture
-def tree(tmp_path: Path) -> Tree:
-    """Make a corpus of empty files."""
-    return lambda *files: touch_files(tmp_path / "corpus", files)
-
-
 @pytest.mark.parametrize(
     "files",
     [
@@ -50,7 +36,6 @@ def tree(tmp_path: Path) -> Tree:
         voicebank("_16k", within="DS_10283_2791/"),
         voicebank(train="trainset_56spk"),
         voicebank("_16k", train="trainset"),
-        [f"{name.split('/')[0]}/{name}" for name in voicebank()],
     ],
 )
 def test_voicebank_demand_is_recognised(files: list[str]) -> None:
@@ -62,25 +47,6 @@ def test_voicebank_demand_is_recognised(files: list[str]) -> None:
         assert row.noisy == row.path.replace("clean_", "noisy_")
 
 
-MISMATCHES = {
-    "no noisy folder": [name for name in voicebank("_16k") if "noisy_test" not in name],
-    "a missing file": [name for name in voicebank() if name != "noisy_testset_wav/p232_001.wav"],
-    "another set": [*voicebank(), "clean_valset_wav/p1_001.wav", "noisy_valset_wav/p1_001.wav"],
-    "both rates": [*voicebank(), *voicebank("_16k")],
-    "noise": [*voicebank(), "noise/bus/1.wav"],
-    "another name": [*voicebank(), "clean_testset_wav/a.wav", "noisy_testset_wav/a.wav"],
-    "no split": ["train/a/1.wav", "test/b/1.wav", "extra/c/1.wav"],
-    "second name of a split": ["train/a/1.wav", "test/b/1.wav", "training/c/1.wav"],
-    "beside the folders of splits": ["train/a/1.wav", "test/b/1.wav", "1.wav"],
-}
-
-
-@pytest.mark.parametrize("name", MISMATCHES)
-def test_files_that_do_not_match_the_layout_are_rejected(name: str) -> None:
-    with pytest.raises(ValueError):
-        recognise(MISMATCHES[name])
-
-
 @pytest.mark.parametrize("within", ["", "LibriSpeech/"])
 def test_librispeech_and_libritts_are_recognised(within: str) -> None:
     names = "train-clean-100/103/1240/a.flac train-other-500/20/205/b.flac dev-clean/84/1/c.wav"
@@ -88,9 +54,6 @@ def test_librispeech_and_libritts_are_recognised(within: str) -> None:
     layout, utterances = recognise([within + file for file in files])
     assert layout == "LibriSpeech or LibriTTS"
     assert splits_and_speakers(utterances) == "test 367 d, train 103 a, train 20 b, valid 84 c"
-    for other in ("noise/1.wav", "train-clean-100/a.flac", "1.wav"):
-        with pytest.raises(ValueError):
-            recognise([*files, other])
 
 
 SPLITS = "train val test, Training validation testing, tr cv tt, train dev TEST, TRAIN eval test"
@@ -105,52 +68,44 @@ def test_split_folders_are_recognised_by_any_of_their_names(names: str) -> None:
         assert splits_and_speakers(utterances) == expected
 
 
-def test_timits_speakers_are_below_its_regions() -> None:
-    _, utterances = recognise(["TRAIN/DR1/FCJF0/SA1.WAV", "TEST/DR1/FAKS0/SA1.WAV"])
-    assert splits_and_speakers(utterances) == "test FAKS0 SA1, train FCJF0 SA1"
-
-
-def test_clean_and_noisy_folders_in_splits_are_pairs(tree: Tree) -> None:
-    files = ("train/clean/1.wav", "train/noisy/1.flac", "test/Clean/s/2.wav", "test/Noisy/s/2.wav")
-    corpus = find_corpus(tree(*files, "train/noise/1.wav", "readme.txt"))
-    assert corpus.utterances == [
+def test_clean_and_noisy_folders_in_splits_are_pairs(tmp_path: Path) -> None:
+    files = ["train/clean/1.wav", "train/noisy/1.flac", "test/Clean/s/2.wav", "test/Noisy/s/2.wav"]
+    touch_files(tmp_path, [*files, "train/noise/1.wav", "readme.txt"])
+    layout, utterances = find_corpus(tmp_path)
+    assert layout == "folders clean and noisy in train, valid, test"
+    assert utterances == [
         Utterance("test/Clean/s/2.wav", "test/Noisy/s/2.wav", "s", "test"),
         Utterance("train/clean/1.wav", "train/noisy/1.flac", "", "train"),
     ]
-    assert corpus.unused_audio == {"train/noise": 1} and corpus.other_files == {".txt": 1}
-    assert corpus.to_text().splitlines() == [
-        "layout: folders clean and noisy in train, valid, test",
-        "split  speakers  utterances  pairs",
-        "train   unknown           1      1",
-        "test          1           1      1",
-        "not used: 1 audio files in train/noise",
-        "not used: 1 other files, .txt",
-    ]
-    for extra in ("train/clean/3.wav", "test/noisy/3.wav", "train/mixed/1.wav"):
-        with pytest.raises(ValueError):
-            recognise([*files, extra])
 
 
-OTHER_LAYOUTS = {
-    "LibriMix": "train-100/mix_clean/a.wav train-100/s1/a.wav train-100/noise/a.wav",
-    "LibriMix in split folders": "train/mix_both/a.wav train/s1/a.wav test/mix_both/b.wav",
-    "WSJ0-2mix": "tr/mix/a.wav tr/s1/a.wav tr/s2/a.wav",
-    "DNS challenge": "clean/clean_fileid_1.wav noisy/x_fileid_1.wav noise/noise_fileid_1.wav",
-    "DNS in split folders": "test/clean/clean_fileid_1.wav test/noisy/x_snr5_fileid_1.wav",
-    "clean speech and noise": "clean/a.wav noise/b.wav",
-    "noise in a split": "train/noise/a.wav train/speech/b.wav",
-    "noisy speech alone": "train/noisy/a.wav test/noisy/b.wav",
-    "clean and noisy without splits": "clean/a.wav noisy/a.wav",
-    "speakers without an option": "id1/session/1.wav id2/session/1.wav",
-    "wav is no speaker": "train/wav/1.wav test/wav/2.wav",
-    "a speaker in two splits": "train/s1/1.wav test/s1/2.wav",
+REJECTED = {
+    "no noisy folder": [name for name in voicebank("_16k") if "noisy_test" not in name],
+    "a missing file": [name for name in voicebank() if name != "noisy_testset_wav/p232_001.wav"],
+    "another set": [*voicebank(), "clean_valset_wav/p1_001.wav", "noisy_valset_wav/p1_001.wav"],
+    "noise beside VoiceBank": [*voicebank(), "noise/bus/1.wav"],
+    "noise beside LibriSpeech": ["dev-clean/84/1/c.wav", "noise/1.wav"],
+    "no split": ["train/a/1.wav", "test/b/1.wav", "extra/c/1.wav"],
+    "beside the folders of splits": ["train/a/1.wav", "test/b/1.wav", "1.wav"],
+    "clean without noisy": ["train/clean/1.wav", "train/noisy/1.wav", "train/clean/2.wav"],
+    "LibriMix": ["train-100/mix_clean/a.wav", "train-100/s1/a.wav", "train-100/noise/a.wav"],
+    "LibriMix in split folders": ["train/mix_both/a.wav", "train/s1/a.wav", "test/mix_both/b.wav"],
+    "DNS challenge": ["clean/clean_fileid_1.wav", "noisy/x_fileid_1.wav"],
+    "DNS in split folders": ["test/clean/clean_fileid_1.wav", "test/noisy/x_snr5_fileid_1.wav"],
+    "noise in a split": ["train/noise/a.wav", "train/speech/b.wav"],
+    "noisy speech alone": ["train/noisy/a.wav", "test/noisy/b.wav"],
+    "speakers without an option": ["id1/session/1.wav", "id2/session/1.wav"],
+    "TIMIT": ["TRAIN/DR1/FCJF0/SA1.WAV", "TEST/DR1/FAKS0/SA1.WAV"],
+    "a speaker in two splits": ["train/s1/1.wav", "test/s1/2.wav"],
+    "no audio": ["readme.txt"],
 }
 
 
-@pytest.mark.parametrize("layout", OTHER_LAYOUTS)
-def test_any_other_layout_is_rejected_with_advice(tree: Tree, layout: str) -> None:
-    with pytest.raises(ValueError, match=r"use a CSV file .*, or name the levels"):
-        find_corpus(tree(*OTHER_LAYOUTS[layout].split()))
+@pytest.mark.parametrize("corpus", REJECTED)
+def test_any_other_layout_is_rejected(corpus: str, tmp_path: Path) -> None:
+    touch_files(tmp_path, REJECTED[corpus])
+    with pytest.raises(ValueError, match=r"use a CSV file .*, or name the levels|no audio in it"):
+        find_corpus(tmp_path)
 
 
 def test_an_option_gives_the_meaning_of_folders() -> None:
@@ -169,7 +124,7 @@ def test_an_option_gives_the_meaning_of_folders() -> None:
 def test_held_out_speakers_validate_and_no_longer_train() -> None:
     utterances = [Utterance(f"s{i}/{j}.wav", "", f"s{i}") for i in range(10) for j in range(2)]
     rows = hold_out_speakers(utterances, 0.2)
-    check_utterances(rows, Path())
+    check_utterances(rows)
     assert rows == hold_out_speakers(utterances, 0.2)
     assert Counter(row.split for row in rows) == {"train": 16, "valid": 4}
     assert Counter(row.split for row in hold_out_speakers(utterances, 0.01))["valid"] == 2
@@ -179,28 +134,15 @@ def test_held_out_speakers_validate_and_no_longer_train() -> None:
             hold_out_speakers(invalid_rows, 0.2)
 
 
-def test_prepare_writes_what_training_reads(tree: Tree, tmp_path: Path) -> None:
-    corpus = tree(*voicebank("_16k"))
-    prepared = prepare(corpus, tmp_path / "m.csv", valid_share=0.5)
-    assert read_manifest(tmp_path / "m.csv", corpus) == prepared.utterances
-    # A CSV file of the user is read in the same way, and is not overwritten.
+def test_prepare_writes_what_training_reads(tmp_path: Path) -> None:
+    corpus = touch_files(tmp_path / "corpus", voicebank("_16k"))
+    text = prepare(corpus, tmp_path / "m.csv", valid_share=0.5)
+    rows = read_manifest(tmp_path / "m.csv", corpus)
+    assert text.startswith("layout: VoiceBank-DEMAND")
+    assert sorted(row.split for row in rows) == ["test", "train", "valid"]
+    # A CSV file of the user is read in the same way.
     (corpus / "own.csv").write_text((tmp_path / "m.csv").read_text().replace("path,", "path, "))
-    assert prepare(corpus / "own.csv", corpus / "manifest.csv").utterances == prepared.utterances
-    for out in (corpus / "own.csv", corpus / "clean_testset_wav_16k"):
-        with pytest.raises(ValueError, match="choose another name"):
-            prepare(corpus / "own.csv", out)
-
-
-def test_links_and_folders_without_audio_are_rejected(tree: Tree, tmp_path: Path) -> None:
-    corpus = tree("train/a/1.wav")
-    (tmp_path / "outside.wav").touch()
-    (tmp_path / "empty").mkdir()
-    (corpus / "train" / "a" / "2.wav").symlink_to(tmp_path / "outside.wav")
-    with pytest.raises(ValueError, match=r"2\.wav is outside"):
-        find_corpus(corpus)
-    (corpus / "train" / "a" / "2.wav").unlink()
-    (corpus / "test").symlink_to(tmp_path / "empty")
-    with pytest.raises(ValueError, match="links to folders"):
-        find_corpus(corpus)
-    with pytest.raises(ValueError, match="no audio in it"):
-        find_corpus(tmp_path / "empty")
+    prepare(corpus / "own.csv", corpus / "manifest.csv")
+    assert read_manifest(corpus / "manifest.csv") == rows
+    with pytest.raises(ValueError, match=r"ends in \.csv"):
+        prepare(corpus / "own.csv", corpus / "clean_testset_wav_16k")

@@ -55,8 +55,8 @@ def test_voicebank_demand_gives_the_papers_number_of_instances(
 
 
 def test_an_instance_is_what_an_ear_perceives_aligned_with_its_input(voicebank: Path) -> None:
-    corpus = find_corpus(voicebank)
-    rows = [row for row in corpus.utterances if row.split == "train"]
+    _, utterances = find_corpus(voicebank)
+    rows = [row for row in utterances if row.split == "train"]
     ears = [Audiogram.standard(name) for name in ("N1", "N3", "N5")]
     instances = Instances(rows, voicebank, ears)
     assert len(instances) == 8
@@ -84,8 +84,8 @@ def test_an_instance_is_what_an_ear_perceives_aligned_with_its_input(voicebank: 
 
 
 def test_instances_that_cannot_be_read_name_the_file(voicebank: Path) -> None:
-    corpus = find_corpus(voicebank)
-    instances = Instances(corpus.utterances, voicebank, draw_ears(4, "train"))
+    _, utterances = find_corpus(voicebank)
+    instances = Instances(utterances, voicebank, draw_ears(4, "train"))
     noisy = voicebank / "noisy_testset_wav_16k" / "p232_001.wav"
     write_audio(noisy, torch.randn(9000), 16000)
     with pytest.raises(ValueError, match=r"p232_001\.wav"):

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -41,14 +40,12 @@ _LEVELS = {
 
 _LAYOUTS = {
     "VoiceBank-DEMAND": (
-        r"(?P<condition>clean|noisy)"
-        r"(?P<set>_(?P<split>train|test)set(_28spk|_56spk)?_wav(?P<version>_16k|_48k)?)/"
-        r"(?P<doubled>(?P=condition)(?P=set)/)?(?P<speaker>p\d+)_\d+\.\w+"
+        r"(?P<condition>clean|noisy)_(?P<split>train|test)set(_28spk|_56spk)?_wav(_16k|_48k)?/"
+        r"(?P<speaker>p\d+)_\d+\.\w+"
     ),
     "LibriSpeech or LibriTTS": (
         r"(?P<split>train|dev|test)-(clean|other)(-\d+)?/(?P<speaker>\d+)/\d+/[^/]+"
     ),
-    "TIMIT": r"(?P<split>train|test)/dr\d/(?P<speaker>\w+)/[^/]+",
     "folders clean and noisy in train, valid, test": (
         rf"{_LEVELS['split']}/{_LEVELS['condition']}/({_LEVELS['speaker']}/(.*/)?)?[^/]+"
     ),
@@ -56,8 +53,7 @@ _LAYOUTS = {
 }
 """Patterns of the paths of audio files by layout, ignoring case.
 
-The two files of a pair differ in the group ``condition``. The group ``version`` is the same for
-all.
+The two files of a pair differ in the group ``condition``.
 """
 
 _ADVICE = (
@@ -68,59 +64,25 @@ _ADVICE = (
 """Advice on corpora that are rejected."""
 
 
-@dataclass(frozen=True)
-class Corpus:
-    """Utterances of a corpus, and counts of the files in its folder that are no utterances.
-
-    Attributes:
-        layout: Name of the layout that was recognised.
-        utterances: Rows of the manifest.
-        unused_audio: Number of audio files that are no utterances, by folder.
-        other_files: Number of files that are not audio, by extension.
-
-    >>> Corpus("folders", [Utterance("train/1.wav")], Counter(), Counter()).layout
-    'folders'
-    """
-
-    layout: str
-    utterances: Sequence[Utterance]
-    unused_audio: Counter[str]
-    other_files: Counter[str]
-
-    def to_text(self) -> str:
-        """Describe the corpus: a table of its splits, and the unused files."""
-        lines = [f"layout: {self.layout}", "split  speakers  utterances  pairs"]
-        for split in SPLITS:
-            rows = [row for row in self.utterances if row.split == split]
-            speakers = {row.speaker for row in rows}
-            speaker_count = "unknown" if "" in speakers else str(len(speakers))
-            pairs = sum(bool(row.noisy) for row in rows)
-            if rows:
-                lines.append(f"{split:<5}  {speaker_count:>8}  {len(rows):>10}  {pairs:>5}")
-        for folder, count in sorted(self.unused_audio.items()):
-            lines.append(f"not used: {count} audio files in {folder}")
-        for extension, count in sorted(self.other_files.items()):
-            lines.append(f"not used: {count} other files, {extension}")
-        return "\n".join(lines)
-
-
 def prepare(
     source: str | Path,
     out: str | Path,
     *,
     folders: Sequence[str] | None = None,
     valid_share: float = 0.0,
-) -> Corpus:
+) -> str:
     """Recognise a corpus and write its manifest, the CSV file from which trainings read.
 
     Args:
         source: Folder of a known layout, or a CSV file, see ``read_manifest``.
         out: CSV file to write. Its paths are relative to the folder of the corpus, or to that of
             the CSV file.
-        folders: Meaning of each level of folders, the top first, instead of a known layout:
-            ``split``, ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
+        folders: Meaning of each level of folders, see ``recognise``.
         valid_share: Share of the training speakers that are moved to the validation split, if the
             corpus has none.
+
+    Returns:
+        Name of the layout, and a table of the splits.
 
     Raises:
         ValueError: The layout is unknown or contradictory, or the manifest cannot be written.
@@ -130,52 +92,56 @@ def prepare(
     ...     for name in ("ann", "bob"):
     ...         Path(folder, "train", name).mkdir(parents=True)
     ...         Path(folder, "train", name, "1.wav").touch()
-    ...     corpus = prepare(folder, f"{folder}/manifest.csv", valid_share=0.5)
-    >>> [(row.speaker, row.split) for row in corpus.utterances]
-    [('ann', 'train'), ('bob', 'valid')]
+    ...     print(prepare(folder, f"{folder}/manifest.csv", valid_share=0.5))
+    layout: folders train, valid, test
+    split  speakers  utterances  pairs
+    train         1           1      0
+    valid         1           1      0
     """
-    path = Path(source)
-    if path.is_dir():
-        corpus = find_corpus(path, folders)
+    if Path(source).is_dir():
+        layout, utterances = find_corpus(source, folders)
     else:
-        corpus = Corpus("CSV file", read_manifest(path), Counter(), Counter())
-    utterances = corpus.utterances
+        layout, utterances = "CSV file", read_manifest(source)
     if valid_share:
         utterances = hold_out_speakers(utterances, valid_share)
     write_manifest(out, utterances)
-    return replace(corpus, utterances=utterances)
+    lines = [f"layout: {layout}", "split  speakers  utterances  pairs"]
+    for split in SPLITS:
+        rows = [row for row in utterances if row.split == split]
+        speakers = {row.speaker for row in rows}
+        speaker_count = "unknown" if "" in speakers else len(speakers)
+        pairs = sum(bool(row.noisy) for row in rows)
+        if rows:
+            lines.append(f"{split:<5}  {speaker_count:>8}  {len(rows):>10}  {pairs:>5}")
+    return "\n".join(lines)
 
 
-def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
+def find_corpus(
+    root: str | Path, folders: Sequence[str] | None = None
+) -> tuple[str, list[Utterance]]:
     """Recognise the layout of a folder, and list its utterances, whose audio is not read.
 
     Args:
         root: Folder of the corpus.
-        folders: Meaning of each level of folders, the top first, instead of a known layout:
-            ``split``, ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
+        folders: Meaning of each level of folders, see ``recognise``.
+
+    Returns:
+        The name of the layout, and the utterances.
 
     Raises:
         ValueError: The layout is unknown or contradictory.
 
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     Path(folder, "train").mkdir()
-    ...     Path(folder, "train", "1.wav").touch()
-    ...     find_corpus(Path(folder)).layout
+    >>> layout, utterances = find_corpus(Path(__file__).parents[2] / "data" / "speech")
+    >>> layout
     'folders train, valid, test'
     """
-    audio, other_files = _list_files(root)
+    files = [path.relative_to(root).as_posix() for path in find_audio(root)]
     try:
-        layout, utterances = recognise(audio, folders)
-        check_utterances(utterances, root)
+        layout, utterances = recognise(files, folders)
+        check_utterances(utterances)
     except ValueError as error:
         raise ValueError(f"{root}: {error}; {_ADVICE}") from error
-    used = {row.path for row in utterances} | {row.noisy for row in utterances}
-    unused = Counter(
-        os.path.dirname(name) or "the top folder" for name in audio if name not in used
-    )
-    extensions = Counter(Path(name).suffix or "without extension" for name in other_files)
-    return Corpus(layout, utterances, unused, extensions)
+    return layout, utterances
 
 
 def recognise(
@@ -200,16 +166,12 @@ def recognise(
     """
     if folders is not None:
         layout = f"folders {'/'.join(folders)}"
-        for level in folders:
-            if level not in _LEVELS:
-                raise ValueError(
-                    f"{layout}: expected some of {', '.join(_LEVELS)}, separated by /, got "
-                    f"{level!r}; write, for example, --folders split/speaker"
-                )
-            if level != "other" and folders.count(level) > 1:
-                raise ValueError(
-                    f"{layout}: expected {level} once, got it twice; write other for one of them"
-                )
+        meanings = [level for level in folders if level != "other"]
+        if not _LEVELS.keys() >= set(folders) or len(set(meanings)) < len(meanings):
+            raise ValueError(
+                f"{layout}: expected each of {', '.join(_LEVELS)} once at most, or other several "
+                "times, separated by /; write, for example, --folders split/speaker"
+            )
         pattern = "/".join(_LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
         return layout, _read_utterances(files, pattern, layout)
     top = {file.split("/")[0] for file in files}
@@ -245,15 +207,11 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
     speakers = sorted({row.speaker for row in utterances if row.split == "train"})
     count = max(1, round(share * len(speakers)))
-    if "" in speakers:
-        raise ValueError(
-            "cannot move speakers to the validation split, because the speaker of some training "
-            f"utterances is unknown; leave --valid-share out, or {_ADVICE}"
-        )
-    if count >= len(speakers):
+    if "" in speakers or count >= len(speakers):
         raise ValueError(
             f"cannot move {count} of {len(speakers)} training speakers to the validation split, "
-            "because one at least must remain; lower --valid-share, or leave it out"
+            "because the speaker of some utterances is unknown, or none would remain; lower "
+            f"--valid-share, or {_ADVICE}"
         )
     valid_speakers = set(Random(0).sample(speakers, count))
     rows = []
@@ -267,27 +225,17 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
     """Read utterances from the paths of files, which must all match the pattern of a layout."""
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}
-    names: dict[str, str] = {}
     for file in files:
         match = re.fullmatch(pattern, file, re.IGNORECASE)
         if match is None:
             raise ValueError(f"{file} does not match the layout {layout!r}")
         groups = match.groupdict(default="")
-        split_name = groups.get("split", "train")
-        split = _SPLIT_OF[split_name.lower()]
-        for kind, name in ((split, split_name), ("version", groups.get("version", ""))):
-            if names.setdefault(kind, name) != name:
-                raise ValueError(
-                    f"{file}: expected one name for the {kind} part of the corpus, got "
-                    f"{names[kind]!r} and {name!r}"
-                )
         key = os.path.splitext(file)[0]
-        # The later group comes first, so that the position of the other one stays valid.
-        for group in ("doubled", "condition"):
-            if groups.get(group):
-                key = key[: match.start(group)] + key[match.end(group) :]
+        if "condition" in groups:
+            key = key[: match.start("condition")] + key[match.end("condition") :]
         condition = groups.get("condition", "clean").lower()
         if condition == "clean":
+            split = _SPLIT_OF[groups.get("split", "train").lower()]
             clean[key] = Utterance(file, "", groups.get("speaker", ""), split)
         elif condition == "noisy":
             noisy[key] = file
@@ -299,20 +247,3 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
             f"name, such as {first}"
         )
     return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]
-
-
-def _list_files(root: Path) -> tuple[list[str], list[str]]:
-    """List the relative paths of the audio files and of the other files below a folder, sorted.
-
-    Raises:
-        ValueError: There is no audio, or a folder is a link.
-    """
-    for path in root.rglob("*"):
-        if path.is_symlink() and path.is_dir():
-            raise ValueError(
-                f"{path}: links to folders are not followed; move the folder itself there"
-            )
-    audio = find_audio(root)
-    names = [path.relative_to(root).as_posix() for path in audio]
-    other_files = {path for path in root.rglob("*") if path.is_file()}.difference(audio)
-    return names, sorted(path.name for path in other_files)

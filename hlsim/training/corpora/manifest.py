@@ -5,10 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from hlsim.files import read_table, write_atomically
 
@@ -52,8 +51,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
-        ValueError: The file is not such a table, a path is listed twice or is outside the root, or
-            a speaker or a file is in two splits.
+        ValueError: The file is not such a table, its rows contradict each other, see
+            ``check_utterances``, or its first file is not in the root.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -64,26 +63,17 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     """
     utterances = []
     for line, row in read_table(path, "the manifest"):
-        utterance = Utterance(
-            row.get("path", ""),
-            row.get("noisy", ""),
-            row.get("speaker", ""),
-            row.get("split", "train"),
-        )
-        if not utterance.path:
+        values = {name: row[name] for name in COLUMNS if name in row}
+        utterance = Utterance(**{"path": "", **values})
+        if not utterance.path or utterance.split not in SPLITS:
             raise ValueError(
-                f"{path}, line {line}: expected a file in the column 'path', got none; add the "
-                "column or the value"
-            )
-        if utterance.split not in SPLITS:
-            raise ValueError(
-                f"{path}, line {line}: expected train, valid or test in the column 'split', got "
-                f"{utterance.split!r}; correct it"
+                f"{path}, line {line}: expected a file in the column 'path', and train, valid or "
+                f"test in the column 'split', got {values}; correct the row"
             )
         utterances.append(utterance)
     folder = Path(path).parent if root is None else Path(root)
     try:
-        check_utterances(utterances, folder)
+        check_utterances(utterances)
     except ValueError as error:
         raise ValueError(f"{path}: the manifest is not valid: {error}") from error
     if not (folder / utterances[0].path).is_file():
@@ -102,7 +92,7 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
         utterances: Rows of the manifest.
 
     Raises:
-        ValueError: The file cannot be written, or exists and is not a manifest.
+        ValueError: The file cannot be written, or its name does not end in .csv.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -111,14 +101,8 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     path,noisy,speaker,split
     1.wav,,,train
     """
-    path = Path(path)
-    is_file = path.is_file()
-    header = path.read_bytes().partition(b"\n")[0].strip() if is_file else b""
-    if path.exists() and header != ",".join(COLUMNS).encode():
-        raise ValueError(
-            f"{path}: refusing to overwrite what is no manifest; choose another name that ends in "
-            ".csv"
-        )
+    if Path(path).suffix != ".csv":
+        raise ValueError(f"{path}: expected the name of a manifest, which ends in .csv")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -126,51 +110,33 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     write_atomically(path, text.getvalue())
 
 
-def check_utterances(utterances: Sequence[Utterance], root: Path) -> None:
+def check_utterances(utterances: Sequence[Utterance]) -> None:
     """Validate the rows of a manifest.
 
     Args:
         utterances: Rows of the manifest.
-        root: Folder to which their paths are relative.
 
     Raises:
-        ValueError: There are no rows, rows contradict each other, noise is listed as speech, or a
-            path leads out of the root.
+        ValueError: There are no rows, a file is both clean and noisy, noise is listed as speech, or
+            a file or a speaker is in two splits.
 
-    >>> check_utterances([Utterance("noise/1.wav")], Path("corpus"))
+    >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):
     ValueError: noise/1.wav is listed as clean speech, but is in a folder 'noise'
     """
-    problem = next(_find_problems(utterances, root), None)
-    if problem is not None:
-        raise ValueError(problem)
-
-
-def _find_problems(utterances: Sequence[Utterance], root: Path) -> Iterator[str]:
-    """Yield a description of each problem for which the rows of a manifest are rejected."""
     if not utterances:
-        yield "there are no utterances, expected one per row"
-    inside = root.resolve()
+        raise ValueError("there are no utterances, expected one per row")
     clean = {utterance.path for utterance in utterances}
-    splits: dict[str, dict[str, str]] = {"file": {}, "speaker": {}}
-    pairs = Counter((utterance.path, utterance.noisy) for utterance in utterances)
+    splits: dict[tuple[str, str], str] = {}
     for utterance in utterances:
         if utterance.noisy in clean:
-            yield f"{utterance.noisy} is listed both as clean and as noisy speech"
-        if pairs[utterance.path, utterance.noisy] > 1:
-            yield f"{utterance.path} is listed twice"
+            raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
         for folder in utterance.path.split("/")[:-1]:
             if _NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):
-                yield f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
-        for kind, name in (("file", utterance.path), ("speaker", utterance.speaker)):
-            split = splits[kind].setdefault(name, utterance.split)
-            if name and split != utterance.split:
-                yield f"{kind} {name} is in the splits {split} and {utterance.split}"
-        for name in (utterance.path, utterance.noisy):
-            path = PurePosixPath(name)
-            leads_out = path.is_absolute() or ".." in path.parts
-            if leads_out or not (root / path).resolve().is_relative_to(inside):
-                yield (
-                    f"{name} is outside {root}; expected a path relative to that folder, without "
-                    "'..'"
+                raise ValueError(
+                    f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
                 )
+        for kind, name in (("file", utterance.path), ("speaker", utterance.speaker)):
+            split = splits.setdefault((kind, name), utterance.split)
+            if name and split != utterance.split:
+                raise ValueError(f"{kind} {name} is in the splits {split} and {utterance.split}")
