@@ -5,8 +5,6 @@ bandwidths), on the scale of Glasberg and Moore (1990), rectangular and without 
 powers add up to that of the signal.
 """
 
-from functools import lru_cache
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -210,7 +208,6 @@ def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     return np.clip((upper - lower) / spacing, 0.0, None)
 
 
-@lru_cache(maxsize=1)
 def threshold_in_quiet() -> NDArray[np.float64]:
     """Return the softest level that a normal ear hears in each band in dB SPL, (24,).
 

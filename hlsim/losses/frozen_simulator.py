@@ -1,27 +1,23 @@
 """A simulator that is not trained, and the reference with which its output is compared."""
 
 import math
-import os
-from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.devices import on_device
-from hlsim.checks import broadcast_shape, check_waveform
+from hlsim.checks import broadcast_shape
 from hlsim.dsp.resample import resample
-from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
 from hlsim.neuro import load_pretrained
-from hlsim.neuro.network import EarNetwork
-from hlsim.torchtools import without_modes
+from hlsim.torchtools import constant, flatten_items
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
@@ -33,7 +29,7 @@ class FrozenSimulator:
     """Simulator of an impaired ear that is not trained, with the normal ear that belongs to it.
 
     The simulator stays in eval mode and has no trainable parameter. This class is not a module, so
-    that the loss that owns it does not register these parameters. The loss moves it with ``apply``.
+    that the loss that owns it does not register these parameters.
 
     Args:
         simulator: ``"msbg"``, the name or folder of a checkpoint, or a module, as in
@@ -64,34 +60,21 @@ class FrozenSimulator:
         reference: ReferenceName | None,
         checkpoint: bool = False,
     ) -> None:
-        if normal is not None and not callable(normal):
-            raise ValueError(
-                "expected normal to be a module or a function of a waveform, "
-                f"got {type(normal).__name__}"
-            )
-        simulator = build_simulator(simulator, sample_rate, full_scale_spl)
-        self.simulator = simulator.eval().requires_grad_(False)
+        model: Any = build_simulator(simulator, sample_rate, full_scale_spl)
+        self.simulator = model.eval().requires_grad_(False)
+        if checkpoint:
+            model.checkpoint = True
         self.sample_rate = sample_rate
         self.normal = normal
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
         self.choice = reference
-        self._highest_frequency = float(getattr(simulator, "highest_frequency", math.inf))
-        self._limits_band = 2.0 * self._highest_frequency < sample_rate
-        self._needs_exact_lengths = bool(getattr(simulator, "needs_exact_lengths", False))
-        self._has_bank_phase = normal is None and bool(getattr(simulator, "emulates_msbg", False))
-        self._checkpoints_whole = checkpoint
-        if checkpoint and isinstance(simulator, MSBG | EarNetwork):
-            # They compute a few items at a time again, so that the peak is lower, too.
-            simulator.checkpoint = True
-            self._checkpoints_whole = False
+        self._band_rate = 2.0 * getattr(model, "highest_frequency", math.inf)
+        self._needs_exact_lengths = getattr(model, "needs_exact_lengths", False)
+        self._has_bank_phase = normal is None and getattr(model, "emulates_msbg", False)
 
     def simulate(
-        self,
-        waveform: Tensor,
-        thresholds: Tensor,
-        lengths: Tensor | None = None,
-        options: Mapping[str, Any] | None = None,
+        self, waveform: Tensor, thresholds: Tensor, lengths: Tensor | None = None
     ) -> Tensor:
         """Compute what the impaired ears perceive.
 
@@ -100,44 +83,22 @@ class FrozenSimulator:
             thresholds: Ears in dB HL.
             lengths: Number of samples of each item of a padded batch, on the CPU. By default, all
                 items are as long as the batch.
-            options: Further keyword arguments of the simulator.
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
         """
-        if not self._needs_exact_lengths or lengths is None or options:
-            return self._run(waveform, thresholds, options or {})
-        # Items of each length are simulated separately, without the silence after their ends.
         time = waveform.shape[-1]
-        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
-        ends = lengths.expand(batch).flatten()
-        items = waveform.expand(*batch, -1).reshape(-1, time)
-        ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        outputs: dict[int, Tensor] = {}
-        for end in ends.unique().tolist():
-            members = (ends == end).nonzero().flatten()
-            chosen = members.to(items.device)
-            perceived = self._run(items[chosen, :end], ears[chosen], {})
-            padded = functional.pad(perceived, (0, time - end))
-            outputs |= zip(members.tolist(), padded, strict=True)
-        return torch.stack([outputs[item] for item in range(len(items))]).reshape(*batch, time)
-
-    def _run(self, waveform: Tensor, thresholds: Tensor, options: Mapping[str, Any]) -> Tensor:
-        """Run the simulator, and validate its output."""
-        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
-        weight = next(self.simulator.parameters(), None)
-        if weight is not None and weight.device != waveform.device:
-            raise ValueError(
-                f"the speech is on {waveform.device} and the simulator on {weight.device}; "
-                "move the loss with .to()"
-            )
-        arguments = {
-            name: value.to(waveform.device) if isinstance(value, Tensor) else value
-            for name, value in options.items()
-        }
-        simulator = partial(self.simulator, **arguments)
-        if self._checkpoints_whole:
-            simulator = partial(checkpoint, simulator, use_reentrant=False)
-        return _check_output(simulator(waveform, thresholds), "simulator", waveform, batch)
+        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
+        if lengths is None or not self._needs_exact_lengths:
+            perceived = self.simulator(waveform, thresholds)
+            return check_shape(perceived, "simulator", (*batch, time))
+        # Items are simulated one by one, without the silence after their ends.
+        items = flatten_items(waveform, batch, waveform.dtype)
+        ears = flatten_items(thresholds, batch, thresholds.dtype)
+        outputs = []
+        for item, ear, end in zip(items, ears, lengths.expand(batch).flatten(), strict=True):
+            perceived = self.simulator(item[:end], ear)
+            outputs.append(functional.pad(perceived, (0, time - int(end))))
+        return check_shape(torch.stack(outputs), "simulator", items.shape).reshape(*batch, time)
 
     def reference(
         self,
@@ -146,7 +107,6 @@ class FrozenSimulator:
         thresholds: Tensor,
         batch: torch.Size,
         lengths: Tensor | None = None,
-        options: Mapping[str, Any] | None = None,
     ) -> Tensor:
         """Compute the reference with which a criterion compares what the impaired ears perceive.
 
@@ -157,92 +117,40 @@ class FrozenSimulator:
                 the reference (``hlsim.msbg.response``).
             batch: Leading dimensions of the result.
             lengths: Lengths of the items, as in ``simulate``.
-            options: Further arguments of the simulator, as in ``simulate``.
 
         Returns:
             Clean speech, or what a normal ear perceives of it, (*batch, time).
         """
-        time = clean.shape[-1]
-        ears = thresholds
-        if self._has_bank_phase:
-            ears = ears.expand(*batch, -1) if ears.ndim > 1 else ears
-            ears = ears.reshape(-1, len(FREQUENCIES))
-        choice = self._choice(criterion)
-        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
-            if choice == "clean":
-                reference = self._limit_band(clean)
-            elif self.normal is not None:
-                reference = _check_output(self.normal(clean), "normal ear", clean)
-            elif self._has_bank_phase and criterion not in ("bands", "paper"):
-                items = self._limit_band(clean).expand(*batch, time).reshape(-1, time)
-                return simulate_normal_ear(items, ears, self.sample_rate).reshape(*batch, time)
-            else:
-                no_loss = on_device(_no_loss(clean.dtype), clean.device)
-                reference = self.simulate(clean, no_loss, lengths, options)
-            reference = reference.expand(*batch, time)
-            if criterion == "bands" or not self._has_bank_phase:
-                return reference
-            normal = choice == "normal-hearing"
-            items = reference.reshape(-1, time)
-            items = apply_bank_phase(items, ears, self.sample_rate, normal=normal)
-            return items.reshape(*batch, time)
-
-    def frequencies(self, fft: int) -> int | None:
-        """Return how many frequencies of a Fourier transform the criteria compare.
-
-        Args:
-            fft: Length of the transform.
-
-        Returns:
-            Number of frequencies from 0 Hz up to 7500 Hz if the output of the simulator ends below
-            half the loss's sample rate, as that of Neuro-MSBG does at 8 kHz for rates above 16 kHz;
-            otherwise ``None``, for all of them.
-        """
-        return int(HIGHEST * fft / self.sample_rate) + 1 if self._limits_band else None
-
-    def apply(self, function: Callable[[Tensor], Tensor]) -> None:
-        """Move or convert the simulator and the normal ear, as ``nn.Module.to`` does.
-
-        Args:
-            function: Function that moves or converts a tensor.
-        """
-        apply_to_module(self.simulator, function)
-        apply_to_module(self.normal, function)
-
-    def _choice(self, criterion: str) -> ReferenceName:
+        shape = (*batch, clean.shape[-1])
+        ears = thresholds[None]
+        if thresholds.ndim > 1:
+            ears = flatten_items(thresholds, batch, thresholds.dtype)
+        choice = self.choice or ("clean" if criterion == "paper" else "normal-hearing")
         if criterion in ("coherent-bands", "bands"):
-            return "normal-hearing"
-        return self.choice or ("clean" if criterion == "paper" else "normal-hearing")
+            choice = "normal-hearing"
+        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
+            reference = clean = self._limit_band(clean)
+            if choice == "normal-hearing" and self.normal is not None:
+                reference = check_shape(self.normal(clean), "normal ear", clean.shape)
+            elif choice == "normal-hearing":
+                if self._has_bank_phase and criterion not in ("bands", "paper"):
+                    items = flatten_items(clean, batch, clean.dtype)
+                    return simulate_normal_ear(items, ears, self.sample_rate).reshape(shape)
+                cpu = torch.device("cpu")
+                no_loss = constant(np.zeros, len(FREQUENCIES), dtype=clean.dtype, device=cpu)
+                reference = self.simulate(clean, on_device(no_loss, clean.device), lengths)
+            if criterion == "bands" or not self._has_bank_phase:
+                return reference.expand(shape)
+            items = flatten_items(reference, batch, clean.dtype)
+            normal = choice == "normal-hearing"
+            return apply_bank_phase(items, ears, self.sample_rate, normal=normal).reshape(shape)
 
     def _limit_band(self, clean: Tensor) -> Tensor:
         """Remove the frequencies above those that the simulator returns."""
-        if not self._limits_band:
+        if self._band_rate >= self.sample_rate:
             return clean
-        rate = round(2.0 * self._highest_frequency)
-        low = resample(clean, self.sample_rate, rate)
-        return resample(low, rate, self.sample_rate)[..., : clean.shape[-1]]
-
-
-def apply_to_module(value: object, function: Callable[[Tensor], Tensor]) -> None:
-    """Move or convert all tensors of a module in place, but never to half precision.
-
-    Args:
-        value: Module, or another value, which is ignored.
-        function: Function that moves or converts a tensor.
-
-    >>> layer = nn.Linear(2, 1)
-    >>> apply_to_module(layer, lambda tensor: tensor.bfloat16())
-    >>> layer.weight.dtype
-    torch.float32
-    """
-
-    def move(tensor: Tensor) -> Tensor:
-        moved = function(tensor)
-        halved = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
-        return tensor.to(moved.device) if halved else moved
-
-    if isinstance(value, nn.Module):
-        value._apply(move)
+        low = resample(clean, self.sample_rate, round(self._band_rate))
+        return resample(low, round(self._band_rate), self.sample_rate)[..., : clean.shape[-1]]
 
 
 def build_simulator(
@@ -264,67 +172,31 @@ def build_simulator(
     MSBG(sample_rate=16000, full_scale_spl=94, aligned=True)
     """
     if isinstance(simulator, nn.Module):
-        settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+        settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
         for name, value in settings.items():
-            if getattr(simulator, name, value) != value:
-                raise ValueError(
-                    f"expected a simulator with {name}={value:g}, got {getattr(simulator, name):g}"
-                )
-        if getattr(simulator, "aligned", True) is False:
-            raise ValueError(
-                "expected a simulator that does not delay its output, such as MSBG(aligned=True)"
-            )
+            setting = getattr(simulator, name, value)
+            if setting != value:
+                raise ValueError(f"expected a simulator with {name}={value}, got {setting}")
         return simulator
-    if not isinstance(simulator, str | os.PathLike):
-        raise ValueError(
-            "expected a simulator as a name, a folder or a module (not its class), "
-            f"got {type(simulator).__name__}"
-        )
     if str(simulator) == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
-@lru_cache
-def _no_loss(dtype: torch.dtype) -> Tensor:
-    return without_modes(lambda: torch.zeros(len(FREQUENCIES), dtype=dtype))
-
-
-def _broadcast_batch(items: torch.Size, ears: torch.Size) -> torch.Size:
-    """Return the shape to which the leading dimensions of signals and ears broadcast.
-
-    Raises:
-        ValueError: They do not broadcast, or so that each item would be simulated for each ear, as
-            (batch,) ears with (batch, 1) items would.
-    """
-    try:
-        batch = broadcast_shape(items, ears)
-    except RuntimeError:
-        batch = None
-    if batch is None or math.prod(batch) > max(math.prod(items), math.prod(ears)):
-        raise ValueError(
-            f"expected one audiogram, or one per item in the shape {(*items, len(FREQUENCIES))}, "
-            f"got {(*ears, len(FREQUENCIES))}"
-        )
-    return batch
-
-
-def _check_output(
-    output: Any, source: str, waveform: Tensor, batch: torch.Size | None = None
-) -> Tensor:
-    """Return an output, or raise ValueError unless it is a waveform with the shape of its input.
+def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
+    """Return an output, or raise ValueError unless it is a tensor of a shape.
 
     Args:
         output: Value to validate.
-        source: Name of the module that returned it, for messages.
-        waveform: Input of the module.
-        batch: Leading dimensions that the output may have instead of those of its input.
+        source: Name of the module or function that returned it, for the message.
+        shape: Expected shape.
+
+    >>> check_shape(torch.zeros(2), "criterion", (2,))
+    tensor([0., 0.])
     """
-    check_waveform(output, f"the output of the {source}", highest=math.inf)
-    time = waveform.shape[-1:]
-    if output.shape != waveform.shape and (batch is None or output.shape != batch + time):
+    if not isinstance(output, Tensor) or output.shape != shape:
+        result = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
         raise ValueError(
-            f"expected the {source} to return the shape {tuple(waveform.shape)}, or to broadcast "
-            f"it with the audiograms, got {tuple(output.shape)}"
+            f"expected the {source} to return a tensor of shape {tuple(shape)}, got {result}"
         )
     return output

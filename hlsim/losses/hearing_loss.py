@@ -5,20 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.devices import on_device
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
-    as_thresholds,
     check_two_channels,
     has_listeners,
+    resolve_thresholds,
     store_thresholds,
-    unsqueeze_mono,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import (
@@ -29,25 +26,16 @@ from hlsim.checks import (
     check_waveform,
     silence_after,
 )
-from hlsim.losses import coherent_bands, paper
+from hlsim.dsp.resample import resample
+from hlsim.losses import coherent_bands
 from hlsim.losses.band_levels import band_level_loss
-from hlsim.losses.criteria import (
-    Criterion,
-    check_criterion,
-    check_values,
-    combine_weights,
-    weighted_sum,
-)
-from hlsim.losses.frozen_simulator import (
-    FrozenSimulator,
-    NormalEar,
-    ReferenceName,
-    apply_to_module,
-)
+from hlsim.losses.criteria import Criterion, read_criterion, weighted_sum
+from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceName, check_shape
+from hlsim.losses.paper import paper_parts
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.score_loss import SCORES, score_loss
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.torchtools import not_compiled
+from hlsim.torchtools import flatten_items, not_compiled
 
 _Reduction = Literal["mean", "none"]
 
@@ -61,26 +49,6 @@ _TEMPERATURE = 0.1
 
 An ear with a loss that is 0.1 lower than that of the other ear counts 2.7 times as much.
 """
-
-
-class _Call(NamedTuple):
-    """Validated arguments of a call of the loss.
-
-    Attributes:
-        compensated: Output of the compensator, silent after each end and at missing ears.
-        clean: Clean speech, silent there, too.
-        ears: Thresholds in dB HL, 0 dB HL for missing ears.
-        lengths: Number of samples of each item, or None if all are as long as the batch.
-        known: Mask of the ears that are not missing, or None if none is missing.
-        options: Further keyword arguments of the simulator.
-    """
-
-    compensated: Tensor
-    clean: Tensor
-    ears: Tensor
-    lengths: Tensor | None
-    known: Tensor | None
-    options: Mapping[str, Any]
 
 
 class HearingLossLoss(nn.Module):
@@ -127,11 +95,11 @@ class HearingLossLoss(nn.Module):
             itself is frozen, so pass a copy of one that is still trained. It may have the
             attributes ``sample_rate``, ``full_scale_spl`` and ``aligned`` (false if its output is
             delayed), which are validated; ``emulates_msbg``, true if its normal ear and its phases
-            are those of MSBG;
-            ``highest_frequency`` of its output in Hz; and ``needs_exact_lengths``, true if silence
-            after the end of an item changes the output before.
+            are those of MSBG; ``highest_frequency`` of its output in Hz; and
+            ``needs_exact_lengths``, true if silence after the end of an item changes the output
+            before.
         sample_rate: Sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
-            below 8 kHz, and below 7.5 kHz at rates above 16000.
+            below 8 kHz. The criterion ``"paper"`` resamples what it compares to 16000.
         full_scale_spl: Level in dB SPL of RMS 1.0.
         reference: Signal with which ``"paper"``, a function and ``heard`` compare: ``"clean"``, the
             clean speech (the default for ``"paper"``), or ``"normal-hearing"``, the output of a
@@ -152,7 +120,8 @@ class HearingLossLoss(nn.Module):
             of the better ear. Each ear then counts by its share, ``softmax(-loss / 0.1)`` over
             both. The shares carry no gradient, so that no ear is made worse.
         checkpoint: Compute the activations of the simulator again in the backward pass instead of
-            storing them, which takes less memory. Value and gradient are the same.
+            storing them, which takes less memory. Value and gradient are the same. A module of your
+            own gets the attribute ``checkpoint = True``, and decides itself what it does not store.
 
     Raises:
         ValueError: A name is unknown, a value has another type or is out of range, or the simulator
@@ -191,39 +160,18 @@ class HearingLossLoss(nn.Module):
         check_choice("ears", ears, _EarsName)
         self.reduction = reduction
         self.ears = ears
-        self.criteria = check_criterion(criterion)
-        self.weights = combine_weights(weights, self.criteria)
+        self.criteria, self.weights = read_criterion(criterion, weights)
         self._two_ears = has_listeners(audiogram)
         self._frozen = FrozenSimulator(
             simulator, self.sample_rate, self.full_scale_spl, normal, reference, checkpoint
         )
         # nn.Module does not register what is in a tuple.
-        self._unregistered = (store_thresholds(audiogram, allow_missing=True), criterion)
-
-    @property
-    def criterion(self) -> Criterion:
-        """Criterion that was passed to the constructor."""
-        return self._unregistered[1]
+        self._unregistered: tuple[Tensor | None, Any] = (store_thresholds(audiogram), criterion)
 
     @property
     def simulator(self) -> nn.Module:
         """Simulator that computes what the impaired ear perceives, which is not trained."""
         return self._frozen.simulator
-
-    @property
-    def normal(self) -> NormalEar | None:
-        """Normal ear that was passed to the constructor; None for that of the simulator."""
-        return self._frozen.normal
-
-    @property
-    def reference(self) -> ReferenceName | None:
-        """Name of the reference that was passed to the constructor; None for the default."""
-        return self._frozen.choice
-
-    @property
-    def thresholds(self) -> Tensor | None:
-        """Thresholds of the constructor's ear or ears in dB HL, (..., 8); NaN for a missing ear."""
-        return self._unregistered[0]
 
     @not_compiled
     def forward(
@@ -232,8 +180,6 @@ class HearingLossLoss(nn.Module):
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
-        *,
-        listener: Mapping[str, Any] | None = None,
     ) -> Tensor:
         """Compute the loss.
 
@@ -242,26 +188,22 @@ class HearingLossLoss(nn.Module):
             clean: Clean speech.
             audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions; by
                 default the ears of the constructor. With (batch, 1, time), (batch, 8) is accepted,
-                too. A ``Listener`` goes with (..., 2, time), left first; a missing ear does not
-                count.
+                too. A ``Listener`` goes with (..., 2, time), left first.
             lengths: Number of samples of each item of a padded batch, (...), or its share of the
                 longest, above 0 and up to 1, as SpeechBrain defines it. Samples after the end of an
                 item are ignored, so that its value is the one that it has alone (within 1e-4 for
                 the exact MSBG, which simulates the padded batch at once).
-            listener: Further keyword arguments for a simulator of your own, by name, as a
-                dictionary. This is not a ``Listener``, which goes into ``audiogram``. Tensors are
-                moved to the device of the speech.
 
-        Shape: (..., time) twice -> (), or with ``reduction="none"`` the leading dimensions, where a
-            missing ear is NaN. With ``ears="better"`` the result has no dimension of ears.
+        Shape: (..., time) twice -> (), or with ``reduction="none"`` the leading dimensions. With
+            ``ears="better"`` the result has no dimension of ears.
 
         Raises:
-            ValueError: There is no audiogram, shapes or devices do not fit, levels are outside -10
-                to 100 dB HL, lengths are outside 1 to time, a simulator, normal ear or criterion
-                returns another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, an item
-                is shorter than 0.7 s.
+            ValueError: There is no audiogram, or one of two ears is missing; shapes do not fit,
+                levels are outside -10 to 100 dB HL, lengths are outside 1 to time, a simulator,
+                normal ear or criterion returns another shape than it should, or, with ``"haspi"``
+                or ``"hasqi"``, an item is shorter than 0.7 s.
         """
-        parts = self.parts(compensated, clean, audiogram, lengths, listener=listener)
+        parts = self.parts(compensated, clean, audiogram, lengths)
         return weighted_sum(parts, self.weights)
 
     @not_compiled
@@ -271,8 +213,6 @@ class HearingLossLoss(nn.Module):
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
-        *,
-        listener: Mapping[str, Any] | None = None,
     ) -> dict[str, Tensor]:
         """Compute the named terms of the loss, before they are multiplied by their weights.
 
@@ -285,10 +225,16 @@ class HearingLossLoss(nn.Module):
             for ``"paper"`` magnitude, phase, complex and time. Other criteria have one part of
             their own name, and a function has the part ``"criterion"``.
         """
-        call = self._prepare(compensated, clean, audiogram, lengths, listener)
-        with torch.autocast(call.clean.device.type, enabled=False):
-            parts = self._compare(call)
-        return self._reduce(parts, call.known)
+        call = self._prepare(compensated, clean, audiogram, lengths)
+        with torch.autocast(clean.device.type, enabled=False):
+            parts = self._compare(*call)
+        if self.ears == "better":
+            losses = weighted_sum(parts, self.weights).detach()
+            shares = torch.softmax(-losses / _TEMPERATURE, -1)
+            parts = {name: (shares * part).sum(-1) for name, part in parts.items()}
+        if self.reduction == "mean":
+            parts = {name: part.mean() for name, part in parts.items()}
+        return parts
 
     @not_compiled
     def heard(
@@ -297,13 +243,11 @@ class HearingLossLoss(nn.Module):
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
-        *,
-        listener: Mapping[str, Any] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Compute the perceived speech and its reference, for a criterion of your own.
 
-        Both signals are in pascals and time-aligned. They are silent after the end of each item,
-        and at the missing ear of a listener. Gradients pass through the frozen simulator.
+        Both signals are in pascals and time-aligned. They are silent after the end of each item.
+        Gradients pass through the frozen simulator.
 
         Arguments and errors are those of ``forward``.
 
@@ -314,23 +258,23 @@ class HearingLossLoss(nn.Module):
             The compensated speech as the impaired ear perceives it, and its reference: the clean
             speech as a normal ear perceives it or, with ``reference="clean"``, as it is.
         """
-        call = self._prepare(compensated, clean, audiogram, lengths, listener)
-        output, clean, ears, lengths, _, options = call
+        output, clean, ears, ends = self._prepare(compensated, clean, audiogram, lengths)
         with torch.autocast(clean.device.type, enabled=False):
-            perceived = self._frozen.simulate(output, ears, lengths, options)
+            perceived = self._frozen.simulate(output, ears, ends)
             batch = perceived.shape[:-1]
-            reference = self._frozen.reference("criterion", clean, ears, batch, lengths, options)
-            if lengths is not None:
-                perceived = silence_after(perceived, lengths)
-                reference = silence_after(reference, lengths)
+            reference = self._frozen.reference("criterion", clean, ears, batch, ends)
+            if ends is not None:
+                perceived, reference = (
+                    silence_after(perceived, ends),
+                    silence_after(reference, ends),
+                )
             gain = gain_to_pascals(self.full_scale_spl)
             return perceived * gain, reference * gain
 
     def extra_repr(self) -> str:
         return (
             f"simulator={type(self.simulator).__name__}, sample_rate={self.sample_rate}, "
-            f"full_scale_spl={self.full_scale_spl:g}, reference={self.reference!r}, "
-            f"criterion={self.criterion!r}"
+            f"full_scale_spl={self.full_scale_spl:g}, criteria={self.criteria}"
         )
 
     def _prepare(
@@ -339,58 +283,43 @@ class HearingLossLoss(nn.Module):
         clean: Tensor,
         audiogram: AudiogramLike | None,
         lengths: Lengths | None,
-        listener: Mapping[str, Any] | None,
-    ) -> _Call:
-        """Validate the arguments of a call, and silence samples after the end of each item."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Validate the arguments of a call.
+
+        Returns:
+            The output and the clean speech, silent after the end of each item; thresholds in dB HL;
+            and the number of samples of each item, or None if all are as long as the batch.
+        """
         check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
-        for name in ("shape", "device"):
-            values = getattr(compensated, name), getattr(clean, name)
-            if values[0] != values[1]:
-                raise ValueError(
-                    f"expected compensated and clean with the same {name}, "
-                    f"got {values[0]} and {values[1]}"
-                )
-        listeners = self._two_ears if audiogram is None else has_listeners(audiogram)
-        if listeners or self.ears == "better" or "interaural" in self.criteria:
+        if compensated.shape != clean.shape:
+            raise ValueError(
+                "expected compensated and clean with the same shape, "
+                f"got {tuple(compensated.shape)} and {tuple(clean.shape)}"
+            )
+        stored = self._unregistered[0]
+        ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)
+        if self.ears == "better" or "interaural" in self.criteria:
             check_two_channels(clean)
-        ends = None if lengths is None else check_lengths(lengths, clean.shape)
-        if ends is not None and bool((ends == clean.shape[-1]).all()):
-            ends = None
-        ears = self.thresholds
-        if audiogram is not None:
-            ears = as_thresholds(audiogram, allow_missing=True)
-        if ears is None:
-            raise ValueError("no audiogram; pass one to the constructor or to the call")
-        ears = unsqueeze_mono(ears, clean.shape)
         dtype = torch.promote_types(compensated.dtype, clean.dtype)
         dtype = torch.promote_types(dtype, torch.float32)
         compensated, clean = compensated.to(dtype), clean.to(dtype)
-        if ends is not None:
-            compensated, clean = silence_after(compensated, ends), silence_after(clean, ends)
-        # Only a listener, whose ears are on the CPU, may lack an ear.
-        known = ears.isfinite().all(-1) if listeners else None
-        ears = on_device(ears, compensated.device)
-        if known is not None and bool(known.all()):
-            known = None
-        if known is not None:
-            # A missing ear is simulated as a normal one that receives silence.
-            known = known.to(compensated.device, non_blocking=True)
-            compensated = torch.where(known.unsqueeze(-1), compensated, 0.0)
-            clean = torch.where(known.unsqueeze(-1), clean, 0.0)
-            ears = ears.nan_to_num()
-        return _Call(compensated, clean, ears, ends, known, listener or {})
+        ends = None if lengths is None else check_lengths(lengths, clean.shape)
+        if ends is None or bool((ends == clean.shape[-1]).all()):
+            return compensated, clean, ears, None
+        return silence_after(compensated, ends), silence_after(clean, ends), ears, ends
 
-    def _compare(self, call: _Call) -> dict[str, Tensor]:
+    def _compare(
+        self, output: Tensor, clean: Tensor, ears: Tensor, lengths: Tensor | None
+    ) -> dict[str, Tensor]:
         """Compute the parts of the loss for each item, each in the shape of the leading dimensions.
 
-        Args:
-            call: Arguments from ``_prepare``.
+        The arguments are the results of ``_prepare``.
         """
-        output, clean, ears, lengths, known, options = call
+        limited = output
         if {"coherent-bands", *SCORES} & self.criteria.keys():
-            output = coherent_bands.limit_gradient_spikes(output, self.sample_rate)
-        perceived = self._frozen.simulate(output, ears, lengths, options)
+            limited = coherent_bands.limit_gradient_spikes(output, self.sample_rate)
+        perceived = self._frozen.simulate(limited, ears, lengths)
         batch, time = perceived.shape[:-1], perceived.shape[-1]
         gain = gain_to_pascals(self.full_scale_spl)
 
@@ -398,10 +327,10 @@ class HearingLossLoss(nn.Module):
             """Return a waveform in pascals, (items, time)."""
             return waveform.expand_as(perceived).reshape(-1, time) * gain
 
-        signals = {"perceived": as_items(perceived), "output": as_items(call.compensated)}
+        signals = {"perceived": as_items(perceived), "output": as_items(output)}
         for name in self.criteria:
             if name not in _CRITERIA_OF_OUTPUT:
-                reference = self._frozen.reference(name, clean, ears, batch, lengths, options)
+                reference = self._frozen.reference(name, clean, ears, batch, lengths)
                 signals[name] = as_items(reference)
         if lengths is None:
             ends = [time] * math.prod(batch)
@@ -413,16 +342,14 @@ class HearingLossLoss(nn.Module):
                 alone = {name: signal[item, None, :end] for name, signal in signals.items()}
                 items.append(self._compare_perceived(alone))
             parts = {name: torch.cat([item[name] for item in items]) for name in items[0]}
-        for name in self.criteria:
-            if name in SCORES:
-                item_ears = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-                pair = as_items(output), as_items(clean)
-                parts[name] = score_loss(name, *pair, item_ears, ends, self.sample_rate)
+        aided, target = as_items(limited), as_items(clean)
+        item_ears = flatten_items(ears, batch, ears.dtype)
+        for name in [name for name in self.criteria if name in SCORES]:
+            parts[name] = score_loss(name, aided, target, item_ears, ends, self.sample_rate)
         if "interaural" in self.criteria:
-            pair = output.expand_as(perceived) * gain, clean.expand_as(perceived) * gain
-            changes = interaural_loss(*pair, self.sample_rate)
-            both_ears = 1.0 if known is None else known.all(-1).to(changes)
-            parts["interaural"] = (both_ears * changes).unsqueeze(-1).expand(batch)
+            shape = perceived.shape
+            changes = interaural_loss(aided.view(shape), target.view(shape), self.sample_rate)
+            parts["interaural"] = changes.unsqueeze(-1).expand(batch)
         return {name: part.reshape(batch) for name, part in parts.items()}
 
     def _compare_perceived(self, signals: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -437,7 +364,7 @@ class HearingLossLoss(nn.Module):
         """
         perceived = signals["perceived"]
         parts: dict[str, Tensor] = {}
-        for name, criterion in self.criteria.items():
+        for name in self.criteria:
             if name in _CRITERIA_OF_OUTPUT:
                 continue
             pair = perceived, signals[name]
@@ -447,38 +374,22 @@ class HearingLossLoss(nn.Module):
             elif name == "bands":
                 parts["band_levels"] = band_level_loss(*pair, self.sample_rate)
             elif name == "paper":
-                stft = paper.paper_stft(self.sample_rate)
-                parts |= paper.paper_parts(*pair, stft, self._frozen.frequencies(stft.fft))
+                parts |= paper_parts(*(resample(x, self.sample_rate, NEURO_RATE) for x in pair))
             else:
-                parts[name] = check_values(criterion(*pair), len(perceived))
+                value = self._unregistered[1](*pair)
+                parts[name] = check_shape(value, "criterion", (len(perceived),))
         return parts
 
-    def _reduce(self, parts: dict[str, Tensor], known: Tensor | None) -> dict[str, Tensor]:
-        """Reduce the parts of each ear and item as ``ears`` and ``reduction`` demand.
-
-        Args:
-            parts: Parts under their names, each in the shape of the leading dimensions.
-            known: Mask of the ears that are not missing, or None if none is missing.
-        """
-        if known is not None:
-            known = known.expand(next(iter(parts.values())).shape)
-        if self.ears == "better":
-            losses = weighted_sum(parts, self.weights).detach()
-            if known is not None:
-                losses = losses.masked_fill(~known, math.inf)
-            shares = torch.softmax(-losses / _TEMPERATURE, -1)
-            parts = {name: (shares * part).sum(-1) for name, part in parts.items()}
-        elif known is not None and self.reduction == "mean":
-            return {name: part[known].mean() for name, part in parts.items()}
-        elif known is not None:
-            parts = {name: torch.where(known, part, torch.nan) for name, part in parts.items()}
-        if self.reduction == "none":
-            return parts
-        return {name: part.mean() for name, part in parts.items()}
-
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the simulator and the criterion, which are not registered, along with the loss."""
+        """Move modules that are not registered along with the loss, but not to half precision."""
+
+        def move(tensor: Tensor) -> Tensor:
+            moved = function(tensor)
+            is_half = moved.is_floating_point() and moved.dtype.itemsize < 4
+            return tensor.to(moved.device) if is_half else moved
+
         super()._apply(function, recurse)
-        self._frozen.apply(function)
-        apply_to_module(self.criterion, function)
+        for module in (self.simulator, self._frozen.normal, self._unregistered[1]):
+            if isinstance(module, nn.Module):
+                module._apply(move)
         return self

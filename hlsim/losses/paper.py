@@ -41,18 +41,6 @@ FAINT_POWER = 8e-4
 SILENT_MAGNITUDE = 1e-7
 
 
-def magnitude_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Compute the mean squared difference of the magnitudes of spectra (Equation 2).
-
-    Shape: complex (items, frames, bins) twice -> (items,).
-
-    >>> spectrum = torch.full((1, 3, 201), 2.0 + 0.0j)
-    >>> magnitude_loss(spectrum, 0.5 * spectrum)
-    tensor([1.])
-    """
-    return (_magnitude(estimate) - _magnitude(target)).square().mean((-2, -1))
-
-
 def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
     """Compute the mean error of the phase of spectra in radians (Equations 3 to 6).
 
@@ -62,8 +50,7 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
     1 / magnitude, so that inaudible frequencies would dominate the gradient. Therefore the gradient
     is faded out where the estimate or the target is fainter than a tone of 20 dB SPL.
 
-    The spectra are those of signals in pascals by ``PAPER_STFT``, or are scaled to its magnitudes
-    as in ``paper_parts``.
+    The spectra are those of signals in pascals by ``PAPER_STFT``.
 
     Shape: complex (items, frames, bins) twice -> (items,).
 
@@ -80,30 +67,6 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
     return total + anti_wrap(difference.diff(dim=-2)).mean((-2, -1))
 
 
-def complex_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Compute twice the mean squared difference of real and imaginary parts (Equation 7).
-
-    Shape: complex (items, frames, bins) twice -> (items,).
-
-    >>> spectrum = torch.full((1, 3, 201), 2.0 + 0.0j)
-    >>> complex_loss(spectrum, -spectrum)
-    tensor([16.])
-    """
-    difference = torch.view_as_real(estimate - target)
-    return 2.0 * difference.square().mean((-3, -2, -1))
-
-
-def time_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Compute the mean absolute difference of waveforms (Equation 8).
-
-    Shape: (items, time) twice -> (items,).
-
-    >>> time_loss(torch.ones(1, 100), torch.zeros(1, 100))
-    tensor([1.])
-    """
-    return (estimate - target).abs().mean(-1)
-
-
 def anti_wrap(angle: Tensor) -> Tensor:
     """Compute the distance of angles from the nearest multiple of 2 pi, a whole turn, in radians.
 
@@ -118,30 +81,16 @@ def anti_wrap(angle: Tensor) -> Tensor:
     return torch.sub(angle, turns, alpha=2.0 * math.pi).abs()
 
 
-def paper_stft(sample_rate: int) -> STFT:
-    """Return the paper's short-time Fourier transform for a sample rate in Hz.
+def paper_parts(estimate: Tensor, target: Tensor) -> dict[str, Tensor]:
+    """Compute the paper's four losses of waveforms at 16 kHz.
 
-    Its windows are 25 ms long, one every 6.25 ms.
-
-    >>> paper_stft(48000).window
-    1200
-    """
-    hop = round(sample_rate * PAPER_STFT.hop / 16000)
-    return STFT(4 * hop, 4 * hop, hop)
-
-
-def paper_parts(
-    estimate: Tensor, target: Tensor, stft: STFT = PAPER_STFT, frequencies: int | None = None
-) -> dict[str, Tensor]:
-    """Compute the paper's four losses: of magnitudes, phases, complex spectra and waveforms.
+    They are the mean squared difference of the magnitudes of spectra (Equation 2), the error of
+    their phase (``phase_loss``), twice the mean squared difference of their real and imaginary
+    parts (Equation 7), and the mean absolute difference of the waveforms (Equation 8).
 
     Args:
         estimate: Waveforms to judge, (items, time).
         target: Waveforms that they should equal, (items, time).
-        stft: Short-time Fourier transform. Spectra are scaled to the magnitudes of the paper's
-            transform, so that the sample rate changes no level, and the magnitude and complex
-            losses to its number of frequencies, so that an empty band changes nothing.
-        frequencies: Number of frequencies of spectra to compare, from 0 Hz up; all if None.
 
     Returns:
         ``magnitude``, ``phase``, ``complex`` and ``time`` of each item, (items,) each.
@@ -151,17 +100,14 @@ def paper_parts(
     >>> {name: part.item() for name, part in parts.items()}
     {'magnitude': 0.0, 'phase': 0.0, 'complex': 0.0, 'time': 0.0}
     """
-    spectrum = stft.analyse(estimate)[..., :frequencies]
-    target_spectrum = stft.analyse(target)[..., :frequencies]
-    scale = PAPER_STFT.window / stft.window
-    if scale != 1.0:
-        spectrum, target_spectrum = spectrum * scale, target_spectrum * scale
-    share = spectrum.shape[-1] / PAPER_STFT.frequencies
+    spectrum, target_spectrum = PAPER_STFT.analyse(estimate), PAPER_STFT.analyse(target)
+    magnitude_error = _magnitude(spectrum) - _magnitude(target_spectrum)
+    complex_error = torch.view_as_real(spectrum - target_spectrum)
     return {
-        "magnitude": magnitude_loss(spectrum, target_spectrum) * share,
+        "magnitude": magnitude_error.square().mean((-2, -1)),
         "phase": phase_loss(spectrum, target_spectrum),
-        "complex": complex_loss(spectrum, target_spectrum) * share,
-        "time": time_loss(estimate, target),
+        "complex": 2.0 * complex_error.square().mean((-3, -2, -1)),
+        "time": (estimate - target).abs().mean(-1),
     }
 
 

@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -14,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from compensators import NALR
-from hlsim import MSBG, Audiogram, HearingLossLoss, NeuroMSBG, load_pretrained
+from hlsim import MSBG, Audiogram, HearingLossLoss, Listener, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
-from hlsim.checkpoint import find_checkpoint
+from hlsim.checkpoint import checkpoints_folder
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.coherent_bands import coherent_band_parts
@@ -91,15 +89,6 @@ class Wrapper(nn.Module):
         return perceived
 
 
-class DeadRegion(nn.Module):
-    """A simulator that removes the band above an edge, which is an argument of the call."""
-
-    def forward(self, waveform: Tensor, thresholds: Tensor, edge: Tensor) -> Tensor:
-        time = waveform.shape[-1]
-        passes = torch.fft.rfftfreq(time, 1.0 / 16000) < edge.unsqueeze(-1)
-        return torch.fft.irfft(torch.fft.rfft(waveform) * passes, time)
-
-
 def compute(loss: HearingLossLoss, output: Tensor, clean: Tensor, *arguments: object) -> Result:
     """Return the value, and the gradient with respect to the output."""
     leaf = output.detach().clone().requires_grad_()
@@ -117,47 +106,37 @@ def assert_same(first: Result, second: Result) -> None:
 
 
 @each_simulator
-def test_host_does_not_know_the_simulator(simulator: str) -> None:
+def test_host_trains_without_the_simulator(simulator: str, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, simulator=simulator)
     assert isinstance(loss.simulator, SIMULATORS[simulator])
     host, bare = Host(loss).train().requires_grad_(True), Host()
     assert loss.training and not any(module.training for module in loss.simulator.modules())
     assert not any(parameter.requires_grad for parameter in loss.simulator.parameters())
     assert list(loss.parameters()) == [] and list(loss.buffers()) == [] and loss.state_dict() == {}
-    assert not any(isinstance(module, (MSBG, NeuroMSBG)) for module in host.modules())
     # A state dict of either host loads into the other.
     bare.load_state_dict(host.state_dict(), strict=True)
     host.load_state_dict(bare.state_dict(), strict=True)
-
-
-def test_step_trains_only_the_compensator(options: Options, clean: Tensor) -> None:
-    host = Host(HearingLossLoss(N3, **options)).train()
-    before = copy.deepcopy(host.loss.simulator.state_dict())
-    host.loss(host(clean), clean).backward()
+    loss(host(clean), clean).backward()
     for parameter in host.filter.parameters():
         assert parameter.grad is not None
         assert bool(parameter.grad.isfinite().all()) and bool(parameter.grad.any())
-    torch.optim.SGD(host.parameters(), lr=1e-3).step()
-    assert all(parameter.grad is None for parameter in host.loss.simulator.parameters())
-    after = host.loss.simulator.state_dict()
-    assert all(torch.equal(before[name], after[name]) for name in before)
 
 
 def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
     expected = HearingLossLoss(N3)(2.0 * clean, clean)
-    folder = find_checkpoint("neuro-msbg")
     model = load_pretrained("neuro-msbg").train().requires_grad_(True)
-    for simulator in (Path("neuro-msbg"), folder, str(folder), model):
+    for simulator in (Path("neuro-msbg"), str(checkpoints_folder() / "neuro-msbg"), model):
         loss = HearingLossLoss(N3, simulator=simulator)
         close(loss(2.0 * clean, clean), expected)
     assert loss.simulator is model and not model.training
     assert not any(parameter.requires_grad for parameter in model.parameters())
 
 
-def test_loss_from_inference_mode_trains_later(options: Options, clean: Tensor) -> None:
-    expected = HearingLossLoss(N3, **options)
+@each_simulator
+def test_loss_from_inference_mode_trains_later(simulator: str, clean: Tensor) -> None:
+    expected = HearingLossLoss(N3, simulator=simulator)
     with torch.inference_mode():
-        loss = HearingLossLoss(N3, **options)
+        loss = HearingLossLoss(N3, simulator=simulator)
         loss(3.0 * clean, clean)
     assert_same(compute(expected, 3.0 * clean, clean), compute(loss, 3.0 * clean, clean))
 
@@ -167,15 +146,11 @@ def test_simulator_moves_with_its_host_but_never_to_half_precision(
     simulator: str, clean: Tensor
 ) -> None:
     host = Host(HearingLossLoss(N3, simulator=simulator, criterion="bands"))
-    tensors = host.loss.simulator.state_dict().values
-    dtypes = {tensor.dtype for tensor in tensors()}
+    value, slope = compute(host.loss, 3.0 * clean, clean)
     host.to(torch.bfloat16)
     assert host.filter.weight.dtype == torch.bfloat16
-    assert {tensor.dtype for tensor in host.loss.simulator.state_dict().values()} == dtypes
-    value, slope = compute(host.loss, 3.0 * clean, clean)
+    assert_same(compute(host.loss, 3.0 * clean, clean), (value, slope))
     host.double()
-    floating = [t for t in host.loss.simulator.state_dict().values() if t.is_floating_point()]
-    assert {tensor.dtype for tensor in floating} <= {torch.float64}
     precise_value, precise_slope = compute(host.loss, 3.0 * clean.double(), clean.double())
     assert precise_value.dtype == precise_slope.dtype == torch.float64
     # In another precision, only the direction of the gradient is the same.
@@ -198,9 +173,8 @@ def test_copies_have_simulators_of_their_own(
 
 
 @pytest.mark.slow
-@each_simulator
-def test_caller_can_be_compiled(simulator: str, clean: Tensor) -> None:
-    loss = HearingLossLoss(N3, simulator=simulator, criterion="bands")
+def test_caller_can_be_compiled(clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, criterion="bands")
 
     def step(gain: Tensor, signal: Tensor) -> Tensor:
         value: Tensor = loss((1.0 + gain).square() * signal, signal) * 0.5
@@ -214,22 +188,10 @@ def test_caller_can_be_compiled(simulator: str, clean: Tensor) -> None:
     assert_same(results[0], results[1])
 
 
-@pytest.mark.slow
-def test_import_and_simulator_do_not_import_the_compiler() -> None:
-    code = (
-        "import sys, torch, hlsim, hlsim.evaluation; hlsim.MSBG(torch.zeros(8))(torch.zeros(99)); "
-        "sys.exit('torch._dynamo' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-SINE = Function(lambda waveform: 0.5 * waveform.sin())
-
-
-@pytest.mark.parametrize("simulator", [*SIMULATORS, "neuro-msbg-light", SINE])
+@pytest.mark.parametrize("simulator", [*SIMULATORS, "neuro-msbg-light"])
 @pytest.mark.parametrize("seconds", [0.3, 9.0])
 def test_checkpoint_stores_less_and_changes_no_bit(
-    simulator: str | nn.Module, seconds: float, clean: Tensor
+    simulator: str, seconds: float, clean: Tensor
 ) -> None:
     signal = clean.repeat(2, 32)[:, : round(16000 * seconds)]
     results, stored = [], []
@@ -248,24 +210,11 @@ def test_checkpoint_stores_less_and_changes_no_bit(
         results.append((value.detach(), torch.autograd.grad(value, output)[0]))
     assert torch.equal(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
-    if isinstance(simulator, str) and seconds < 1.0:
+    if seconds < 1.0:
         assert stored[1] < 0.4 * stored[0]
 
 
 # Ears, items and lengths
-
-
-@each_simulator
-def test_audiogram_in_all_forms(simulator: str, clean: Tensor) -> None:
-    stored = HearingLossLoss(N3, simulator=simulator, criterion="paper")
-    bare = HearingLossLoss(simulator=stored.simulator, criterion="paper")
-    expected = stored(clean, clean)
-    for ear in ("N3", [N3, N3], torch.tensor([N3.thresholds])):
-        close(bare(clean, clean, ear), expected)
-    # The ear of the call has priority over the stored one.
-    other = stored(clean, clean, S2)
-    close(other, bare(clean, clean, S2))
-    assert float(other) != pytest.approx(float(expected), rel=0.01)
 
 
 def test_batch_is_the_mean_of_its_items(options: Options, clean: Tensor) -> None:
@@ -295,16 +244,15 @@ def test_ear_can_be_trained(simulator: str, clean: Tensor) -> None:
     assert torch.equal(copy.deepcopy(loss)(3.0 * clean, clean), loss(3.0 * clean, clean))
 
 
-def test_ears_pair_with_items_and_never_with_all_of_them() -> None:
-    loss, ears = HearingLossLoss(simulator="msbg"), [N2, N4]
+def test_ears_of_the_call_replace_those_of_the_constructor_and_pair_with_items() -> None:
+    loss, ears = HearingLossLoss(S2, simulator="msbg"), [N2, N4]
     speech = 0.03 * torch.randn(2, 1, 2000)
     expected = loss(speech[:, 0], speech[:, 0], ears)
+    assert float(expected) != float(loss(speech, speech))
     close(loss(speech, speech, ears), expected)
     levels = torch.tensor([ear.thresholds for ear in ears])
     close(loss(speech, speech, levels[:, None]), expected)
     assert bool(loss(speech[0, 0], speech[0, 0], ears).isfinite())  # one item and several ears
-    with pytest.raises(ValueError):
-        loss(*[speech.unsqueeze(1).expand(2, 3, 1, 2000)] * 2, ears)
 
 
 @each_reference
@@ -329,17 +277,14 @@ def test_samples_after_the_end_do_not_count(options: Options, clean: Tensor) -> 
     after[1, 3000:] = 1.0
     expected = compute(loss, 3.0 * clean, clean, None, [4800, 3000])
     assert not bool(expected[1][1, 3000:].any()) and bool(expected[1][1, :3000].any())
-    for lengths in (torch.tensor([4800, 3000]), [1.0, 0.625], torch.tensor([1.0, 0.625])):
-        result = compute(loss, 3.0 * clean + after, clean - after, None, lengths)
-        assert torch.equal(result[0], expected[0]) and torch.equal(result[1], expected[1])
+    result = compute(loss, 3.0 * clean + after, clean - after, None, torch.tensor([1.0, 0.625]))
+    assert torch.equal(result[0], expected[0]) and torch.equal(result[1], expected[1])
     mono = loss(3.0 * clean[:, None], clean[:, None], lengths=torch.tensor([1.0, 0.625]))
     close(mono, expected[0])
     # Items that are as long as the batch need no lengths.
     full = loss(3.0 * clean, clean)
     assert float(expected[0]) != float(full)
     assert torch.equal(loss(3.0 * clean, clean, lengths=[4800, 4800]), full)
-    scalar = loss(3.0 * clean[0], clean[0], N3, lengths=torch.tensor(4800))
-    assert torch.equal(scalar, loss(3.0 * clean[0], clean[0], N3))
 
 
 def test_reduction_none_gives_a_value_per_item(options: Options, clean: Tensor) -> None:
@@ -396,20 +341,13 @@ def test_perceived_signal_is_compared_with_the_reference(simulator: str, clean: 
         assert float(expected) != float(band_level_loss(perceived, clean, 16000).mean())
 
 
-def test_default_compares_the_signals_of_heard(clean: Tensor) -> None:
-    loss = HearingLossLoss([N3, S2], full_scale_spl=100.0, reduction="none")
-    parts = loss.parts(3.0 * clean, clean)
-    for name, part in coherent_band_parts(*loss.heard(3.0 * clean, clean), 16000).items():
-        close(parts[name], part)
-
-
 @each_simulator
 def test_function_gets_the_signals_of_heard(simulator: str, clean: Tensor) -> None:
     def mean_square(perceived: Tensor, reference: Tensor) -> Tensor:
         assert perceived.shape == reference.shape and perceived.ndim == 2
         return (perceived - reference).square().mean(-1)
 
-    for options in ({}, {"reference": "clean"}, {"full_scale_spl": 100.0}):
+    for options in ({"reference": "clean"}, {"full_scale_spl": 100.0}):
         settings: Options = {"simulator": simulator, "reduction": "none", **options}
         loss = HearingLossLoss([N3, S2], criterion=mean_square, **settings)
         output = (3.0 * clean).requires_grad_()
@@ -423,6 +361,11 @@ def test_function_gets_the_signals_of_heard(simulator: str, clean: Tensor) -> No
         values = mean_square(perceived, reference) * torch.tensor([1.0, 4800 / 3000])
         close(values, loss(output, clean, lengths=lengths))
     assert tuple(loss.parts(clean, clean)) == tuple(loss.weights) == ("criterion",)
+    # The default criterion compares the same signals.
+    default = HearingLossLoss([N3, S2], **settings)
+    parts = default.parts(output, clean)
+    for name, part in coherent_band_parts(*default.heard(output, clean), 16000).items():
+        close(parts[name], part)
 
 
 def test_several_criteria_share_one_simulation(clean: Tensor) -> None:
@@ -449,36 +392,23 @@ def test_output_of_an_unknown_simulator_is_compared_as_it_is(criterion: str, cle
     close(wrapped(3.0 * clean, clean), expected)
 
 
-@pytest.mark.parametrize("criterion", ["coherent-bands", "bands"])
-def test_simulator_takes_further_arguments(criterion: str, clean: Tensor) -> None:
-    options: Options = {"criterion": criterion, "normal": lambda waveform: waveform}
-    loss = HearingLossLoss(N3, simulator=DeadRegion(), reduction="none", **options)
-    whole = {"edge": torch.tensor([1e5, 1e5])}
-    assert loss(clean, clean, listener=whole).tolist() == pytest.approx([0.0, 0.0], abs=1e-4)
-    first, second = loss(clean, clean, listener={"edge": torch.tensor([1e5, 2000.0])})
-    assert float(first) == pytest.approx(0.0, abs=1e-4) and float(second) > 0.01
-    close(loss.heard(clean, clean, listener=whole)[0], clean)
-
-
 def test_simulator_has_a_normal_ear(clean: Tensor) -> None:
-    region = DeadRegion()
-    low_pass = Function(lambda waveform: region(waveform, N3, torch.tensor(2000.0)))
-    # At 0 dB HL, the simulator removes the band above 2 kHz from the reference, too.
-    value = float(HearingLossLoss(N3, simulator=low_pass)(clean, clean))
+    softer = Function(lambda waveform: 0.1 * waveform)
+    # At 0 dB HL, the simulator makes the reference softer, too.
+    value = float(HearingLossLoss(N3, simulator=softer)(clean, clean))
     assert value == pytest.approx(0.0, abs=1e-6)
-    loss = HearingLossLoss(N3, simulator=low_pass, normal=nn.Identity())
+    loss = HearingLossLoss(N3, simulator=softer, normal=nn.Identity())
     assert float(loss(clean, clean)) > 0.1
     ear = nn.Conv1d(1, 1, 1)
     loss = HearingLossLoss(N3, normal=ear)
-    assert loss.normal is ear and not ear.weight.requires_grad and list(loss.parameters()) == []
-    twin = copy.deepcopy(loss).double()
-    assert twin.normal.weight.dtype == torch.float64 and ear.weight.dtype == torch.float32
+    assert not ear.weight.requires_grad and list(loss.parameters()) == []
+    loss.double()
+    assert ear.weight.dtype == torch.float64
     # The normal ear of another teacher has a phase of its own, not that of MSBG.
     learned = Wrapper(Function(lambda waveform: waveform * 1.0))
-    for criterion in ("paper", lambda output, target: (output - target).square().mean(-1)):
-        options: Options = {"normal": nn.Identity(), "reference": "clean"}
-        loss = HearingLossLoss(N4, simulator=learned, criterion=criterion, **options)
-        assert float(loss(clean, clean)) == pytest.approx(0.0, abs=1e-6)
+    options: Options = {"normal": nn.Identity(), "reference": "clean", "criterion": "paper"}
+    loss = HearingLossLoss(N4, simulator=learned, **options)
+    assert float(loss(clean, clean)) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_normal_ear_has_no_loss(options: Options, clean: Tensor) -> None:
@@ -494,7 +424,7 @@ def test_normal_ear_has_no_loss(options: Options, clean: Tensor) -> None:
 
 @each_simulator
 @each_reference
-@pytest.mark.parametrize("ear", ["NH", "N1", "N3", "N4", "S2"])
+@pytest.mark.parametrize("ear", ["NH", "N3", "S2"])
 def test_speech_is_closer_than_inverted_speech_and_silence(
     simulator: str, reference: str, ear: str, clean: Tensor
 ) -> None:
@@ -613,7 +543,8 @@ def test_torch_func_gives_the_same_gradients(options: Options, clean: Tensor) ->
 
 def test_limited_gradient_has_no_derivative(clean: Tensor) -> None:
     for criterion in WEIGHTS:
-        loss = HearingLossLoss(N3, simulator=SINE, criterion=criterion)
+        sine = Function(lambda waveform: 0.5 * waveform.sin())
+        loss = HearingLossLoss(N3, simulator=sine, criterion=criterion)
         output = (3.0 * clean).requires_grad_()
         (slope,) = torch.autograd.grad(loss(output, clean), output, create_graph=True)
         if criterion == "coherent-bands":
@@ -650,20 +581,20 @@ N7 = Audiogram.standard("N7")
 
 BAD_SETTINGS: Options = {
     "simulator": ["ear", 3, nn.ReLU, MSBG(aligned=False), MSBG(sample_rate=44100)],
-    "normal": ["N0"],
     "sample_rate": [8000],
     "full_scale_spl": [None],
     "reference": ["noisy", ["clean"]],
     "reduction": ["sum"],
     "ears": ["left"],
-    "criterion": ["l1", ["paper"], nn.L1Loss, {}, {"l1": 1.0}, {"bands": -1.0}, {"bands": 0.0}],
+    "criterion": ["l1", ["paper"], {}, {"l1": 1.0}, {"bands": -1.0}, {"bands": 0.0}],
     "weights": [1.0, {"pitch": 1.0}, {"levels": float("nan")}, {}],
     "audiogram": [N7, torch.zeros(7)],
 }
 BAD_CALLS: list[tuple[Any, ...]] = [
     (SIGNAL, SIGNAL),
     (SIGNAL, SIGNAL[:, 1:], N3),
-    (SIGNAL, SIGNAL.to("meta"), N3),
+    (SIGNAL[0], SIGNAL[0], Listener(N3, N3)),
+    (torch.stack((SIGNAL, SIGNAL)), torch.stack((SIGNAL, SIGNAL)), Listener(None, N3)),
     (SIGNAL.long(), SIGNAL, N3),
     (SIGNAL[:, :0], SIGNAL[:, :0], N3),
     (SIGNAL, SIGNAL, [N3, N3, N3]),
@@ -674,7 +605,6 @@ BAD_CALLS: list[tuple[Any, ...]] = [
 BAD_OUTPUTS: list[Callable[[Tensor], Any]] = [
     lambda wave: nn.functional.pad(wave, (0, 100)),
     lambda wave: (wave, wave),
-    lambda wave: wave.cfloat(),
     lambda wave: wave.mean(0),
     lambda wave: wave.expand(2, 2, -1),
 ]
@@ -689,21 +619,10 @@ def test_bad_settings_calls_and_outputs_raise_value_error() -> None:
         with pytest.raises(ValueError):
             HearingLossLoss(simulator="msbg")(*arguments)
     for function in BAD_OUTPUTS:
-        with pytest.raises(ValueError):
+        with pytest.raises(ValueError, match="the simulator to return a tensor of shape"):
             HearingLossLoss(N3, simulator=Function(function))(SIGNAL, SIGNAL)
-    for result in (torch.zeros(()), torch.zeros(3), 0.5):
-        with pytest.raises(ValueError):
+    for result in (torch.zeros(()), torch.zeros(3), nn.L1Loss()):
+        with pytest.raises(ValueError, match=r"the criterion to return a tensor of shape \(2,\)"):
             HearingLossLoss(N3, criterion=lambda *_, result=result: result)(SIGNAL, SIGNAL)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="the normal ear to return"):
         HearingLossLoss(N3, normal=lambda waveform: waveform[..., 1:])(SIGNAL, SIGNAL)
-    loss = HearingLossLoss(N3)
-    loss.simulator.to("meta")
-    with pytest.raises(ValueError):
-        loss(SIGNAL, SIGNAL)
-
-
-def test_output_may_broadcast_with_the_ears() -> None:
-    for shape in ((1600,), (3, 1600)):
-        simulator = Function(lambda waveform, shape=shape: waveform.expand(shape))
-        loss = HearingLossLoss([N3, N4, S2], simulator=simulator, criterion="paper")
-        assert float(loss(SIGNAL[0], SIGNAL[0])) == pytest.approx(0.0, abs=1e-6)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,18 +10,12 @@ from numpy.typing import NDArray
 from scipy.signal import get_window
 from torch import Tensor
 
-from hlsim.dsp.resample import resample
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import (
     DEFAULT_WEIGHTS,
-    PAPER_STFT,
     anti_wrap,
-    complex_loss,
-    magnitude_loss,
     paper_parts,
-    paper_stft,
     phase_loss,
-    time_loss,
 )
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from tests.losses.signals import add_noise
@@ -86,24 +79,15 @@ def test_phase_loss_ignores_a_gain_and_counts_a_constant_turn_once() -> None:
     torch.testing.assert_close(turned, torch.full((3,), 0.4, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("criterion", [magnitude_loss, phase_loss, complex_loss])
-def test_gradients_of_spectral_criteria_are_exact(criterion: Criterion) -> None:
+def test_gradient_of_the_phase_is_exact() -> None:
     # The spectra are so loud that the gradient of the phase is not faded out.
     target = 1e4 * torch.randn(2, 3, 4, dtype=torch.complex128)
     estimate = (1e4 * torch.randn(2, 3, 4, 2, dtype=torch.float64)).requires_grad_()
 
     def loss(parts: Tensor) -> Tensor:
-        return criterion(torch.view_as_complex(parts), target)
+        return phase_loss(torch.view_as_complex(parts), target)
 
-    # The values reach 1e8, so that a step of 1e-6 would be lost in rounding.
     assert torch.autograd.gradcheck(loss, (estimate,), eps=1e-2, atol=1e-7, rtol=1e-5)
-
-
-def test_gradients_of_time_criteria_are_exact(pair: tuple[Tensor, Tensor]) -> None:
-    target, estimate = (10.0 * waveform[:, 2000:2040] for waveform in pair)
-    for criterion in (time_loss, noise_to_signal_db):
-        loss = partial(criterion, target=target)
-        assert torch.autograd.gradcheck(loss, (estimate.requires_grad_(),))
 
 
 @pytest.mark.parametrize("criterion", [noise_to_signal_db, log_spectral_distance_db])
@@ -142,11 +126,3 @@ def test_log_spectral_distance_of_a_gain_is_the_gain() -> None:
     torch.testing.assert_close(distance, torch.full_like(distance, 6.0), atol=0.02, rtol=0.0)
     # Bins far below the strongest one do not count.
     assert float(log_spectral_distance_db(loud + 1e-6 * loud.roll(1, -1), loud).max()) < 0.01
-
-
-def test_parts_are_similar_at_another_rate(pair: tuple[Tensor, Tensor]) -> None:
-    waves = [resample(waveform, 16000, 15000) for waveform in pair]  # without the band near 8 kHz
-    low = paper_parts(*(resample(wave, 15000, 16000) for wave in waves), PAPER_STFT, 181)
-    high = paper_parts(*(resample(wave, 15000, 48000) for wave in waves), paper_stft(48000), 181)
-    for name in DEFAULT_WEIGHTS:
-        torch.testing.assert_close(high[name], low[name], rtol=0.01, atol=0.0)

@@ -96,7 +96,5 @@ def test_as_a_part_of_the_training_loss_it_restores_the_differences(scene: Tenso
     assert loss.weights["interaural"] == 2.0
     (slope,) = torch.autograd.grad(parts["interaural"].sum(), gains)
     assert float(slope[0]) > 0.0 > float(slope[1])
-    parts_of_one_ear = loss.parts(gains * scene, scene, Listener(None, EAR))
-    assert float(parts_of_one_ear["interaural"][1].detach()) == 0.0
     with pytest.raises(ValueError):
         loss(scene[0], scene[0], EAR)
