@@ -77,7 +77,7 @@ class HearingAid(Wearable):
             in level between them stay if their audiograms are equal.
 
     Raises:
-        ValueError: A rate or level is out of range, or the configuration is of another type.
+        ValueError: A rate or level is out of range.
 
     >>> import hlsim
     >>> aid = HearingAid().eval()
@@ -98,7 +98,7 @@ class HearingAid(Wearable):
         linked: bool = False,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl, linked)
-        self.config = config = HearingAidConfig.from_optional(config)
+        self.config = config = config or HearingAidConfig()
         self.bands = config.bands
         self.limit_spl = config.limit_spl
         inner = config.inner

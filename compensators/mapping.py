@@ -20,7 +20,7 @@ from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.neuro.decoders import Decoder, PhaseDecoder
+from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.torchtools import constant_like
@@ -56,7 +56,7 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         highest_frequency: Highest frequency of outputs in Hz.
 
     Raises:
-        ValueError: A rate or level is out of range, or the configuration is of another type.
+        ValueError: A rate or level is out of range.
 
     >>> import hlsim
     >>> model = MappingCompensator(MappingConfig(channels=8, blocks=1))
@@ -76,7 +76,7 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        self.config = config = MappingConfig.from_optional(config)
+        self.config = config = config or MappingConfig()
         self.stft = config.stft
         sizes = config.channels, config.dense_depth, config.stride
         is_predicted = config.phase == "predicted"
@@ -85,7 +85,11 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         self.encoder = DenseEncoder(inputs, *sizes, normalise=False)
         self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
         self.magnitude_decoder = Decoder(*sizes, outputs=1, normalise=False)
-        self.phase_decoder = PhaseDecoder(*sizes, normalise=False) if is_predicted else None
+        self.phase_decoder = None
+        if is_predicted:
+            self.phase_decoder = Decoder(*sizes, outputs=2, normalise=False)
+        # The gains are averaged over one point of the feature maps.
+        self._additional_field = config.step - config.hop
 
     def _start_gains_db(self, thresholds: Tensor) -> Tensor:
         """Return the gain before training at each frequency of the spectrogram.
@@ -104,17 +108,6 @@ class MappingCompensator(MeasuredAid, EarNetwork):
             f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
             f"start={self.config.start!r}"
         )
-
-    @property
-    def _receptive_field(self) -> tuple[int, int] | None:
-        if self.config.receptive_field is None:
-            return None
-        averaged = self.config.step - self.config.hop
-        return self.config.step, self.config.receptive_field + averaged
-
-    @property
-    def _dtype(self) -> torch.dtype:
-        return self.magnitude_decoder.leave.weight.dtype
 
     def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
         return self._process(noise, ears)
@@ -138,7 +131,7 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         if self.phase_decoder is None:
             factor = gain.exp()
         else:
-            factor = self.phase_decoder.factor(features, size, gain)
+            factor = phase_factor(self.phase_decoder(features, size), gain)
         return self.stft.synthesise(spectrum * factor, signals.shape[-1])
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:

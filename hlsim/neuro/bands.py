@@ -25,7 +25,7 @@ class BandCorrection(nn.Module):
     of the network are the fluctuation of each channel's level about its envelope (the smoothed
     level), and the difference between the envelopes of neighbouring channels. Neither changes with
     the level of the signal. The network predicts a correction of each channel's envelope, a factor
-    on its gain and, optionally, a phase.
+    on its gain, and a phase.
 
     The degrees of hearing loss, or severities, have different filter banks in MSBG. Each has
     its own first and last layer. Before training the last layer is 0, and the output is that of the
@@ -34,7 +34,7 @@ class BandCorrection(nn.Module):
     Args:
         config: Settings of which these are used: ``channels``, the width of the network;
             ``blocks``, the number of its blocks; ``stride[0]``, the number of frames per step;
-            ``kernel[0]``, the length of the convolutions in steps; ``expansion`` and ``phase``.
+            ``kernel[0]``, the length of the convolutions in steps; and ``expansion``.
 
     >>> import torch
     >>> from hlsim.audiogram import severity_index
@@ -57,8 +57,7 @@ class BandCorrection(nn.Module):
         )
         self.bias = nn.Parameter(torch.zeros(severities, width, 1))
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.blocks))
-        outputs = (3 if config.phase == "predicted" else 2) * CHANNELS
-        self.leave = nn.Parameter(torch.zeros(severities, outputs, width))
+        self.leave = nn.Parameter(torch.zeros(severities, 3 * CHANNELS, width))
 
     def forward(self, spectrum: Tensor, ears: Tensor, severity: Tensor, prior: Prior) -> Tensor:
         """Return the spectrogram that ears perceive.
@@ -81,19 +80,12 @@ class BandCorrection(nn.Module):
         for block in self.blocks:
             features = block(features)
 
-        envelope_correction, gain_correction, *phases = (self.leave[severity] @ features).split(
-            CHANNELS, 1
-        )
+        outputs = self.leave[severity] @ features
+        envelope_correction, gain_correction, phase = outputs.split(CHANNELS, 1)
         log_gain = prior.log_gain(log_envelope + envelope_correction, ears, severity)
         gain = (log_gain + gain_correction).exp()
-        if phases:
-            (phase,) = phases
-            real = gain * phase.cos()
-            imaginary = gain * phase.sin()
-        else:
-            real = gain
-            imaginary = torch.zeros_like(gain)
-        factors = prior.gains_to_factors(torch.cat((real, imaginary), 1), severity)
+        gains = torch.cat((gain * phase.cos(), gain * phase.sin()), 1)
+        factors = prior.gains_to_factors(gains, severity)
         frames = smeared.shape[1]
         factors = _interpolate_steps(factors, self.step)[:, :frames]
         return smeared * torch.view_as_complex(factors)

@@ -75,6 +75,17 @@ class SequencePath(nn.Module):
         self.core = core
         self.restore = nn.ConvTranspose1d(width, channels, 1)
 
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode of this module, but leave the layer in training mode.
+
+        The mode has no effect on results, because there is no dropout. In evaluation mode, cuDNN
+        would compute no gradient of an LSTM, and a Transformer layer would keep the attention of
+        all pairs of times in memory, 64 GiB for one minute of signal.
+        """
+        super().train(mode)
+        self.core.train()
+        return self
+
     def forward(self, features: Tensor) -> Tensor:
         rows = features.transpose(1, 2) if self.axis == 0 else features
         hidden = self.core(self.norm(rows).flatten(0, 1)).unflatten(0, rows.shape[:2])
@@ -122,16 +133,6 @@ class BidirectionalLSTM(nn.Module):
         super().__init__()
         self.lstm = nn.LSTM(channels, hidden, batch_first=True, bidirectional=True)
 
-    def train(self, mode: bool = True) -> Self:
-        """Set the mode of this module, but leave the LSTM in training mode.
-
-        In evaluation mode cuDNN computes no gradient. The mode has no other effect, because there
-        is no dropout.
-        """
-        super().train(mode)
-        self.lstm.train()
-        return self
-
     def forward(self, sequence: Tensor) -> Tensor:
         # Where other layers run in bfloat16, cuDNN would run the LSTM in float16.
         with torch.autocast(sequence.device.type, enabled=False):
@@ -142,9 +143,6 @@ class BidirectionalLSTM(nn.Module):
 
 class EncoderLayer(nn.TransformerEncoderLayer):
     """Transformer layer (self-attention and a feed-forward layer) whose memory grows with length.
-
-    In evaluation mode, torch would keep the attention of all pairs of times in memory, 64 GiB for
-    one minute of signal. The layer therefore stays in training mode, and has no dropout.
 
     Shape: (sequences, length, channels) -> (sequences, length, channels).
 
@@ -160,10 +158,6 @@ class EncoderLayer(nn.TransformerEncoderLayer):
     def __init__(self, channels: int, heads: int, hidden: int) -> None:
         options: dict[str, Any] = {"activation": "gelu", "batch_first": True, "norm_first": True}
         super().__init__(channels, heads, hidden, dropout=0.0, **options)
-
-    def train(self, mode: bool = True) -> Self:
-        """Leave the layer in training mode, whatever the mode."""
-        return super().train(True)
 
     def forward(self, src: Tensor, *args: Any, **options: Any) -> Tensor:
         # Where other layers run in bfloat16, the backward pass of attention would take four times

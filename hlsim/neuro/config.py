@@ -17,19 +17,7 @@ Structure = Literal["dual-path", "monolithic", "bands"]
 AudiogramInput = Literal["channel", "concatenated"]
 Phase = Literal["predicted", "input"]
 
-_MAX_SIZES = {
-    "fft": 1024,
-    "window": 1024,
-    "hop": 1024,
-    "channels": 1024,
-    "dense_depth": 8,
-    "blocks": 64,
-    "expansion": 16,
-    "states": 256,
-    "heads": 64,
-    "stride": 64,
-    "kernel": 127,
-}
+MAX_SIZE = 1024
 """Largest accepted value of each size, which protects from mistakes and from exhausted memory."""
 
 
@@ -40,25 +28,6 @@ class ModelConfig:
     >>> NeuroConfig.from_dict({"channels": 32}).to_dict()["channels"]
     32
     """
-
-    @classmethod
-    def from_optional(cls, config: Self | None) -> Self:
-        """Return the settings that a caller passed, or the default ones if it passed None.
-
-        Args:
-            config: Settings of this class, or None.
-
-        Raises:
-            ValueError: The settings are of another class.
-        """
-        if config is None:
-            return cls()
-        if not isinstance(config, cls):
-            raise ValueError(
-                f"expected config to be a {cls.__name__}, got {type(config).__name__}; build one "
-                f"with {cls.__name__}.from_dict"
-            )
-        return config
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the settings to a dictionary of JSON values."""
@@ -74,12 +43,8 @@ class ModelConfig:
         Raises:
             ValueError: A name is unknown, or a value is not accepted.
         """
-        if not isinstance(data, Mapping):
-            raise ValueError(
-                f"expected network settings as a mapping of names to values, got {describe(data)}"
-            )
         check_names(data, (field.name for field in fields(cls)), "network settings")
-        return cls(**dict(data))
+        return cls(**data)
 
 
 @dataclass(frozen=True)
@@ -133,12 +98,18 @@ class NetworkConfig(ModelConfig):
                     f"expected {name} to be two whole numbers, for time and frequency, "
                     f"got {describe(pair)}"
                 )
+            for size in pair:
+                check_number(name, size, 1, MAX_SIZE, whole=True)
             object.__setattr__(self, name, tuple(pair))
-        for name, highest in _MAX_SIZES.items():
-            lowest = 0 if name == "dense_depth" else 1
+        for name, kind in get_type_hints(type(self)).items():
             value = getattr(self, name)
-            for size in value if isinstance(value, tuple) else (value,):
-                check_number(name, size, lowest, highest, whole=True)
+            if kind is int:
+                lowest = 0 if name == "dense_depth" else 1
+                check_number(name, value, lowest, MAX_SIZE, whole=True)
+            elif kind is bool and not isinstance(value, bool):
+                raise ValueError(f"expected {name} to be true or false, got {describe(value)}")
+            elif get_origin(kind) is Literal:
+                check_choice(name, value, kind)
         if any(length % 2 == 0 for length in self.kernel):
             raise ValueError(f"expected odd lengths of kernel, got {self.kernel}")
         if self.block == "transformer" and self.channels % self.heads:
@@ -153,9 +124,6 @@ class NetworkConfig(ModelConfig):
                 f"expected a hop of at most a quarter of the window, got hop={self.hop}, "
                 f"window={self.window}"
             )
-        for name, kind in get_type_hints(type(self)).items():
-            if get_origin(kind) is Literal:
-                check_choice(name, getattr(self, name), kind)
 
     @property
     def stft(self) -> STFT:
@@ -171,15 +139,6 @@ class NetworkConfig(ModelConfig):
     def step(self) -> int:
         """Samples at 16 kHz from one point of the feature maps to the next."""
         return self.hop * self.stride[0]
-
-    @property
-    def density(self) -> float:
-        """Number of values of the largest tensor in the network per sample of its input.
-
-        It decides how many samples the network processes at a time.
-        """
-        rows = -(-self.stft.frequencies // self.stride[1])
-        return self.channels * self.expansion * rows / self.step
 
     @property
     def receptive_field(self) -> int | None:
@@ -238,19 +197,14 @@ class NeuroConfig(NetworkConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("prior", "level_aware"):
-            value = getattr(self, name)
-            if not isinstance(value, bool):
-                raise ValueError(f"expected {name} to be true or false, got {describe(value)}")
-        supports_bands = self.prior and self.level_aware and self.block == "cnn"
-        if self.structure == "bands" and not supports_bands:
+        supports_bands = self.prior and self.level_aware and self.phase == "predicted"
+        if self.structure == "bands" and not (supports_bands and self.block == "cnn"):
             raise ValueError(
-                "expected prior=True, level_aware=True and block='cnn' with structure='bands', got "
-                f"prior={self.prior}, level_aware={self.level_aware}, block={self.block!r}"
+                "expected structure='bands' with block='cnn', phase='predicted', prior=True and "
+                f"level_aware=True, got {self}"
             )
 
     @property
-    def density(self) -> float:
-        if self.structure == "bands":
-            return 2.0 * self.stft.frequencies / self.hop
-        return super().density
+    def receptive_field(self) -> int | None:
+        # The scale of a normalised network depends on the whole signal.
+        return super().receptive_field if self.level_aware else None

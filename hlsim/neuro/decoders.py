@@ -55,85 +55,26 @@ class Decoder(nn.Module):
         return grid.flatten(4, 5).flatten(2, 3)[..., : size[0], : size[1]]
 
 
-class MaskDecoder(Decoder):
-    """Decoder of a mask, the factor by which a network multiplies the magnitude of a spectrogram.
+def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
+    """Compute the complex factor by which a network multiplies the input's spectrogram.
+
+    The factor is exp(log gain + j shift). The shift of the phase is the angle of 1 + x + j y for
+    two decoded values x and y.
+
+    Shape: (items, 2, time, frequency), (items, time, frequency) -> complex (items, time,
+        frequency).
 
     Args:
-        channels: Number of channels of the feature maps.
-        depth: Number of convolutions before the last layer.
-        stride: Frames and frequencies of the spectrogram per point of the feature maps.
-        normalise: Normalise the output of each convolution per item and channel.
-        recruiting: Add a term in proportion to the recruitment of the ear, as errors of the prior's
-            envelope are: the log mask is a x + b, where a and b are decoded and x is the exponent
-            of recruitment at each frequency. Otherwise it is b.
+        maps: The values x and y at each point of the spectrogram, from a ``Decoder`` with two
+            outputs.
+        log_gain: Natural logarithm of the factor's magnitude.
 
-    >>> decoder = MaskDecoder(8, depth=0, stride=(4, 3), normalise=False, recruiting=True)
-    >>> decoder.log_mask(torch.randn(2, 8, 5, 22), (20, 65), torch.ones(2, 65)).shape
-    torch.Size([2, 20, 65])
+    >>> phase_factor(torch.zeros(1, 2, 20, 65), torch.zeros(1, 20, 65))[0, 0, 0]
+    tensor(1.+0.j)
     """
-
-    def __init__(
-        self, channels: int, depth: int, stride: tuple[int, int], normalise: bool, recruiting: bool
-    ) -> None:
-        super().__init__(channels, depth, stride, 2 if recruiting else 1, normalise)
-        self.recruiting = recruiting
-
-    def log_mask(self, features: Tensor, size: tuple[int, int], exponents: Tensor) -> Tensor:
-        """Decode the natural logarithm of the mask.
-
-        Shape: (items, channels, time / stride[0], frequency / stride[1]), (items, frequency) ->
-            (items, time, frequency).
-
-        Args:
-            features: Feature maps.
-            size: Number of frames and frequencies of the spectrogram.
-            exponents: Exponent of recruitment at each frequency, 0 for an ear without a loss. An
-                ear with exponent x perceives a rise of 1 dB as one of 1 + x dB.
-        """
-        maps = self(features, size).to(exponents.dtype)
-        if not self.recruiting:
-            return maps[:, 0]
-        return maps[:, 0] * exponents.unsqueeze(1) + maps[:, 1]
-
-
-class PhaseDecoder(Decoder):
-    """Decoder of the shift of the phase at each point of a spectrogram.
-
-    The shift is the angle of 1 + x + j y for two decoded values x and y. ``factor`` returns the
-    complex factor by which the spectrogram is multiplied: the gain that it is given, and the shift.
-
-    Args:
-        channels: Number of channels of the feature maps.
-        depth: Number of convolutions before the last layer.
-        stride: Frames and frequencies of the spectrogram per point of the feature maps.
-        normalise: Normalise the output of each convolution per item and channel.
-
-    >>> decoder = PhaseDecoder(8, depth=0, stride=(4, 3), normalise=False)
-    >>> decoder.factor(torch.randn(2, 8, 5, 22), (20, 65), torch.zeros(2, 20, 65)).shape
-    torch.Size([2, 20, 65])
-    """
-
-    def __init__(self, channels: int, depth: int, stride: tuple[int, int], normalise: bool) -> None:
-        super().__init__(channels, depth, stride, 2, normalise)
-
-    def factor(self, features: Tensor, size: tuple[int, int], log_gain: Tensor) -> Tensor:
-        """Compute the complex factor by which the network multiplies the input's spectrogram.
-
-        The factor is exp(log gain + j shift), with the decoded phase shift in radians.
-
-        Shape: (items, channels, time / stride[0], frequency / stride[1]), (items, time, frequency)
-            -> complex (items, time, frequency).
-
-        Args:
-            features: Feature maps.
-            size: Number of frames and frequencies of the spectrogram, to which the decoded values
-                are cut.
-            log_gain: Natural logarithm of the factor's magnitude.
-        """
-        # Autocast may return maps of lower precision than that of the weights.
-        maps = self(features, size).to(self.leave.weight.dtype)
-        factor: Tensor = _PhaseFactor.apply(log_gain, *maps.unbind(1))
-        return factor
+    # Autocast may return maps of lower precision.
+    factor: Tensor = _PhaseFactor.apply(log_gain, *maps.to(log_gain.dtype).unbind(1))
+    return factor
 
 
 class _PhaseFactor(torch.autograd.Function):

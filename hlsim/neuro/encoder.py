@@ -2,7 +2,6 @@
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 
 def log_magnitude(squared: Tensor) -> Tensor:
@@ -73,47 +72,13 @@ class Unit(nn.Sequential):
         normalise: Normalise each item and channel, so that the output does not depend on the level
             of the input.
 
-    >>> Unit(DilatedConv(2, 8, 1), 8, normalise=True)(torch.randn(1, 2, 20, 5)).shape
+    >>> Unit(nn.Conv2d(2, 8, 3, padding=1), 8, normalise=True)(torch.randn(1, 2, 20, 5)).shape
     torch.Size([1, 8, 20, 5])
     """
 
     def __init__(self, conv: nn.Module, channels: int, normalise: bool) -> None:
         norm = [nn.InstanceNorm2d(channels, affine=True)] if normalise else []
         super().__init__(conv, *norm, nn.PReLU(channels))
-
-
-class DilatedConv(nn.Conv2d):
-    """A 3 x 3 convolution that skips frames, so that it covers more time with as many weights.
-
-    The output has as many frames and frequencies as the input.
-
-    Shape: (items, inputs, time, frequency) -> (items, outputs, time, frequency).
-
-    Args:
-        inputs: Number of channels of the input.
-        outputs: Number of channels of the output.
-        dilation: Distance in frames of the three frames that the convolution reads.
-
-    >>> DilatedConv(2, 8, dilation=4)(torch.randn(1, 2, 20, 5)).shape
-    torch.Size([1, 8, 20, 5])
-    """
-
-    def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
-        super().__init__(inputs, outputs, 3, padding=(dilation, 1), dilation=(dilation, 1))
-
-    def forward(self, features: Tensor) -> Tensor:
-        step = self.dilation[0]
-        is_trained = torch.is_grad_enabled() and self.weight.requires_grad
-        if step == 1 or not is_trained or features.device.type != "cpu":
-            return super().forward(features)
-        # On a CPU, the gradient of the weights takes three to six times as long with dilation as
-        # for separate convolutions of every step-th frame.
-        time = features.shape[2]
-        padded = functional.pad(features, (0, 0, 0, -time % step))
-        phases = padded.unflatten(2, (-1, step)).movedim(3, 1)
-        convolved = functional.conv2d(phases.flatten(0, 1), self.weight, self.bias, padding=1)
-        interleaved = convolved.unflatten(0, (-1, step)).movedim(1, 3).flatten(2, 3)
-        return interleaved[:, :, :time]
 
 
 class DenseBlock(nn.Module):
@@ -132,10 +97,12 @@ class DenseBlock(nn.Module):
 
     def __init__(self, channels: int, depth: int, normalise: bool) -> None:
         super().__init__()
-        self.units = nn.ModuleList(
-            Unit(DilatedConv(channels * (i + 1), channels, 2**i), channels, normalise)
-            for i in range(depth)
-        )
+        self.units = nn.ModuleList()
+        for i in range(depth):
+            # padding by the dilation keeps the number of frames
+            dilation = (2**i, 1)
+            conv = nn.Conv2d(channels * (i + 1), channels, 3, padding=dilation, dilation=dilation)
+            self.units.append(Unit(conv, channels, normalise))
 
     def forward(self, features: Tensor) -> Tensor:
         outputs = [features]

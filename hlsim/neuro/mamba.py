@@ -65,7 +65,6 @@ class Mamba(nn.Module):
                 self.D,
                 z=gate.to(dtype).mT,
                 delta_bias=self.dt_proj.bias,
-                delta_softplus=True,
             )
         output: Tensor = self.out_proj(y.mT)
         return output

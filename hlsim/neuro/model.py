@@ -14,7 +14,7 @@ from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.bands import BandCorrection
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
-from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
+from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import (
     AudiogramEncoder,
     DenseEncoder,
@@ -67,7 +67,7 @@ class NeuroMSBG(EarNetwork):
         needs_exact_lengths: Whether silence after the end of a signal changes the output before.
 
     Raises:
-        ValueError: The rate or the level is out of range, or the configuration is of another class.
+        ValueError: The rate or the level is out of range.
 
     >>> simulator = NeuroMSBG(NeuroConfig(channels=8, blocks=1))
     >>> simulator(torch.randn(2, 16000), "N3").shape
@@ -89,11 +89,13 @@ class NeuroMSBG(EarNetwork):
         compute_prior: bool = True,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        self.config = config = NeuroConfig.from_optional(config)
+        self.config = config = config or NeuroConfig()
         self.stft = config.stft
         # Training may run the network in bfloat16, but not the prior and the transforms.
         self.autocast_dtype: torch.dtype | None = None
         self.prior = Prior(self.stft, compute_prior) if config.prior else None
+        if self.prior is not None:
+            self._additional_field = self.prior.receptive_field
         self.bands = BandCorrection(config) if config.structure == "bands" else None
         if self.bands is not None:
             return
@@ -114,25 +116,13 @@ class NeuroMSBG(EarNetwork):
             self.encoder = DenseEncoder(inputs, channels, depth, stride, normalise)
         blocks = (DualPathBlock(config, time_alone=is_monolithic) for _ in range(config.blocks))
         self.blocks = nn.ModuleList(blocks)
-        self.mask_decoder = MaskDecoder(channels, depth, stride, normalise, config.prior)
-        self.phase_decoder = None
-        if config.phase == "predicted":
-            self.phase_decoder = PhaseDecoder(channels, depth, stride, normalise)
+        sizes = channels, depth, stride
+        self.mask_decoder = Decoder(*sizes, 1 + config.prior, normalise)
+        is_predicted = config.phase == "predicted"
+        self.phase_decoder = Decoder(*sizes, 2, normalise) if is_predicted else None
         self.severity = nn.Embedding(len(SEVERITIES), channels) if config.prior else None
         if self.severity is not None:
             nn.init.zeros_(self.severity.weight)
-
-    @property
-    def _receptive_field(self) -> tuple[int, int] | None:
-        if self.config.receptive_field is None or not self.config.level_aware:
-            return None
-        field_of_prior = self.prior.receptive_field if self.prior is not None else 0
-        return self.config.step, self.config.receptive_field + field_of_prior
-
-    @property
-    def _dtype(self) -> torch.dtype:
-        weight = self.mask_decoder.leave.weight if self.bands is None else self.bands.enter
-        return weight.dtype
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         if self.config.level_aware:
@@ -175,8 +165,6 @@ class NeuroMSBG(EarNetwork):
         """
         features = self._features(spectrum, powers, ears, prior_factor)
         size = (spectrum.shape[-2], spectrum.shape[-1])
-        ratios = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz))
-        recruitment_exponents = ratios - 1.0
         device = spectrum.device.type
         autocast_dtype = self.autocast_dtype or torch.bfloat16
         with torch.autocast(device, autocast_dtype, enabled=self.autocast_dtype is not None):
@@ -187,11 +175,16 @@ class NeuroMSBG(EarNetwork):
             for block in self.blocks:
                 hidden = block(hidden)
             hidden = hidden.permute(0, 3, 1, 2)
-            log_mask = self.mask_decoder.log_mask(hidden, size, recruitment_exponents)
+            maps = self.mask_decoder(hidden, size).to(ears.dtype)
+            log_mask = maps[:, -1]
+            if self.prior is not None:
+                # Errors of the prior's envelope are in proportion to the recruitment of the ear.
+                ratios = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz))
+                log_mask = maps[:, 0] * (ratios - 1.0).unsqueeze(1) + log_mask
             log_mask = log_mask.clamp(MIN_LOG_MASK, MAX_LOG_MASK)
             if self.phase_decoder is None:
                 return log_mask.exp()
-            return self.phase_decoder.factor(hidden, size, log_mask)
+            return phase_factor(self.phase_decoder(hidden, size), log_mask)
 
     def _features(
         self, spectrum: Tensor, powers: Tensor, ears: Tensor, prior_factor: Tensor | None

@@ -2,16 +2,14 @@
 
 Each channel of a signal has several *states*, which remember its past: h[t] = decay[t] h[t - 1] +
 drive[t], where drive is the weighted input. In the order of Mamba's names: decay[t] = exp(delta[t]
-A) and drive[t] = delta[t] B[t] u[t]. Items and channels are divided into *blocks*, whose states are
-computed one block after the other, so that they fit into the cache of the CPU.
+A) and drive[t] = delta[t] B[t] u[t].
 
 Source: Gu and Dao (2023), arXiv:2312.00752.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
@@ -20,14 +18,11 @@ from torch import Tensor
 from torch.linalg import vecdot
 from torch.nn import functional
 
-_STATES_PER_BLOCK_CPU = 2**18
+_STATES_AT_ONCE_CPU = 2**18
 """Number of states computed at once on a CPU, few enough for the cache of a core."""
 
-_STATES_PER_BLOCK_GPU = 2**27
+_STATES_AT_ONCE_GPU = 2**26
 """Number of states computed at once on a GPU, enough to keep it busy."""
-
-_MIN_CHANNELS_PER_BLOCK = 8
-"""Smallest number of channels computed at once. Shorter rows cost more than the cache saves."""
 
 
 def selective_scan(
@@ -36,120 +31,88 @@ def selective_scan(
     A: Tensor,
     B: Tensor,
     C: Tensor,
-    D: Tensor | None = None,
-    z: Tensor | None = None,
-    delta_bias: Tensor | None = None,
-    delta_softplus: bool = False,
+    D: Tensor,
+    z: Tensor,
+    delta_bias: Tensor,
 ) -> Tensor:
     """Filter each channel with a recursive filter whose coefficients change over time.
 
-    This is the core of the Mamba layer. Each channel has states h[t] = exp(delta[t] A) h[t - 1] +
-    delta[t] B[t] u[t] with h[-1] = 0, and the result is (C[t] h[t] + D u[t]) silu(z[t]).
+    This is the core of the Mamba layer. Each channel has states h[t] = exp(s[t] A) h[t - 1] +
+    s[t] B[t] u[t] with h[-1] = 0 and the step size s[t] = softplus(delta[t] + delta_bias). The
+    result is (C[t] h[t] + D u[t]) silu(z[t]).
 
-    The function has the signature of that of ``mamba_ssm``, and calls it for tensors on a GPU where
-    it is installed. Otherwise, the recurrence is computed in about log2(time) steps, each of which
-    is parallel over time. The gradient computes the states again, so that they are not stored.
-    There is no second derivative.
+    The function calls that of ``mamba_ssm``, which has the same names of arguments, for tensors on
+    a GPU where it is installed. Otherwise, the recurrence is computed in about log2(time) steps,
+    each of which is parallel over time. The gradient computes the states again, so that they are
+    not stored. There is no second derivative.
 
     Shape: (items, channels, time) -> (items, channels, time).
 
     Args:
         u: Input. Shape: (items, channels, time).
-        delta: Step sizes. Shape: (items, channels, time).
+        delta: Step sizes before bias and softplus. Shape: (items, channels, time).
         A: Rates, negative so that the states are bounded. Shape: (channels, states).
         B: Weights of the input in the states. Shape: (items, states, time).
         C: Weights of the states in the result. Shape: (items, states, time).
-        D: Weight of the input in the result, 0 by default. Shape: (channels,).
-        z: Gate of the result, no gate by default. Shape: (items, channels, time).
-        delta_bias: Value added to the step sizes, 0 by default. Shape: (channels,).
-        delta_softplus: Apply softplus to the step sizes and their bias.
+        D: Weight of the input in the result. Shape: (channels,).
+        z: Gate of the result. Shape: (items, channels, time).
+        delta_bias: Value added to the step sizes. Shape: (channels,).
 
     Raises:
         RuntimeError: A second derivative is computed.
 
     >>> u = torch.ones(1, 1, 3)
-    >>> selective_scan(u, delta=u, A=torch.zeros(1, 1), B=u, C=u)  # a cumulative sum
-    tensor([[[1., 2., 3.]]])
+    >>> A, D, bias = torch.zeros(1, 1), torch.zeros(1), torch.zeros(1)
+    >>> step_of_1 = 0.5413 * u  # before softplus
+    >>> y = selective_scan(u, step_of_1, A, B=u, C=u, D=D, z=10.0 * u, delta_bias=bias)
+    >>> y.round()  # ten times a cumulative sum
+    tensor([[[10., 20., 30.]]])
     """
     kernel = _kernel_for(u)
     if kernel is not None:
         output: Tensor = kernel(
-            u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus
+            u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=True
         )
         return output
-    # Products of many decays need at least the precision of float32.
-    input_dtype = u.dtype
-    dtype = torch.promote_types(input_dtype, torch.float32)
-    u, delta, A, B, C = (tensor.to(dtype) for tensor in (u, delta, A, B, C))
-    if delta_bias is not None:
-        delta = delta + delta_bias.unsqueeze(-1)
-    if delta_softplus:
-        delta = functional.softplus(delta)
-    y = _SelectiveScan.apply(delta.mT, u.mT, B.mT, C.mT, A.mT.contiguous()).mT
-    if D is not None:
-        y = torch.addcmul(y, u, D.to(dtype).unsqueeze(-1))
-    if z is not None:
-        y = y * functional.silu(z)
-    return y.to(input_dtype)
+    steps = functional.softplus(delta + delta_bias.unsqueeze(-1))
+    y = _SelectiveScan.apply(steps.mT, u.mT, B.mT, C.mT, A.mT.contiguous()).mT
+    return torch.addcmul(y, u, D.unsqueeze(-1)) * functional.silu(z)
 
 
-def _recur_forward(decay: Tensor, states: Tensor, scratch: Tensor) -> None:
-    """Compute h[t] = decay[t] h[t - 1] + drive[t] with h[-1] = 0.
+def _recur(decay: Tensor, states: Tensor) -> None:
+    """Compute h[t] = decay[t - 1] h[t - 1] + drive[t] with h[-1] = 0.
 
     Neighbouring times are joined in pairs. The recurrence of the pairs has half the length and the
     same form, and the times between them follow from it. This takes about three operations per time
     in log2(time) steps. Nothing overflows, because decays are multiplied and never divided.
 
-    Shape: (items, time, ...) for all tensors.
-
     Args:
-        decay: Decays, which are at most 1.
-        states: Drive, which the states replace.
-        scratch: Memory for products of decays.
+        decay: Decays, which are at most 1, from each time to the next. Shape: (items, time - 1,
+            ...).
+        states: Drive, which the states replace. Shape: (items, time, ...).
     """
-    time = states.shape[1]
-    half = time // 2
+    half = states.shape[1] // 2
     if half == 0:
         return
-    # The second time of each pair
-    second_states = states[:, 1::2]
-    second_decay = decay[:, 1::2]
-    first_states = states[:, : time - 1 : 2]
-    second_states.addcmul_(second_decay, first_states)
-    if half > 1:
-        pair_decay = scratch[:, :half]
-        first_decay = decay[:, : time - 1 : 2]
-        torch.mul(second_decay, first_decay, out=pair_decay)
-        _recur_forward(pair_decay, second_states, scratch[:, half:])
-    if time > 2:
-        states_before = second_states[:, : (time - 1) // 2]
-        states[:, 2::2].addcmul_(decay[:, 2::2], states_before)
+    first, second = states[:, ::2], states[:, 1::2]
+    into_second, into_first = decay[:, ::2], decay[:, 1::2]
+    second.addcmul_(into_second, first[:, :half])
+    _recur(into_second[:, 1:] * into_first[:, : half - 1], second)
+    first[:, 1:].addcmul_(into_first, second[:, : into_first.shape[1]])
 
 
-def _recur_backward(decay: Tensor, states: Tensor, scratch: Tensor) -> None:
-    """Compute h[t] = decay[t] h[t + 1] + drive[t] with h[time] = 0.
+def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the states of some items.
 
-    This is ``_recur_forward`` backwards in time, with pairs counted from the end.
-
-    Shape: (items, time - 1, ...) for ``decay``, (items, time, ...) for the others.
+    Returns:
+        Decays from each time to the next, (items, time - 1, states, channels); drives before their
+        weights, (items, time, 1, channels); and states, (items, time, states, channels).
     """
-    time = states.shape[1]
-    half = time // 2
-    if half == 0:
-        return
-    start = time % 2
-    first_states = states[:, start::2]
-    first_decay = decay[:, start::2]
-    second_states = states[:, start + 1 :: 2]
-    first_states.addcmul_(first_decay, second_states)
-    if half > 1:
-        pair_decay = scratch[:, : half - 1]
-        second_decay = decay[:, start + 1 :: 2]
-        torch.mul(first_decay[:, :-1], second_decay, out=pair_decay)
-        _recur_backward(pair_decay, first_states, scratch[:, half:])
-    if time > 2:
-        states_after = first_states[:, 1 - start :]
-        states[:, 1 - start : -1 : 2].addcmul_(decay[:, 1 - start :: 2], states_after)
+    decay = (delta[:, 1:].unsqueeze(-2) * A).exp_()
+    drive = (delta * u).unsqueeze(-2)
+    states = drive * B.unsqueeze(-1)
+    _recur(decay, states)
+    return decay, drive, states
 
 
 class _SelectiveScan(torch.autograd.Function):
@@ -161,20 +124,11 @@ class _SelectiveScan(torch.autograd.Function):
 
     @staticmethod
     def forward(delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
-        y = u.new_empty(u.shape)
-        with torch.autocast(u.device.type, enabled=False):
-            for items, channels, (decay, states, scratch) in _blocks(u, A, tensors=3):
-                block_delta = delta[items, :, channels].contiguous()
-                block_u = u[items, :, channels].contiguous()
-                block_B = B[items].contiguous()
-                block_C = C[items].contiguous()
-                torch.mul(block_delta.unsqueeze(-2), A[:, channels], out=decay).exp_()
-                drive = (block_delta * block_u).unsqueeze(-2)
-                torch.mul(drive, block_B.unsqueeze(-1), out=states)
-                _recur_forward(decay, states, scratch)
-                block_y = block_C.unsqueeze(-2) @ states
-                y[items, :, channels] = block_y.squeeze(-2)
-        return y
+        outputs = []
+        for part_delta, part_u, part_B, part_C in _parts(A, delta, u, B, C):
+            _, _, states = _states(part_delta, part_u, part_B, A)
+            outputs.append((part_C.unsqueeze(-2) @ states).squeeze(-2))
+        return torch.cat(outputs)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -197,45 +151,31 @@ class _ScanGradient(torch.autograd.Function):
     def forward(
         gradient: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
     ) -> tuple[Tensor, ...]:
-        grad_delta = u.new_empty(u.shape)
-        grad_u = u.new_empty(u.shape)
         grad_A = torch.zeros_like(A)
-        grad_B = torch.zeros_like(B)
-        grad_C = torch.zeros_like(C)
+        gradients = []
         # The backward pass may run in a region of autocast.
         with torch.autocast(u.device.type, enabled=False):
-            for items, channels, memory in _blocks(u, A, tensors=4):
-                decay, states, scratch, grad_states = memory
-                block_delta = delta[items, :, channels].contiguous()
-                block_u = u[items, :, channels].contiguous()
-                block_gradient = gradient[items, :, channels].contiguous()
-                block_B = B[items].contiguous()
-                block_C = C[items].contiguous()
-                block_A = A[:, channels]
-                torch.mul(block_delta.unsqueeze(-2), block_A, out=decay).exp_()
-                drive = (block_delta * block_u).unsqueeze(-2)
-                torch.mul(drive, block_B.unsqueeze(-1), out=states)
-                _recur_forward(decay, states, scratch)
+            for part in _parts(A, gradient, delta, u, B, C):
+                part_gradient, part_delta, part_u, part_B, part_C = part
+                decay, drive, states = _states(part_delta, part_u, part_B, A)
                 # matmul takes three times as long as vecdot.
-                grad_C[items] += vecdot(states, block_gradient.unsqueeze(-2))
+                grad_C = vecdot(states, part_gradient.unsqueeze(-2))
                 # The gradient with respect to the states follows the same recurrence backwards in
-                # time, with the decay of the following time.
-                torch.mul(block_C.unsqueeze(-1), block_gradient.unsqueeze(-2), out=grad_states)
-                _recur_backward(decay[:, 1:], grad_states, scratch)
-                grad_drive = (block_B.unsqueeze(-2) @ grad_states).squeeze(-2)
-                grad_u[items, :, channels] = grad_drive * block_delta
-                grad_B[items] += vecdot(grad_states, drive)
+                # time.
+                reverse = part_C.flip(1).unsqueeze(-1) * part_gradient.flip(1).unsqueeze(-2)
+                _recur(decay.flip(1), reverse)
+                grad_states = reverse.flip(1)
+                grad_drive = (part_B.unsqueeze(-2) @ grad_states).squeeze(-2)
+                grad_B = vecdot(grad_states, drive)
 
-                # The gradient with respect to the exponent delta[t] A replaces the states.
-                grad_exponent = states[:, :-1].mul_(decay[:, 1:]).mul_(grad_states[:, 1:])
-                product = torch.mul(grad_exponent, block_A, out=scratch[:, 1:])
-                block_grad_delta = grad_drive.mul_(block_u)
-                block_grad_delta[:, 1:] += product.sum(-2)
-                grad_delta[items, :, channels] = block_grad_delta
-                grad_exponent.mul_(block_delta[:, 1:].unsqueeze(-2))
+                # The gradient with respect to the exponent delta[t] A
+                grad_exponent = states[:, :-1] * decay * grad_states[:, 1:]
+                grad_delta = grad_drive * part_u
+                grad_delta[:, 1:] += (grad_exponent * A).sum(-2)
                 # One sum over both dimensions of a slice takes 20 times as long as two sums.
-                grad_A[:, channels] += grad_exponent.sum(1).sum(0)
-        return grad_delta, grad_u, grad_B, grad_C, grad_A
+                grad_A += (grad_exponent * part_delta[:, 1:].unsqueeze(-2)).sum(1).sum(0)
+                gradients.append((grad_delta, grad_drive * part_delta, grad_B, grad_C))
+        return *(torch.cat(parts) for parts in zip(*gradients, strict=True)), grad_A
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
@@ -248,32 +188,12 @@ class _ScanGradient(torch.autograd.Function):
         )
 
 
-def _blocks(u: Tensor, A: Tensor, tensors: int) -> Iterator[tuple[slice, slice, list[Tensor]]]:
-    """Divide items and channels into blocks, either of all channels or of one item.
-
-    Yields:
-        Items of the block, its channels, and a number of tensors for values of all its states,
-        (items, time, states, channels) each, in memory that all blocks share.
-    """
-    items, time, channels = u.shape
-    states = len(A)
-    states_per_block = _STATES_PER_BLOCK_GPU if u.is_cuda else _STATES_PER_BLOCK_CPU
-    rows = max(_MIN_CHANNELS_PER_BLOCK, states_per_block // max(1, time * states))
-    # Blocks of one item have about the same number of channels each.
-    channels_per_block = math.ceil(channels / math.ceil(channels / rows))
-    items_per_block = max(1, min(items, rows // channels))
-    values = items_per_block * time * states * channels_per_block
-    memory = [u.new_empty(values) for _ in range(tensors)]
-    for item in range(0, items, items_per_block):
-        for channel in range(0, channels, channels_per_block):
-            block_items = min(items_per_block, items - item)
-            block_channels = min(channels_per_block, channels - channel)
-            shape = (block_items, time, states, block_channels)
-            yield (
-                slice(item, item + block_items),
-                slice(channel, channel + block_channels),
-                [part[: math.prod(shape)].view(shape) for part in memory],
-            )
+def _parts(A: Tensor, *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """Divide tensors into parts of a few items, whose states fit into the cache of a CPU."""
+    at_once = _STATES_AT_ONCE_GPU if A.is_cuda else _STATES_AT_ONCE_CPU
+    states_per_item = tensors[0].shape[1] * A.numel()
+    items = max(1, at_once // states_per_item)
+    return zip(*(tensor.split(items) for tensor in tensors), strict=True)
 
 
 def _kernel_for(u: Tensor) -> Callable[..., Any] | None:

@@ -11,7 +11,6 @@ from torch import Tensor
 from compensators import (
     NALR,
     WDRC,
-    HearingAid,
     HearingAidConfig,
     MappingCompensator,
     MappingConfig,
@@ -21,7 +20,6 @@ from compensators import (
 from compensators.limiter import soft_limit
 from hlsim import Audiogram
 from hlsim.calibration import set_level
-from hlsim.neuro import NeuroConfig
 from tests.compensators.aids import (
     EAR,
     SMALL,
@@ -140,8 +138,6 @@ BAD_SETTINGS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     (MappingConfig, {"fft": 400, "window": 400, "hop": 200}),
     (MappingConfig, {"phase": "minimum"}),
     (MappingConfig.from_dict, {"data": {"layers": 3}}),
-    *((MappingCompensator, {"config": config}) for config in (5, {}, MappingConfig, NeuroConfig())),
-    (HearingAid, {"config": MappingConfig()}),
 ]
 
 

@@ -1,6 +1,5 @@
 """The network on bands corrects MSBG's known gains, and equals the prior before training."""
 
-import pytest
 import torch
 
 from hlsim import Audiogram
@@ -12,15 +11,12 @@ EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("NH", "N1"
 SIZES = {"fft": 128, "window": 96, "hop": 24, "channels": 8, "blocks": 1, "kernel": (3, 1)}
 
 
-def light(step: int, **settings: object) -> NeuroMSBG:
-    torch.manual_seed(0)
-    changed = {"structure": "bands", "stride": (step, 1), **settings}
-    return NeuroMSBG(NeuroConfig.from_dict(SIZES | changed))
+def light(step: int) -> NeuroMSBG:
+    return NeuroMSBG(NeuroConfig.from_dict(SIZES | {"structure": "bands", "stride": (step, 1)}))
 
 
-@pytest.mark.parametrize("phase", ["predicted", "input"])
-def test_before_training_the_network_equals_the_prior(phase: str) -> None:
-    model = light(1, phase=phase)
+def test_before_training_the_network_equals_the_prior() -> None:
+    model = light(1)
     waveform = 0.05 * torch.randn(4, 4000)
     prior = model.prior
     assert prior is not None
@@ -39,9 +35,8 @@ def test_steps_of_two_frames_change_the_output_little() -> None:
 
 def test_gradients_are_exact() -> None:
     model = light(2).double()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.01 * torch.randn_like(parameter))
+    for parameter in model.parameters():
+        parameter.data.add_(0.01 * torch.randn_like(parameter))
     waveform = (0.05 * torch.randn(2, 200, dtype=torch.float64)).requires_grad_()
 
     def simulate(signals: torch.Tensor) -> torch.Tensor:
