@@ -8,15 +8,10 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import fields
-from importlib import import_module
 
-from hlsim.cli.main import COMMANDS, GROUPS
-from hlsim.cli.options import Parser
+from hlsim.cli.main import COMMANDS, make_parser
 from hlsim.cli.recipes import format_default
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
-
-COLUMN_TITLES = {"positional arguments": "argument", "required options": "required option"}
-"""Titles of tables by argparse's titles of groups."""
 
 _GENERATED = re.compile(r"<!-- generated: (.+) -->")
 _API = re.compile(r"<!-- api: (\S+)(?: (\{.*\}))? -->")
@@ -36,21 +31,18 @@ def _api_directive(match: re.Match[str]) -> str:
 
 def describe_commands() -> str:
     """Return a section for each command, with its options."""
-    names = [name for group in GROUPS.values() for name in group]
-    return "\n\n".join(_describe_command(name) for name in names)
+    return "\n\n".join(map(_describe_command, COMMANDS))
 
 
 def _describe_command(name: str) -> str:
-    module, description = COMMANDS[name]
-    parser = Parser(prog=f"hlsim {name}", description=description)
-    getattr(import_module(f"hlsim.cli.{module}"), name.replace("-", "_"))(parser)
+    parser, description = make_parser(name), COMMANDS[name][1]
     text = f"{description[0].upper()}{description[1:]}."
     parts = [f"## hlsim {name}", text]
     for group in parser._action_groups:
         actions = [action for action in group._group_actions if action.dest != "help"]
         rows = [_describe_option(action) for action in actions if not _is_setting(action)]
         if rows:
-            kind = COLUMN_TITLES.get(group.title or "", "option")
+            kind = "argument" if group.title == "positional arguments" else "option"
             parts.append("\n".join([f"| {kind} | meaning |", "|---|---|", *rows]))
     if any(_is_setting(action) for action in parser._actions):
         parts.append(
@@ -64,16 +56,16 @@ def _describe_command(name: str) -> str:
 
 def _is_setting(action: argparse.Action) -> bool:
     """Return whether an option is a field of a recipe, which has a page of its own."""
-    return action.dest.startswith("recipe.")
+    return action.dest == "settings"
 
 
 def _describe_option(action: argparse.Action) -> str:
     """Return the row of an option or argument."""
-    name = ", ".join(action.option_strings) or action.dest.upper()
-    value = action.metavar or ""
+    name = ", ".join(action.option_strings)
+    value = action.metavar or ("" if action.nargs == 0 else action.dest.upper())
     if action.choices:
         value = "{" + ",".join(map(str, action.choices)) + "}"
-    label = f"{name} {value}".strip() if action.option_strings else str(value or name)
+    label = f"{name} {value}".strip() if action.option_strings else action.dest
     text = (action.help or "").replace("%%", "%").replace("|", "\\|").replace("<", "&lt;")
     return f"| `{label}` | {text} |"
 
@@ -92,9 +84,8 @@ def _describe_recipe(command: str, recipe: type[TrainingRecipe]) -> str:
             descriptions[name] = " ".join(text.split()).replace("``", "`")
     rows = ["| field | default | meaning |", "|---|---|---|"]
     for setting in fields(recipe):
-        default = format_default(setting).removeprefix(" (default: ").removesuffix(")")
-        shown = f"`{default}`" if default else ""
-        rows.append(f"| `{setting.name}` | {shown} | {descriptions[setting.name]} |")
+        default = format_default(setting)
+        rows.append(f"| `{setting.name}` | `{default}` | {descriptions[setting.name]} |")
     return f"## hlsim {command}\n\n" + "\n".join(rows)
 
 

@@ -26,7 +26,7 @@ train() { # row: recipe[:setting=value[...]]
     IFS=: read -ra parts <<<"$1${STEPS:+:steps=$STEPS}"
     settings=("${parts[@]:1}")
     hlsim train-simulator --recipe "$here/${parts[0]}.yaml" "${settings[@]/#/--recipe.}" \
-        --quiet --out "$out/$(folder "$1")" \
+        --out "$out/$(folder "$1")" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \
         --noise "$corpora/noise/train" --valid-noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/train.csv" --valid-audiograms "$corpora/audiograms/valid.csv"

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import patch
 
 import soundfile
 
@@ -34,13 +35,17 @@ def write_ears(path: Path, *names: str) -> Path:
     return write_table(path, rows)
 
 
-def write_short_speech(folder: Path, speech_dir: Path) -> Path:
-    """Write a second of each of the 24 bundled utterances."""
-    folder.mkdir()
-    for path in sorted(speech_dir.rglob("*.flac")):
+def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
+    """Run the demo for an N4 ear, with a second of each of the 24 bundled utterances."""
+    from hlsim.cli.demo_study import run_demo
+
+    for path in speech_dir.rglob("*.flac"):
         samples, rate = soundfile.read(path)
-        soundfile.write(folder / path.name, samples[rate // 2 : rate // 2 + rate], rate)
-    return folder
+        target = folder / path.relative_to(speech_dir)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(target, samples[rate // 2 : rate // 2 + rate], rate)
+    with patch("hlsim.cli.demo_study.SPEECH", folder):
+        return run_demo(folder / "out", Audiogram.standard("N4"), steps=steps, jobs=1)
 
 
 def load_example(name: str) -> ModuleType:

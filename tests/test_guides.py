@@ -40,10 +40,10 @@ NOT_RUN = {
 """Texts in commands and programs that are not run, with the reason."""
 
 SHORTER = {
-    "hlsim train-": "--recipe.steps 2 --recipe.batch 2 --recipe.validation_items 2 --quiet",
-    "hlsim evaluate-": "--items 2 --seconds 1 --listen 1 --jobs 1",
-    "hlsim haspi-report": "--listen 1 --jobs 1",
-    "hlsim clarity": "--listen 1 --jobs 1",
+    "hlsim train-": "--recipe.steps 2 --recipe.batch 2 --recipe.validation_items 2",
+    "hlsim evaluate-": "--items 2 --seconds 1 --jobs 1",
+    "hlsim haspi-report": "--jobs 1",
+    "hlsim clarity": "--jobs 1",
     "examples.training.dead_region_aid": "S2 2",
 }
 """Options that are added to the commands that contain a text."""

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 # From the top. A room is a module or a package of hlsim, or the package compensators.
 FLOORS = {
     "public names": "hlsim",
-    "interface": "__main__ cli demo live shortcuts",
+    "interface": "__main__ cli shortcuts",
     "lab": "training evaluation report",
     "goals": "losses metrics",
     "models": "compensators neuro msbg export",

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hlsim.calibration import level_spl
-from hlsim.cli.main import make_parser
+from hlsim.cli.main import parse_arguments
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -65,7 +65,7 @@ def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("page", [page for page in PAGES if _commands(page)], ids=_named)
 def test_commands_parse(page: Path) -> None:
     for command in _commands(page):
-        make_parser().parse_args(shlex.split(command, comments=True))
+        parse_arguments(shlex.split(command, comments=True))
 
 
 def test_demo_and_tests_are_one_line_each() -> None:

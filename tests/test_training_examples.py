@@ -143,7 +143,7 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
         assert main([*command.split(), *map(str, options)]) == 0
 
     run(
-        "train-simulator --device cpu --quiet",
+        "train-simulator --device cpu",
         *teacher,
         "--recipe",
         recipe,

@@ -11,20 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import check_extras, read_ears, warn_of_other_ears
-from hlsim.cli.options import (
-    EARS_TABLE,
-    Parser,
-    count,
-    count_or_zero,
-    ears_table,
-    input_file,
-    input_folder,
-    integer,
-    number,
-    output_folder,
-    plugin_name,
-    positive_number,
-)
+from hlsim.cli.options import EARS_TABLE, Parser, count, input_path, positive_number
 from hlsim.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -43,15 +30,14 @@ def evaluate_simulator(parser: Parser) -> None:
         "mine=runs/simulator/checkpoint --speech speech/valid --audiograms standard --out judged",
     )
     option = parser.option
-    text = f"msbg (exact), or checkpoints {_CHECKPOINTS}"
-    option("names", str, text, nargs="+", metavar="NAME")
-    option("--audiograms", ears_table, EARS_TABLE, required=True)
-    parser.teacher("simulator to compare with", "msbg")
+    option("names", str, f"msbg (exact), or checkpoints {_CHECKPOINTS}", nargs="+")
+    option("--audiograms", str, EARS_TABLE, required=True)
+    parser.teacher("simulator to compare with")
     _declare_items(parser, "items", 240, [50, 60, 65, 70, 80])
     text = "input of the simulators: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
-    option("--inputs", str, text, ["as-is"], nargs="+", metavar="INPUT")
+    option("--inputs", str, text, ["as-is"], nargs="+")
     option("--compensator", str, "compensator of the input compensated, by name or folder")
-    _declare_study(parser, listen=1)
+    _declare_study(parser)
 
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
@@ -60,7 +46,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
             "--compensator has no effect without --inputs compensated; add that input, or leave "
             "--compensator out"
         )
-    _check_installed(options)
+    check_extras("eval")
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
     from hlsim.evaluation.simulators import evaluate_simulators
@@ -76,7 +62,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     if options.compensator:
         arguments["compensator"] = load_compensator(options.compensator)
     evaluation = evaluate_simulators(simulators, **arguments)
-    _finish(evaluation, simulators_page(evaluation, options.listen), options)
+    _finish(evaluation, simulators_page(evaluation), options)
 
 
 def evaluate_compensator(parser: Parser) -> None:
@@ -87,20 +73,20 @@ def evaluate_compensator(parser: Parser) -> None:
         "mine=runs/n3/checkpoint --audiogram N3 --speech speech/valid --items 40 --out judged",
     )
     option = parser.option
-    option("names", str, f"compensators, {_CHECKPOINTS}", nargs="+", metavar="NAME")
+    option("names", str, f"compensators, {_CHECKPOINTS}", nargs="+")
     text = f"{EARS_TABLE}; used in addition to Bisgaard's ears N2 to N6 and S1 to S3"
-    option("--audiograms", ears_table, text)
+    option("--audiograms", str, text)
     parser.audiogram(text="; single ear for everything, for a compensator trained for it")
     _declare_items(parser, "clean speech", 400, [50, 65, 80])
     parser.enhancers("time-aligned waveforms with shape (..., time) in pascals")
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
     text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
-    option("--gain-ears", str.upper, text, ["N3", "S2"], nargs="+", metavar="EAR")
+    option("--gain-ears", str.upper, text, ["N3", "S2"], nargs="+")
     _declare_study(parser)
 
 
 def _evaluate_compensator(options: argparse.Namespace) -> None:
-    _check_installed(options)
+    check_extras("eval")
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
     from hlsim.report.compensators import compensators_page
@@ -110,7 +96,7 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     notes = warn_of_other_ears(checkpoints, arguments["audiogram"])
     compensators = {label: load_compensator(name) for label, name in checkpoints.items()}
     evaluation = replace(evaluate_compensators(compensators, **arguments), notes=notes)
-    _finish(evaluation, compensators_page(evaluation, options.listen), options)
+    _finish(evaluation, compensators_page(evaluation), options)
 
 
 def haspi_report(parser: Parser) -> None:
@@ -122,22 +108,22 @@ def haspi_report(parser: Parser) -> None:
     )
     option = parser.option
     text = "folder of clean speech; all folders have files with the same names"
-    option("--clean", input_folder, text)
+    option("--clean", input_path, text)
     text = "folder of speech before the treatment; without it, nothing is compared"
-    option("--before", input_folder, text)
-    option("--after", input_folder, "folder of speech after the treatment")
+    option("--before", input_path, text)
+    option("--after", input_path, "folder of speech after the treatment")
     text = (
         "CSV file instead of the folders, with columns condition, clean, processed and, if they "
         "are known, listener, ear, item, snr, and hl_250, ... or audiogram"
     )
-    option("--manifest", input_file, text)
+    option("--manifest", input_path, text)
     text = "folder to which the manifest's paths are relative; by default the manifest's folder"
-    option("--root", input_folder, text)
+    option("--root", input_path, text)
     parser.audiogram(text="; the ear of all files, or of rows of the manifest without an ear")
     text = "; also with a column file (for folders) or columns listener and ear (for a manifest)"
-    option("--audiograms", ears_table, EARS_TABLE + text)
+    option("--audiograms", str, EARS_TABLE + text)
     text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
-    option("--measures", _split_names, text, ["haspi"], metavar="NAMES")
+    option("--measures", lambda names: names.split(","), text, ["haspi"])
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     parser.flag("--better-ear", "use the better ear's scores; needs a manifest with both ears")
     parser.levels("every clean file")
@@ -145,12 +131,12 @@ def haspi_report(parser: Parser) -> None:
 
 
 def _haspi_report(options: argparse.Namespace) -> None:
-    _check_installed(options)
+    check_extras("eval")
     from hlsim.evaluation.recordings import haspi_report
     from hlsim.report.recordings import report_page
 
     evaluation = haspi_report(**_arguments(options, haspi_report))
-    _finish(evaluation, report_page(evaluation, options.listen), options)
+    _finish(evaluation, report_page(evaluation), options)
 
 
 def clarity(parser: Parser) -> None:
@@ -165,39 +151,34 @@ def clarity(parser: Parser) -> None:
         "folder with SCENE_mix_CH1.wav, SCENE_target_anechoic_CH1.wav (or SCENE_reference.wav) and "
         "SCENE_target_CH1.wav"
     )
-    option("scenes", input_folder, text, metavar="SCENES")
+    option("scenes", input_path, text)
     text = (
         f"compensators {_CHECKPOINTS}; or aids of your own as package.module:name or "
         "path/to/file.py:name, a callable (waveform, listener, sample_rate) -> waveform or its "
         "class, for (2, time) at the files' scale"
     )
-    option("names", str, text, nargs="+", metavar="NAME")
+    option("names", str, text, nargs="+")
     text = "Clarity's listeners.json, or a CSV file with the columns listener, ear, hl_250, ..."
-    option("--listeners", input_file, text, required=True)
+    option("--listeners", input_path, text, required=True)
     text = "JSON file with each scene's listeners; by default every listener in every scene"
-    option("--scenes-listeners", input_file, text)
+    option("--scenes-listeners", input_path, text)
     text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1, dest="stride")
     parser.enhancers("waveforms with shape (2, time) in pascals")
     parser.linked("")
-    option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 100.0)
+    option("--full-scale-spl", float, "level in dB SPL of a file whose RMS is 1.0", 100.0)
     _declare_study(parser)
 
 
 def _clarity(options: argparse.Namespace) -> None:
-    _check_installed(options)
+    check_extras("eval")
     from hlsim.evaluation.clarity import evaluate_scenes
     from hlsim.report.clarity import scenes_page, write_scores
 
     arguments = _arguments(options, evaluate_scenes)
     evaluation = evaluate_scenes(_read_labels(options.names), **arguments)
     write_scores(evaluation, options.out)
-    _finish(evaluation, scenes_page(evaluation, options.listen), options)
-
-
-def _split_names(text: str) -> list[str]:
-    """Split names that are separated by commas."""
-    return [name.strip() for name in text.split(",")]
+    _finish(evaluation, scenes_page(evaluation), options)
 
 
 def _read_labels(texts: Sequence[str]) -> dict[str, str]:
@@ -208,15 +189,13 @@ def _read_labels(texts: Sequence[str]) -> dict[str, str]:
     """
     labels: dict[str, str] = {}
     for text in texts:
-        label, sign, name = text.partition("=")
-        if Path(text).exists() or not (sign and label):
-            label, name = text, text
+        label, _, name = text.partition("=")
         if label in labels:
             raise ValueError(
-                f"{labels[label]} and {name} have the same label, {label}; write one of them as "
-                "LABEL=NAME with another label"
+                f"two of the names have the same label, {label}; write one of them as LABEL=NAME "
+                "with another label"
             )
-        labels[label] = name
+        labels[label] = name or label
     return labels
 
 
@@ -231,34 +210,26 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
     """
     option = parser.option
     text = "folder of clean speech, of speakers that were not used in training"
-    option("--speech", input_folder, text, required=True)
+    option("--speech", input_path, text, required=True)
     text = "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB"
-    option("--noise", input_folder, text)
-    option("--levels", number, f"levels of the {levelled} in dB SPL, in turn", levels, nargs="+")
+    option("--noise", input_path, text)
+    option("--levels", float, f"levels of the {levelled} in dB SPL, in turn", levels, nargs="+")
     option("--items", count, "number of items", items)
     option("--seconds", positive_number, "length of an item in seconds", 3.0)
 
 
-def _declare_study(parser: Parser, listen: int = 3) -> None:
-    """Declare the options that all evaluations share.
-
-    Args:
-        parser: Parser of the command.
-        listen: Default number of items with players on the page.
-    """
+def _declare_study(parser: Parser) -> None:
+    """Declare the options that all evaluations share."""
     text = (
         "additional measure of your own, package.module:name or path/to/file.py:name: a "
         "function (item, output) -> dict of numbers"
     )
-    settings = {"nargs": "+", "metavar": "NAME", "dest": "own_measures"}
-    parser.option("--measure", plugin_name, text, [], **settings)
-    parser.option("--listen", count_or_zero, "number of items with players on the page", listen)
-    parser.flag("--print", "print all tables of the page instead of the first")
-    parser.option("--jobs", count, "number of processes; all cores by default")
+    parser.option("--measure", str, text, [], nargs="+", dest="own_measures")
+    parser.option("--jobs", int, "number of processes; all cores by default")
     text = "address of a Dask scheduler, such as tcp://host:8786, whose workers are used"
-    parser.option("--dask", str, text, metavar="ADDRESS")
-    parser.option("--seed", integer, "seed of every random draw", 0)
-    parser.option("--out", output_folder, "folder for the results", required=True)
+    parser.option("--dask", str, text)
+    parser.option("--seed", int, "seed of every random draw", 0)
+    parser.option("--out", Path, "folder for the results", required=True)
 
 
 def _arguments(options: argparse.Namespace, evaluate: Callable[..., Evaluation]) -> dict[str, Any]:
@@ -276,19 +247,13 @@ def _arguments(options: argparse.Namespace, evaluate: Callable[..., Evaluation])
     return {name: values[name] for name in parameters if name in values} | running
 
 
-def _check_installed(options: argparse.Namespace) -> None:
-    """Raise MissingExtraError for missing packages before an evaluation takes hours."""
-    check_extras("eval", *(["cluster"] if options.dask else []))
-
-
 def _finish(evaluation: Evaluation, page: Page, options: argparse.Namespace) -> None:
-    """Write the page of an evaluation, and print its verdict and its first table or all text."""
+    """Write the page of an evaluation, and print its verdict and its first table."""
     from hlsim.report.page import write_page
 
     path = write_page(page, evaluation.to_dict(), options.out)
     tables = [table for section in page.sections for table in section.tables]
-    text = page.markdown() if options.print else f"{page.verdict}\n\n{tables[0].text()}\n"
-    print(f"{text}\nThe page: {path.as_uri()}")
+    print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path.as_uri()}")
     failed = len(evaluation.failures)
     if failed:
         text = (

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hlsim.extras import is_installed, require
+from hlsim.extras import require
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 PACKAGES = {
     "train": ("lightning", "tensorboard"),
     "eval": ("joblib", "pandas", "matplotlib", "jinja2", "pystoi"),
-    "cluster": ("distributed",),
 }
 """Packages that the commands need from each extra."""
 
@@ -28,12 +27,11 @@ PACKAGES = {
 def check_extras(*extras: str) -> None:
     """Raise MissingExtraError unless extras of hlsim, such as ``"eval"``, are installed.
 
-    The packages are not imported, so that this takes no time before the work of a command.
+    So a command does not work for hours before it needs the package that is missing.
     """
     for extra in extras:
         for package in PACKAGES[extra]:
-            if not is_installed(package):
-                require(package, extra)
+            require(package, extra)
 
 
 def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
@@ -57,13 +55,11 @@ def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
 
 def _read_listener(text: str) -> Listener:
     """Read the value of ``--listener``, which is FILE or FILE:NAME."""
-    file, name = text, ""
-    if not Path(text).exists():
-        file, _, name = text.rpartition(":")
-    if not Path(file).is_file():
-        raise ValueError(f"--listener {text}: there is no such file; use --audiogram for one ear")
     from hlsim.audiogram.table import read_listeners
 
+    file, name = text, ""
+    if ":" in text and not Path(text).exists():
+        file, _, name = text.rpartition(":")
     listeners = read_listeners(file, [name] if name else None)
     if len(listeners) != 1:
         names = ", ".join([*listeners][:5])
@@ -73,10 +69,9 @@ def _read_listener(text: str) -> Listener:
         )
     (listener,) = listeners.values()
     if listener.left is None or listener.right is None:
-        missing, other = ("left", "right") if listener.left is None else ("right", "left")
         raise ValueError(
-            f"--listener {text}: expected two ears, but the {missing} one is missing; use "
-            f"--audiogram for the {other} ear and a file with its channel"
+            f"--listener {text}: expected two ears, but one is missing; use --audiogram for the "
+            "other one and a file with its channel"
         )
     return listener
 
@@ -118,17 +113,16 @@ def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
     """
     import compensators
 
-    name = options.compensator
     compensator = compensators.load_compensator(
-        name,
+        options.compensator,
         sample_rate=sample_rate,
         full_scale_spl=options.full_scale_spl,
         linked=getattr(options, "linked", False),
     )
-    for slider in read_sliders(options).keys() - set(getattr(compensator, "SLIDERS", ())):
-        option = slider.replace("_", "-")
+    if not read_sliders(options).keys() <= {*getattr(compensator, "SLIDERS", ())}:
         raise ValueError(
-            f"--{option} has no effect with --compensator {name}; choose a hearing aid"
+            f"--noise-reduction and --amplification have no effect with {options.compensator}; "
+            "leave them out, or choose a hearing aid"
         )
     return compensator
 

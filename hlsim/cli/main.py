@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Sequence
-from functools import partial
 from importlib import import_module
 
 from hlsim.cli.options import Parser
@@ -47,12 +44,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program ``hlsim``.
 
     Args:
-        arguments: Command and options, such as ``["demo", "--seed", "1"]``; by default those of the
-            process.
+        arguments: Command and options, such as ``["demo", "--steps", "100"]``; by default those of
+            the process.
 
     Returns:
-        Exit status: 0 after success, 2 after an error, and 128 plus the number of the signal that
-        stopped the program.
+        Exit status: 0 after success, 2 after an error, and 130 after Ctrl-C.
     """
     # NumPy solves only small systems here, for which threads of OpenBLAS wait longer than they
     # compute.
@@ -61,37 +57,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The backend of a notebook may be missing in this environment.
         os.environ["MPLBACKEND"] = "Agg"
     warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
-
-    def stop(signal_number: int, frame: object) -> None:
-        raise KeyboardInterrupt(signal_number)
-
-    is_main_thread = threading.current_thread() is threading.main_thread()
-    previous_handler = signal.signal(signal.SIGTERM, stop) if is_main_thread else None
     try:
-        parser = make_parser()
-        options = parser.parse_args(arguments)
-        if not hasattr(options, "run"):
-            parser.print_help()
-            return 0
+        options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
         options.run(options)
     except (ValueError, ImportError, OSError) as error:
         print(f"hlsim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt as interrupt:
+    except KeyboardInterrupt:
         text = "stopped; run the same command again to continue a training or an evaluation"
         print(f"\nhlsim: {text}", file=sys.stderr)
-        return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
-    finally:
-        if is_main_thread:
-            signal.signal(signal.SIGTERM, previous_handler)
+        return 130
     return 0
 
 
-def make_parser() -> Parser:
-    """Make the parser of the ``hlsim`` command line, which has one parser per command.
+def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse a command and its options.
 
-    A command declares its options when it is invoked, so that other commands need not be imported.
+    Args:
+        arguments: Command and options. Without any, the help is printed.
+
+    Returns:
+        Values of the options, and the function ``run`` of them that runs the command.
+
+    Raises:
+        SystemExit: Help was printed, or the command or an option is not valid.
     """
+    if arguments and arguments[0] in COMMANDS:
+        return make_parser(arguments[0]).parse_args(arguments[1:])
     lines = []
     for group, commands in GROUPS.items():
         lines.append(f"\n{group}:")
@@ -105,13 +97,18 @@ def make_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
     text = "one of the commands below"
-    subparsers = parser.add_subparsers(prog="hlsim", metavar="COMMAND", help=text)
-    for command, (module, text) in COMMANDS.items():
-        declare = partial(_declare, module, command.replace("-", "_"))
-        subparsers.add_parser(command, description=text, declare=declare)
+    parser.add_argument("command", metavar="COMMAND", choices=[*COMMANDS], help=text)
+    return parser.parse_args(arguments or ["--help"])
+
+
+def make_parser(command: str) -> Parser:
+    """Make the parser of a command, whose module only now is imported.
+
+    >>> make_parser("prepare").prog
+    'hlsim prepare'
+    """
+    module, description = COMMANDS[command]
+    parser = Parser(prog=f"hlsim {command}", description=description)
+    declare = getattr(import_module(f"hlsim.cli.{module}"), command.replace("-", "_"))
+    declare(parser)
     return parser
-
-
-def _declare(module: str, function: str, parser: Parser) -> None:
-    """Import the module of a command, whose function declares the options on the parser."""
-    getattr(import_module(f"hlsim.cli.{module}"), function)(parser)

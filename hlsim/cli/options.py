@@ -1,4 +1,4 @@
-"""The parser of the command line, and the options that several commands have.
+"""The parser of a command, and the options that several commands have.
 
 This module does not import torch, so that ``--help`` takes a fraction of a second.
 """
@@ -7,18 +7,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
-
-TypedEar = str | tuple[float, ...] | dict[float, float]
-"""An ear of a command line: its name, its eight levels, or frequencies with levels."""
-
-STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
-"""Names of the standard ears, as in ``hlsim.audiogram``."""
 
 EARS_TABLE = (
     "CSV file of ears with columns hl_250, hl_500, ... in dB HL, an empty value where a frequency "
@@ -28,20 +21,20 @@ EARS_TABLE = (
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser of the program and of each command, whose errors are one line without the usage.
+    """Parser of the program or of a command, whose errors are one line without the usage.
 
     Args:
-        declare: Function that declares the options of a command on this parser. It is called only
-            when the command is used, so that other commands do not import its module.
         settings: Arguments of ``argparse.ArgumentParser``.
+
+    Attributes:
+        prefix: Beginning of the names of options that are accepted without being declared. They
+            are appended, with their values, to the list ``settings`` of the parsed options.
     """
 
-    def __init__(self, *, declare: Callable[[Parser], None] | None = None, **settings: Any) -> None:
+    def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        self._declare = declare
+        self.prefix: str | None = None
         self._examples: tuple[str, ...] = ()
-        self._prefixes: tuple[str, ...] = ()
-        self._required: Any = None
         # argparse would take a value such as -10,0,20 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
@@ -55,33 +48,18 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(run=run)
         self._examples = examples
 
-    def accept_prefixes(self, *prefixes: str) -> None:
-        """Accept options that are not declared if their names begin with one of the prefixes.
-
-        The parsed options contain them, with their values, as the list ``undeclared``.
-        """
-        self.set_defaults(undeclared=[])
-        self._prefixes = prefixes
-
     def format_help(self) -> str:
         text = super().format_help()
         if self._examples:
-            lines = [f"  {self.prog} {example}".rstrip() for example in self._examples]
-            text += "\nexamples:\n" + "\n".join(lines) + "\n"
+            examples = [f"  {self.prog} {example}\n" for example in self._examples]
+            text += "\nexamples:\n" + "".join(examples)
         return text
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        if self._declare is not None:
-            declare = self._declare
-            self._declare = None
-            declare(self)
         options, unknown = super().parse_known_args(args, namespace)
-        if unknown and unknown[0].startswith(self._prefixes):
-            options.undeclared = unknown
+        if self.prefix and unknown and unknown[0].startswith(self.prefix):
+            options.settings = [*options.settings, *unknown]
             unknown = []
-        if unknown:
-            # The parser of the program would report them as well, but without the command's name.
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
 
     def error(self, message: str) -> NoReturn:
@@ -99,8 +77,6 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Declare an option or, if the name has no dashes, a positional argument.
 
-        Required options have a group of their own in the help.
-
         Args:
             name: Name, such as ``--speech``; without dashes for a positional argument.
             kind: Function that converts the text of the command line to a value, such as ``count``.
@@ -110,32 +86,29 @@ class Parser(argparse.ArgumentParser):
             settings: Further arguments of ``argparse.ArgumentParser.add_argument``.
         """
         if settings.get("required"):
-            group = self._required = self._required or self.add_argument_group("required options")
+            text += " (required)"
         elif default not in (None, []):
-            separator = " " if "nargs" in settings else ","
-            text += f" (default: {_format_default(default, separator)})"
+            values = default if isinstance(default, list) else [default]
+            text += f" (default: {' '.join(map(str, values))})"
         if name.startswith("-"):
             settings["default"] = default
-        if "choices" not in settings and kind in _METAVARS:
-            settings.setdefault("metavar", _METAVARS[kind])
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
         """Declare an option without a value, which is True if a user gives it and otherwise False.
 
         Args:
-            name: Name, such as ``--json``.
+            name: Name, such as ``--linked``.
             text: Description for the help.
             group: Group of argparse that the option joins, such as a mutually exclusive group.
         """
         (group or self).add_argument(name, action="store_true", help=text)
 
-    def teacher(self, text: str, default: str) -> None:
+    def teacher(self, text: str) -> None:
         """Declare ``--teacher``, a simulator with which others are compared or which they learn.
 
         Args:
             text: Beginning of the help text.
-            default: Value if the option is missing.
         """
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
@@ -144,7 +117,7 @@ class Parser(argparse.ArgumentParser):
             "(items, time) are in pascals, audiograms (items, 8) in dB HL, and the sample rate is "
             "its attribute sample_rate or else 16000 Hz"
         )
-        self.option("--teacher", teacher_name, help_, default, metavar="NAME")
+        self.option("--teacher", str, help_, "msbg")
 
     def audiogram(self, default: str | None = None, text: str = "", group: Any = None) -> None:
         """Declare ``--audiogram``, the thresholds of one ear.
@@ -174,7 +147,7 @@ class Parser(argparse.ArgumentParser):
             f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
             "Clarity's listeners.json; write FILE:NAME if the file holds several listeners"
         )
-        self.option("--listener", str, help_, group=group, metavar="FILE[:NAME]")
+        self.option("--listener", str, help_, group=group)
 
     def levels(self, signal: str) -> None:
         """Declare ``--full-scale-spl`` and ``--spl``, of which a user sets at most one.
@@ -187,9 +160,8 @@ class Parser(argparse.ArgumentParser):
         """
         group = self.add_mutually_exclusive_group()
         text = "level in dB SPL of a file whose RMS is 1.0"
-        self.option("--full-scale-spl", number, text, 94.0, group=group, metavar="DB")
-        text = f"level in dB SPL of {signal}"
-        self.option("--spl", positive_number, text, group=group, metavar="DB")
+        self.option("--full-scale-spl", float, text, 94.0, group=group)
+        self.option("--spl", float, f"level in dB SPL of {signal}", group=group)
 
     def linked(self, condition: str) -> None:
         """Declare ``--linked``, which gives both ears the same gains.
@@ -211,25 +183,17 @@ class Parser(argparse.ArgumentParser):
             "path/to/file.py:name: a callable (waveform, sample_rate) -> waveform or its class, "
             f"for {waveforms}"
         )
-        settings = {"nargs": "+", "metavar": "NAME", "dest": "enhancers"}
-        self.option("--enhancer", plugin_name, text, [], **settings)
+        self.option("--enhancer", str, text, [], nargs="+", dest="enhancers")
 
     def sliders(self) -> None:
         """Declare ``--noise-reduction`` and ``--amplification``, the sliders of a hearing aid."""
         text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 0.5)"
-        self.option("--noise-reduction", fraction, text)
+        self.option("--noise-reduction", float, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
-        self.option("--amplification", fraction, text)
+        self.option("--amplification", float, text)
 
 
-def _format_default(default: Any, separator: str) -> str:
-    """Format a default value, or the values of a list, for the help."""
-    values = default if isinstance(default, list | tuple) else [default]
-    texts = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
-    return separator.join(texts)
-
-
-def checked_type(
+def _checked_type(
     read: Callable[[str], Any], accepts: Callable[[Any], bool], expected: str
 ) -> Callable[[str], Any]:
     """Make a function that converts the text of an option to a value and validates it.
@@ -254,78 +218,18 @@ def checked_type(
     return read_value
 
 
-def _read_ear(text: str) -> TypedEar:
-    """Return the name of a standard ear, eight levels, or frequencies with their levels."""
-    if text.upper() in STANDARD_EARS:
-        return text.upper()
-    parts = re.split(r"[,\s]+", text.strip())
+def ear(text: str) -> str | list[float] | dict[float, float]:
+    """Convert the text of ``--audiogram`` to a name, to levels, or to frequencies with levels.
+
+    >>> ear("N3"), ear("500:30,4000:60")
+    ('N3', {500.0: 30.0, 4000.0: 60.0})
+    """
     if ":" in text:
-        points = [part.split(":") for part in parts]
+        points = [point.split(":") for point in text.split(",")]
         return {float(frequency): float(level) for frequency, level in points}
-    return tuple(float(part) for part in parts)
+    return [float(level) for level in text.split(",")] if "," in text else text
 
 
-def _is_ear(value: TypedEar) -> bool:
-    """Return whether a value is a name, or levels in the range of an audiogram."""
-    if isinstance(value, str):
-        return True
-    levels = value.values() if isinstance(value, dict) else value
-    is_complete = isinstance(value, dict) or len(value) == 8
-    return is_complete and all(-10.0 <= level <= 120.0 for level in levels)
-
-
-def _can_be_created(path: Path) -> bool:
-    """Return whether a folder exists and is writable, or can be created."""
-    existing = path.absolute()
-    while not os.path.lexists(existing):
-        existing = existing.parent
-    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
-
-
-_PLUGIN = re.compile(r".+:\w+")
-
-number = checked_type(float, math.isfinite, "a number such as 65 or 2.5")
-positive_number = checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
-fraction = checked_type(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
-integer = checked_type(int, lambda value: True, "a whole number")
-count = checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
-count_or_zero = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
-ear = checked_type(
-    _read_ear,
-    _is_ear,
-    f"{', '.join(STANDARD_EARS)}, eight levels from -10 to 120 dB HL, or frequencies in Hz with "
-    "levels such as 500:30,1000:40,4000:60",
-)
-plugin_name = checked_type(
-    str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name or path/to/file.py:name"
-)
-teacher_name = checked_type(
-    str,
-    lambda text: text == "msbg" or bool(_PLUGIN.fullmatch(text)),
-    "msbg, package.module:name or path/to/file.py:name",
-)
-input_path = checked_type(Path, lambda path: path.exists(), "an existing file or folder")
-input_file = checked_type(Path, lambda path: path.exists(), "an existing file")
-input_folder = checked_type(Path, lambda path: path.is_dir(), "an existing folder")
-ears_table = checked_type(
-    Path, lambda path: path.exists() or str(path) == "standard", "an existing file, or standard"
-)
-output_folder = checked_type(Path, _can_be_created, "a folder that you may write to")
-
-_METAVARS: dict[Callable[[str], Any], str] = {
-    input_path: "PATH",
-    input_file: "FILE",
-    input_folder: "FOLDER",
-    ears_table: "FILE",
-    output_folder: "FOLDER",
-    Path: "FILE",
-    str: "NAME",
-    ear: "EAR",
-    count: "N",
-    count_or_zero: "N",
-    integer: "N",
-    number: "X",
-    positive_number: "X",
-    fraction: "X",
-}
-"""Placeholders of values in the help."""
+positive_number = _checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
+count = _checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
+input_path = _checked_type(Path, lambda path: path.exists(), "an existing file or folder")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hlsim.cli.options import Parser, fraction, input_path
+from hlsim.cli.options import Parser, input_path
 
 
 def prepare(parser: Parser) -> None:
@@ -28,11 +28,10 @@ def prepare(parser: Parser) -> None:
         str,
         "levels of folders in any other corpus, each split, speaker, condition (clean or noisy) "
         "or other; for example speaker, or split/speaker",
-        metavar="LEVEL/LEVEL",
     )
     option(
         "--valid-share",
-        fraction,
+        float,
         "share of the training speakers that are used for validation, if the corpus has no "
         "validation split",
         0.0,

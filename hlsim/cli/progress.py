@@ -6,6 +6,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from typing import TextIO
 
 _LINE_INTERVAL = 30.0
 """Seconds between two lines, if stderr is not a terminal."""
@@ -39,12 +40,25 @@ def show_progress(unit: str) -> Callable[[int, int], None]:
             seconds = (now - first[1]) / (done - first[0]) * (total - done)
             clock = time.strftime("%a %H:%M", time.localtime(now + seconds))
             text += f", {seconds / 60:.1f} min left ({clock})"
-        if sys.stderr.isatty():
-            width = shutil.get_terminal_size().columns - 1
-            end = "\n" if done == total else ""
-            print(f"\r{text[:width]:<{width}}", end=end, file=sys.stderr, flush=True)
-        elif done == total or now - last_line >= _LINE_INTERVAL:
+        if sys.stderr.isatty() or done == total or now - last_line >= _LINE_INTERVAL:
             last_line = now
-            print(text, file=sys.stderr, flush=True)
+            show_line(text, sys.stderr)
+        if sys.stderr.isatty() and done == total:
+            print(file=sys.stderr)
 
     return show
+
+
+def show_line(text: str, file: TextIO) -> None:
+    """Print a line, in a terminal in place of the one before.
+
+    Args:
+        text: Line to print. A terminal shows as much of it as fits.
+        file: stdout or stderr.
+
+    >>> show_line("1 of 4 items", sys.stdout)
+    1 of 4 items
+    """
+    width = shutil.get_terminal_size().columns - 1
+    line = f"\r{text[:width]:<{width}}" if file.isatty() else f"{text}\n"
+    print(line, end="", file=file, flush=True)

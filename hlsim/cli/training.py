@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_extras, read_ears
-from hlsim.cli.options import (
-    Parser,
-    count,
-    count_or_zero,
-    ears_table,
-    input_file,
-    input_folder,
-    output_folder,
-    positive_number,
-)
-from hlsim.cli.recipes import add_recipe, read_recipe
+from hlsim.cli.options import Parser, count, input_path, positive_number
+from hlsim.cli.recipes import add_recipe, make_recipe
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 
@@ -28,7 +20,7 @@ def train_simulator(parser: Parser) -> None:
         "--recipe examples/neuro-msbg-light.yaml --recipe.batch 4 --manifest "
         "VoiceBank/manifest.csv --out runs/light",
     )
-    parser.teacher("simulator whose output the network learns", "msbg")
+    parser.teacher("simulator whose output the network learns")
     _declare_common(parser)
     add_recipe(parser, SimulatorRecipe, "examples/neuro-msbg.yaml")
 
@@ -53,23 +45,23 @@ def _declare_common(parser: Parser) -> None:
     """Declare the options that both commands have."""
     option = parser.option
     speech = parser.add_mutually_exclusive_group(required=True)
-    option("--speech", input_folder, "folder of clean speech", group=speech)
+    option("--speech", input_path, "folder of clean speech", group=speech)
     text = (
         "CSV file of 'hlsim prepare', instead of --speech; its validation speech and the noise of "
         "its noisy speech are used unless other options name some"
     )
-    option("--manifest", input_file, text, group=speech)
+    option("--manifest", input_path, text, group=speech)
     text = (
         "folder to which the manifest's paths are relative; by default the folder of the manifest"
     )
-    option("--root", input_folder, text)
-    option("--noise", input_folder, "folder of noise recordings that are mixed in")
+    option("--root", input_path, text)
+    option("--noise", input_path, "folder of noise recordings that are mixed in")
     ears = "CSV file of measured ears, or standard for Bisgaard's"
-    option("--audiograms", ears_table, f"{ears}; used in addition to random ears")
+    option("--audiograms", str, f"{ears}; used in addition to random ears")
     text = "folder of clean speech by other speakers, for validation"
-    option("--valid-speech", input_folder, text)
-    option("--valid-noise", input_folder, "folder of noise recordings for validation")
-    option("--valid-audiograms", ears_table, f"{ears}, for validation")
+    option("--valid-speech", input_path, text)
+    option("--valid-noise", input_path, "folder of noise recordings for validation")
+    option("--valid-audiograms", str, f"{ears}, for validation")
     text = (
         "time limit in minutes, including the time before a resumption; the learning rate "
         "does not depend on it"
@@ -78,14 +70,13 @@ def _declare_common(parser: Parser) -> None:
     option("--device", str, "device of the training", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "number of GPUs or processes; each draws its own batches", 1)
     text = "number of processes that draw batches, in addition to the one that trains"
-    option("--workers", count_or_zero, text, 0)
-    parser.flag("--quiet", "print one line per validation, without a progress bar")
-    option("--out", output_folder, "folder for the results", required=True)
+    option("--workers", int, text, 0)
+    option("--out", Path, "folder for the results", required=True)
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
     check_extras("train")
-    recipe = read_recipe(options, SimulatorRecipe)
+    recipe = make_recipe(SimulatorRecipe, options.recipe, options.settings)
     from hlsim.training.simulator import train_simulator
 
     folder = train_simulator(recipe=recipe, teacher=options.teacher, **_common_arguments(options))
@@ -99,7 +90,7 @@ def _train_compensator(options: argparse.Namespace) -> None:
             "ear; leave one or the other out"
         )
     check_extras("train")
-    recipe = read_recipe(options, CompensatorRecipe)
+    recipe = make_recipe(CompensatorRecipe, options.recipe, options.settings)
     ear: Any = read_ears(options)
     from hlsim.training.compensator import train_compensator
 
@@ -128,5 +119,4 @@ def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
         "max_minutes": options.max_minutes,
         "accelerator": "gpu" if options.device == "cuda" else options.device,
         "devices": options.devices,
-        "progress": not options.quiet,
     }

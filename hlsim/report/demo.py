@@ -29,10 +29,7 @@ _COMPARISON = (
     "that clinics know, amplified to the same output level. This comparison was planned before "
     "the scores were known."
 )
-_LISTEN = (
-    "One utterance of a voice that the aid was not trained on. The sounds of all utterances are "
-    "in the folder audio beside this page."
-)
+_LISTEN = "One utterance of a voice that the aid was not trained on."
 _ABOUT_PICTURES = (
     "The aid started from the gains of NAL-R, and was trained for this ear through Neuro-MSBG for "
     "{steps} steps, so that the ear perceives speech as loud as a normal ear does, in "
@@ -47,7 +44,6 @@ def demo_page(
     ear_name: str,
     outputs: Mapping[str, Sequence[Tensor]],
     perceived: Mapping[str, Sequence[Tensor]],
-    sentence: str = "",
 ) -> Page:
     """Return the page of ``hlsim demo``: verdict, sounds, pictures, details and three numbers.
 
@@ -62,7 +58,6 @@ def demo_page(
         perceived: Perceived signals for all items in pascals: first, under the name ``NORMAL_EAR``,
             what a normal ear perceives of clean speech; then, under the name of each condition,
             what this ear perceives of ``outputs``. Shape of each: (time,).
-        sentence: Transcript of the last item, which is played.
     """
     headline = evaluation.headline
     assert headline is not None
@@ -75,7 +70,7 @@ def demo_page(
         "Perceived by this ear, beside a normal ear": last_perceived,
         "Output of the aids": {"original speech": items[-1].clean, **last_outputs},
     }
-    player = make_player(groups, rate, sentence)
+    player = make_player(groups, rate)
     details = score_details(evaluation, [_COMPARISON], [result_table(evaluation)])
     about_pictures = _ABOUT_PICTURES.format(
         steps=evaluation.settings["training_steps"], limit=MappingConfig().limit_spl

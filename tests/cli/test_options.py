@@ -7,16 +7,13 @@ from typing import get_args
 
 import pytest
 
-from hlsim.audiogram import STANDARD
-from hlsim.cli import options
-from hlsim.cli.main import COMMANDS, GROUPS, main
-from hlsim.cli.options import Parser
+from hlsim.cli.main import COMMANDS, main, make_parser
 from hlsim.losses.criteria import CRITERIA, CriterionName
 
 FUNCTIONS = {
     "simulate": "hlsim.shortcuts",
     "compensate": "hlsim.shortcuts",
-    "demo": "hlsim.demo",
+    "demo": "hlsim.cli.demo_study:run_demo",
     "haspi-report": "hlsim.evaluation",
     "evaluate-compensator": "hlsim.evaluation.compensators:evaluate_compensators",
     "evaluate-simulator": "hlsim.evaluation.simulators:evaluate_simulators",
@@ -28,24 +25,18 @@ FUNCTIONS = {
 """Module of each command's function, and its name if it is not that of the command."""
 
 
-def declared(command: str) -> Parser:
-    parser = Parser(prog=command)
-    getattr(import_module(f"hlsim.cli.{COMMANDS[command][0]}"), command.replace("-", "_"))(parser)
-    return parser
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.usefixtures("every_path_exists")
 def test_help_ends_with_two_examples_that_the_command_takes(command: str) -> None:
-    parser = declared(command)
+    parser = make_parser(command)
     text, examples = parser.format_help().split("\nexamples:\n")
-    assert text.startswith(f"usage: {command}")
+    assert text.startswith(f"usage: hlsim {command}") and "None" not in text
     lines = examples.splitlines()
     assert len(lines) == 2
     recipes = [word for word in examples.split() if word.endswith(".yaml")]
     assert all((Path(__file__).parents[2] / recipe).is_file() for recipe in recipes)
     for words in map(str.split, lines):
-        assert words[0] == command and parser.parse_args(words[1:]).run
+        assert words[:2] == ["hlsim", command] and parser.parse_args(words[2:]).run
 
 
 @pytest.mark.parametrize("command", FUNCTIONS)
@@ -53,7 +44,7 @@ def test_defaults_of_a_command_are_those_of_its_function(command: str) -> None:
     pytest.importorskip("lightning")
     module, _, name = FUNCTIONS[command].partition(":")
     function = getattr(import_module(module), name or command.replace("-", "_"))
-    parser, compared = declared(command), 0
+    parser, compared = make_parser(command), 0
     for name, parameter in inspect.signature(function).parameters.items():
         default, expected = parser.get_default(name), parameter.default
         if default is None or expected in (None, inspect.Parameter.empty):
@@ -66,25 +57,18 @@ def test_defaults_of_a_command_are_those_of_its_function(command: str) -> None:
 
 
 def test_names_that_are_written_twice_agree() -> None:
-    assert tuple(STANDARD) == options.STANDARD_EARS
     assert tuple(CRITERIA) == get_args(CriterionName)
 
 
-def test_required_options_are_a_group_of_their_own() -> None:
-    text = declared("evaluate-simulator").format_help()
-    assert text.index("required options:") < text.index("folder of clean speech")
-    assert "None" not in text and "(default: 50 60 65 70 80)" in " ".join(text.split())
-
-
-def test_every_command_is_in_one_group(capsys: pytest.CaptureFixture[str]) -> None:
-    assert sorted(name for names in GROUPS.values() for name in names) == sorted(COMMANDS)
-    assert main([]) == 0
+def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main([])
     text = capsys.readouterr().out
     assert all(f"  {name} " in text for name in COMMANDS)
 
 
 def test_lists_that_begin_with_a_minus_are_values() -> None:
     words = "--levels -5 -10 --audiogram -10,0,5,10,20,30,40,50 msbg --speech . --out o".split()
-    parsed = declared("evaluate-compensator").parse_args(words)
-    assert parsed.audiogram == (-10.0, 0.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0)
+    parsed = make_parser("evaluate-compensator").parse_args(words)
+    assert parsed.audiogram == [-10.0, 0.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0]
     assert parsed.levels == [-5.0, -10.0] and parsed.names == ["msbg"]

@@ -51,13 +51,10 @@ assert not slow & set(sys.modules), slow & set(sys.modules)
 LINES = """nothing
 simulate {plain} {out} --audiogram N3 --loud
 simulate {missing} {out} --audiogram N3
-simulate {plain} {out} --audiogram N9
-simulate {plain} {out}.mp3 --audiogram N3
 live
-live --audiogram N9
 prepare {missing} --out {out}
 train-compensator --speech {missing} --out {out}
-evaluate-simulator msbg --speech {folder} --audiograms {missing} --out {out}
+evaluate-simulator msbg --speech {missing} --audiograms standard --out {out}
 evaluate-compensator nalr --speech {missing} --out {out}
 haspi-report --manifest {missing} --out {out}
 clarity {missing} wdrc --listeners {plain} --out {out}

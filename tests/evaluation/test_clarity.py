@@ -177,7 +177,7 @@ def test_the_command_writes_page_scores_and_signals_and_continues(
     out = tmp_path / "out"
     arguments = ["clarity", clarity / "scenes", "soft=wdrc", f"early={__name__}:Anticipating"]
     arguments += ["--listeners", clarity / "listeners.json", "--jobs", "1", "--every", "2"]
-    arguments += ["--scenes-listeners", clarity / "pairs.json", "--listen", "1", "--out", out]
+    arguments += ["--scenes-listeners", clarity / "pairs.json", "--out", out]
     command = [*map(str, arguments), "--enhancer", f"{__name__}:Halving"]
     assert main(command) == 0
     printed = " ".join(capsys.readouterr().out.split())
@@ -195,7 +195,7 @@ def test_the_command_writes_page_scores_and_signals_and_continues(
     mix, _ = soundfile.read(clarity / "scenes" / "S06001_mix_CH1.wav")
     output, rate = soundfile.read(signal)
     assert rate == LOW_RATE and np.allclose(output, 4 * np.roll(mix, -128, 0), atol=1e-6)
-    assert (out / "report.html").read_text().count("<audio") == 5
+    assert (out / "report.html").read_text().count("<audio") == 10
     stored, report = (out / "scores.jsonl").read_text(), (out / "report.json").read_text()
     signal.unlink()
     other = out / "signals" / "soft" / "S06001_L0001_HA-output.wav"

@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
-from hlsim import Audiogram, example_speech, listen
+from hlsim import example_speech, listen
 from hlsim.report.page import write_page
 from hlsim.report.recordings import report_page
+from tests.helpers import run_short_demo
 from tests.report.test_recordings import evaluation
 
 pytestmark = pytest.mark.browser
@@ -57,13 +58,8 @@ def demo_file(tmp_path_factory: pytest.TempPathFactory, speech_dir: Path) -> Pat
     """The demo's page after few steps of training."""
     for package in ("lightning", "joblib"):
         pytest.importorskip(package)
-    from hlsim.demo import demo
-    from tests.helpers import write_short_speech
-
     root = tmp_path_factory.mktemp("demo")
-    speech = write_short_speech(root / "speech", speech_dir)
-    ear = Audiogram.standard("N4")
-    demo(root / "out", ear, speech=speech, steps=10, report=lambda line: None)
+    run_short_demo(root, speech_dir, steps=10)
     return root / "out" / "report.html"
 
 

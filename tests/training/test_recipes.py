@@ -7,7 +7,7 @@ from typing import Any, get_args
 import pytest
 
 from hlsim.cli.options import Parser
-from hlsim.cli.recipes import add_recipe, describe_settings, make_recipe, read_recipe
+from hlsim.cli.recipes import add_recipe, describe_settings, make_recipe
 from hlsim.losses import frozen_simulator
 from hlsim.training.recipes import CompensatorRecipe, ReferenceName, SimulatorRecipe
 
@@ -41,7 +41,8 @@ AID_RECIPE = CompensatorRecipe(
 def from_options(words: str) -> CompensatorRecipe:
     parser = Parser()
     add_recipe(parser, CompensatorRecipe, "an example")
-    return read_recipe(parser.parse_args(words.split()), CompensatorRecipe)
+    options = parser.parse_args(words.split())
+    return make_recipe(CompensatorRecipe, options.recipe, options.settings)
 
 
 def test_python_yaml_and_the_command_line_agree(tmp_path: Path) -> None:

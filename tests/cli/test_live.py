@@ -22,8 +22,8 @@ from compensators import WDRC
 from hlsim import Listener, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
+from hlsim.cli.microphone import Live, SimulatedStream, _key_reader, play
 from hlsim.extras import MissingExtraError
-from hlsim.live import Live, SimulatedStream, _key_reader, play
 from tests.compensators.aids import EAR, tone, varied_hearing_aid
 
 FLAGS = ("input_overflow", "input_underflow", "output_overflow", "output_underflow")
@@ -36,40 +36,25 @@ class Devices:
     Args:
         recording: Signal of each microphone, (microphones, time).
         lost: Numbers of the blocks that are reported as lost.
-        sample_rate: The only supported sample rate.
-        headphones: Number of output channels.
     """
 
     class PortAudioError(Exception):
         pass
 
-    def __init__(
-        self,
-        recording: Tensor,
-        lost: tuple[int, ...] = (),
-        sample_rate: int = 16000,
-        headphones: int = 2,
-    ) -> None:
+    def __init__(self, recording: Tensor, lost: tuple[int, ...] = ()) -> None:
         self.recording = torch.atleast_2d(recording).mT.numpy()
-        self.lost, self.sample_rate, self.headphones = lost, sample_rate, headphones
+        self.lost = lost
         self.played = np.zeros((0, 2), dtype=np.float32)
         self.options: dict[str, Any] = {}
 
-    def query_devices(self, device: int | str | None = None, kind: str | None = None) -> Any:
-        if kind is None:
-            return "  0 Loopback, ALSA (1 in, 2 out)"
+    def query_devices(self, device: int | str | None, kind: str) -> Any:
         if device not in (None, 0, "Loopback"):
             raise ValueError(f"No {kind} device matching {device!r}")
-        channels = self.recording.shape[1]
-        return {"max_input_channels": channels, "max_output_channels": self.headphones}
-
-    def _check_settings(self, samplerate: int, **_: object) -> None:
-        if samplerate != self.sample_rate:
-            raise self.PortAudioError("Invalid sample rate [PaErrorCode -9997]")
-
-    check_input_settings = check_output_settings = _check_settings
+        return {"max_input_channels": self.recording.shape[1]}
 
     def Stream(self, callback: Callable[..., None], **options: Any) -> Any:
+        if options["device"][1] == "Phones":
+            raise self.PortAudioError("Invalid sample rate [PaErrorCode -9997]")
         self.options = options
         starts = range(options["blocksize"], len(self.recording), options["blocksize"])
         for number, block in enumerate(np.split(self.recording, starts)):
@@ -109,19 +94,19 @@ def test_the_output_of_the_aid_is_played(
 ) -> None:
     devices = Devices(recording, lost=(3, 9))
     monkeypatch.setitem(sys.modules, "sounddevice", devices)
-    command = "live --audiogram n3 --seconds 0.05 --block-ms 5 --compensator wdrc"
+    command = "live --audiogram n3 --seconds 0.05 --compensator wdrc"
     assert main(command.split()) == 0
     stream = WDRC(full_scale_spl=100.0).stream(EAR)
-    stream(torch.zeros(20 * 80))  # before the devices open
+    stream(torch.zeros(20 * 64))  # before the devices open
     expected = stream(recording)
     assert_played(devices, expected, 1e-5)
     assert devices.options == {
-        "samplerate": 16000, "blocksize": 80, "device": (None, None), "channels": (1, 2),
+        "samplerate": 16000, "blocksize": 64, "device": (None, None), "channels": (1, 2),
         "dtype": "float32", "latency": 0.02,
     }  # fmt: skip
     text = capsys.readouterr().out
     level = 10.0 * np.log10(np.square(expected.clamp(-1.0, 1.0)).mean()) + 100.0
-    assert "blocks of 5 ms, delay 34 ms" in text  # 30 of the devices, 4 of the aid
+    assert "blocks of 4 ms, delay 34 ms" in text  # 30 of the devices, 4 of the aid
     assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in text
     assert text.endswith("stopped, drop-outs 2\n")
 
@@ -182,13 +167,14 @@ def test_the_output_is_limited_to_full_scale_and_levels_are_those_since_the_last
 
 
 def test_an_error_of_the_stream_stops_it(
-    recording: Tensor, capsys: pytest.CaptureFixture[str]
+    recording: Tensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blocks = [torch.ones(64)] * 21  # the warm-up and one block
     stream = Mock(side_effect=[*blocks, *[ValueError("the stream failed")] * 99], spec=[])
-    devices: Any = Devices(recording)
+    devices = Devices(recording)
+    monkeypatch.setitem(sys.modules, "sounddevice", devices)
     with pytest.raises(ValueError, match="the stream failed"):
-        play(Live(stream, 94.0), devices)
+        play(Live(stream, 94.0))
     assert not devices.played[64:].any()
     assert "stopped" in capsys.readouterr().out
 
@@ -196,19 +182,18 @@ def test_an_error_of_the_stream_stops_it(
 def test_ctrl_c_stops_and_devices_that_stop_are_started_again(
     recording: Tensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    devices: Any = Devices(recording)
-
+    monkeypatch.setitem(sys.modules, "sounddevice", Devices(recording))
     with monkeypatch.context() as patch:
-        patch.setattr("hlsim.live.time.sleep", Mock(side_effect=KeyboardInterrupt))
-        play(Live(WDRC().stream(EAR), 94.0), devices)
+        patch.setattr("hlsim.cli.microphone.time.sleep", Mock(side_effect=KeyboardInterrupt))
+        play(Live(WDRC().stream(EAR), 94.0))
     assert capsys.readouterr().out.endswith("stopped, drop-outs 0\n")
     start = Mock(side_effect=[None, Devices.PortAudioError("Device unavailable")])
     monkeypatch.setattr(OpenStream, "active", False)
     monkeypatch.setattr(OpenStream, "start", start)
-    monkeypatch.setattr("hlsim.live.time.sleep", Mock())
+    monkeypatch.setattr("hlsim.cli.microphone.time.sleep", Mock())
     live = Live(WDRC().stream(EAR), 94.0)
-    with pytest.raises(ValueError, match="stopped: Device unavailable"):
-        play(live, devices)
+    with pytest.raises(ValueError, match="cannot be used: Device unavailable"):
+        play(live)
     assert live.drop_outs == start.call_count == 2
 
 
@@ -248,11 +233,11 @@ def test_simulated_blocks_equal_the_whole_signal() -> None:
     ("arguments", "message"),
     [
         ("--listener nosuch.csv", "nosuch.csv"),
-        ("--audiogram N3 --input 7", "--input 7 cannot be used: No input device matching 7"),
-        ("--audiogram N3 --output Phones", "--output Phones cannot be used"),
+        ("--audiogram N3 --input 7", "No input device matching 7"),
+        ("--audiogram N3 --output Phones", "Invalid sample rate [PaErrorCode -9997]; choose two"),
         ("--audiogram N3 --compensator nalr", "nalr cannot process blocks"),
         ("--audiogram N3 --simulate --amplification 1", "no effect with --simulate"),
-        ("--audiogram N3 --compensator wdrc --amplification 1", "--compensator wdrc"),
+        ("--audiogram N3 --compensator wdrc --amplification 1", "no effect with wdrc"),
         ("--audiogram N7", "100"),
     ],
 )
@@ -270,23 +255,15 @@ def test_bad_options_cause_one_line(
     assert message in error
 
 
-def test_unsuitable_devices_and_missing_libraries_are_named(
+def test_missing_libraries_are_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mono: Any = Devices(torch.zeros(64), headphones=1)
-    with pytest.raises(ValueError, match="one channel, expected two"):
-        play(Live(lambda samples: samples, 94.0, ears=2), mono)
-    monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64), sample_rate=48000))
-    assert main(["live", "--audiogram", "N3"]) == 2
-    assert "the system's input cannot be used: Invalid sample rate" in capsys.readouterr().err
-    assert main(["live", "--list-devices"]) == 0
-    assert "Loopback" in capsys.readouterr().out
     for error, fix in (
         (OSError("PortAudio library not found"), "apt install libportaudio2"),
         (MissingExtraError("pip install 'hlsim[live]'"), "hlsim[live]"),
     ):
-        monkeypatch.setattr("hlsim.cli.live.require", Mock(side_effect=error))
-        assert main(["live", "--audiogram", "N3"]) == 2
+        monkeypatch.setattr("hlsim.cli.microphone.require", Mock(side_effect=error))
+        assert main(["live", "--audiogram", "N3", "--compensator", "wdrc"]) == 2
         assert fix in capsys.readouterr().err
 
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 import os
 import select
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -23,6 +21,8 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import Listener
 from hlsim.calibration import level_spl
+from hlsim.cli.progress import show_line
+from hlsim.extras import require
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 
@@ -34,8 +34,6 @@ SLIDER_STEP = 0.1
 
 WARM_UP_BLOCKS = 20
 """Number of blocks of silence that are processed before the start, because early calls are slow."""
-
-DEVICE_HINT = f"choose one of hlsim live --list-devices that supports {NEURO_RATE} Hz"
 
 
 class Live:
@@ -184,7 +182,6 @@ class SimulatedStream:
 
 def play(
     live: Live,
-    sounddevice: ModuleType,
     *,
     devices: tuple[int | str | None, int | str | None] = (None, None),
     block: int = 64,
@@ -197,7 +194,6 @@ def play(
 
     Args:
         live: Function that processes the blocks.
-        sounddevice: The imported package.
         devices: Microphone and headphones, by number or part of their names. None stands for the
             device of the system.
         block: Number of samples per block at 16 kHz.
@@ -205,27 +201,27 @@ def play(
         seconds: Duration after which to stop.
 
     Raises:
-        ValueError: A device does not exist, does not support 16 kHz, or has too few channels; or
-            the stream failed.
+        ValueError: A device does not exist, does not support 16 kHz, or has too few channels; the
+            stream failed; or PortAudio is missing.
+        MissingExtraError: sounddevice is not installed.
 
-    >>> import sounddevice  # doctest: +SKIP
-    >>> play(live, sounddevice, seconds=10.0)  # doctest: +SKIP
+    >>> play(live, seconds=10.0)  # doctest: +SKIP
     """
-    microphones = _count_channels(sounddevice, "input", devices[0])
-    headphones = _count_channels(sounddevice, "output", devices[1])
-    if headphones < live.ears:
+    try:
+        sounddevice = require("sounddevice", "live")
+    except OSError as error:  # Not all wheels of sounddevice include PortAudio.
         raise ValueError(
-            "the headphones have one channel, expected two; use --audiogram for one ear"
-        )
+            f"PortAudio not found ({error}); install it (Debian: apt install libportaudio2)"
+        ) from error
+    microphones = sounddevice.query_devices(devices[0], "input")["max_input_channels"]
     silence = torch.zeros(2, block) if live.ears == 2 else torch.zeros(block)
     for _ in range(WARM_UP_BLOCKS):
         live.stream(silence)
-    stream = sounddevice.Stream
     options = {
         "samplerate": NEURO_RATE,
         "blocksize": block,
         "device": devices,
-        "channels": (min(live.ears, microphones), min(2, headphones)),
+        "channels": (min(live.ears, microphones), 2),
         "dtype": "float32",
         "latency": buffer,
     }
@@ -233,49 +229,34 @@ def play(
         with (
             suppress(KeyboardInterrupt),
             _key_reader() as read_key,
-            stream(callback=live, **options) as audio,
+            sounddevice.Stream(callback=live, **options) as audio,
         ):
             delay_ms = 1000.0 * (sum(audio.latency) + live.latency / NEURO_RATE)
             block_ms = 1000.0 * block / NEURO_RATE
             print(f"blocks of {block_ms:g} ms, delay {delay_ms:.0f} ms; q or Ctrl-C stops")
             _show_status(live, audio, read_key, time.monotonic() + seconds)
     except sounddevice.PortAudioError as error:
-        raise ValueError(f"the devices stopped: {error}; {DEVICE_HINT}") from error
+        raise ValueError(
+            f"the devices cannot be used: {error}; choose two that support {NEURO_RATE} Hz and "
+            "stereo headphones by --input and --output; python -m sounddevice lists them"
+        ) from error
     print(f"\nstopped, drop-outs {live.drop_outs}")
     if live.error:
         raise ValueError(live.error)
 
 
 def _show_status(live: Live, audio: Any, read_key: Callable[[float], str], end: float) -> None:
-    """Print a status line five times per second, or once per second outside a terminal."""
-    is_terminal = sys.stdout.isatty()
-    interval = 0.2 if is_terminal else 1.0
+    """Show a status line five times per second, or once per second outside a terminal."""
+    interval = 0.2 if sys.stdout.isatty() else 1.0
     key = ""
     while key != "q" and not live.error and time.monotonic() < end:
         key = read_key(max(0.0, min(interval, end - time.monotonic())))
         live.press(key)
-        text = live.status()
-        if is_terminal:
-            width = shutil.get_terminal_size().columns - 1
-            print(f"\r{text[:width]:<{width}}", end="", flush=True)
-        else:
-            print(text, flush=True)
+        show_line(live.status(), sys.stdout)
         if not audio.active:  # With ALSA, PortAudio may stop after a drop-out.
             live.drop_outs += 1
             audio.stop()
             audio.start()
-
-
-def _count_channels(sounddevice: ModuleType, kind: str, device: int | str | None) -> int:
-    """Return the number of channels of a device; raise ValueError unless it supports 16 kHz."""
-    name = f"the system's {kind}" if device is None else f"--{kind} {device}"
-    try:
-        channels = int(sounddevice.query_devices(device, kind)[f"max_{kind}_channels"])
-        check = getattr(sounddevice, f"check_{kind}_settings")
-        check(device=device, channels=1, dtype="float32", samplerate=NEURO_RATE)
-    except (ValueError, sounddevice.PortAudioError) as error:
-        raise ValueError(f"{name} cannot be used: {error}; {DEVICE_HINT}") from error
-    return channels
 
 
 @contextmanager

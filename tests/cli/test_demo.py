@@ -1,0 +1,44 @@
+"""The demo with few steps: page, sounds and printed table are written, and agree."""
+
+import json
+from pathlib import Path
+from statistics import fmean
+
+import pytest
+
+from tests.helpers import run_short_demo
+
+pytest.importorskip("lightning")
+pytest.importorskip("joblib")
+
+
+def test_demo_writes_a_page_that_agrees_with_the_table(tmp_path: Path, speech_dir: Path) -> None:
+    text = run_short_demo(tmp_path, speech_dir, steps=20)
+    out = tmp_path / "out"
+    report = json.loads((out / "report.json").read_text())
+    rows = report["rows"]
+    names = ["unaided", "NAL-R", "NAL-R, same level", "trained aid"]
+    assert [row["condition"] for row in rows] == names * 10
+    assert rows[2]["level"] == pytest.approx(rows[3]["level"], abs=1e-3)
+    means = {
+        name: fmean(row["haspi"] for row in rows if row["condition"] == name) for name in names
+    }
+    printed = {line[:18].strip(): line[18:].split() for line in text.splitlines()}
+    for name, mean in means.items():
+        assert printed[name][0] == f"{mean:.3f}"
+    # NAL-R, and an aid that starts from it, make speech easier to understand for this ear
+    assert means["NAL-R"] > means["unaided"] and means["trained aid"] > means["unaided"]
+    # one comparison is planned and tested, so that no adjusted p can contradict it
+    [comparison] = report["comparisons"]
+    assert comparison["planned"]
+    assert (comparison["before"], comparison["after"]) == (names[2], "trained aid")
+    page = (out / "report.html").read_text()
+    assert text.startswith("\nThe trained aid ")
+    assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 10
+    evidence = text.splitlines()[1].rpartition(" (")[2]
+    assert f"({evidence}</small>" in page and page.count("t-test p = ") == 1
+    assert page.count("<audio") == 9 and "N4 (pure-tone average" in page
+    for name in names:
+        assert f">{means[name]:.3f}</td>" in page
+    assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0
+    assert "for 20 steps" in page and "exceeds 110 dB SPL" in page
