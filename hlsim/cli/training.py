@@ -117,6 +117,6 @@ def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
         "data": data,
         "out": options.out,
         "max_minutes": options.max_minutes,
-        "accelerator": "gpu" if options.device == "cuda" else options.device,
+        "accelerator": options.device,
         "devices": options.devices,
     }

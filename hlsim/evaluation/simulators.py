@@ -141,7 +141,7 @@ def _teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
     def compute() -> Tensor:
         if teacher is None:
             return perceive(item.signal, item.ear, item.sample_rate)
-        return teacher(item.signal[None], torch.tensor([item.ear.thresholds]), NEURO_RATE)[0]
+        return teacher(item.signal[None], torch.tensor([item.ear.thresholds]))[0]
 
     output: Tensor = item.once("teacher", compute)
     return output

@@ -11,11 +11,12 @@ from torch.nn import functional
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.active_level import active_level_db
+from hlsim.neuro.config import NEURO_RATE
 
 HIGHEST_LEVEL = 115.0
 """Highest RMS level of a training signal in dB SPL."""
 
-EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
+_EQUALISER_FREQUENCIES = torch.tensor([100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0])
 """Frequencies in Hz for which the random equaliser has gains."""
 
 _POWER_FLOOR = 1e-20
@@ -37,6 +38,24 @@ def draw_uniform(
     torch.Size([3])
     """
     return low + (high - low) * torch.rand(shape, generator=generator)
+
+
+def replace_share(
+    signals: Tensor, replacements: Tensor, share: float, generator: torch.Generator
+) -> Tensor:
+    """Replace a random share of items.
+
+    Args:
+        signals: Items with shape (items, samples).
+        replacements: Item that may replace each of them, with the same shape.
+        share: Probability with which an item is replaced, from 0 to 1.
+        generator: Source of the random numbers.
+
+    >>> replace_share(torch.zeros(1, 3), torch.ones(1, 3), 1.0, torch.Generator())
+    tensor([[1., 1., 1.]])
+    """
+    is_replaced = torch.rand(len(signals), 1, generator=generator) < share
+    return torch.where(is_replaced, replacements, signals)
 
 
 def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None = None) -> Tensor:
@@ -122,11 +141,27 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     return waveform * ((power + 1e-3 * mean + _POWER_FLOOR) / (mean + _POWER_FLOOR)) ** exponent
 
 
+def equalise_share(signals: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """Filter a random share of signals with random gains of up to 15 dB.
+
+    Args:
+        signals: Signals at 16 kHz with shape (items, time).
+        share: Probability with which a signal is filtered, from 0 to 1.
+        generator: Source of the random numbers.
+
+    >>> equalise_share(torch.ones(2, 1600), 0.5, torch.Generator()).shape
+    torch.Size([2, 1600])
+    """
+    shape = len(signals), len(_EQUALISER_FREQUENCIES)
+    gains_db = draw_uniform(-15.0, 15.0, shape, generator)
+    equalised = equalise(signals, gains_db, _EQUALISER_FREQUENCIES, NEURO_RATE)
+    return replace_share(signals, equalised, share, generator)
+
+
 def augment_speech(
     speech: Tensor,
     noise: Tensor | None,
     ears: Tensor,
-    sample_rate: int,
     generator: torch.Generator,
     *,
     levels: tuple[float, float] = (40.0, 95.0),
@@ -139,10 +174,9 @@ def augment_speech(
     times the hearing loss.
 
     Args:
-        speech: Clean speech with shape (items, time).
+        speech: Clean speech at 16 kHz with shape (items, time).
         noise: Noise with shape (items, time); None for speech without noise.
         ears: Hearing thresholds in dB HL at ``FREQUENCIES``, with shape (items, 8).
-        sample_rate: Sample rate in Hz.
         generator: Source of the random numbers.
         levels: Lowest and highest level in dB SPL before equalisation and amplification.
         treated: Whether to compress, equalise and amplify.
@@ -152,32 +186,25 @@ def augment_speech(
         ``treated``.
 
     >>> speech, ears = torch.randn(2, 1600), torch.full((2, 8), 40.0)
-    >>> augment_speech(speech, None, ears, 16000, torch.Generator()).shape
+    >>> augment_speech(speech, None, ears, torch.Generator()).shape
     torch.Size([2, 1600])
     """
-    items = len(speech)
-    chance = torch.rand(items, 5, generator=generator)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return draw_uniform(low, high, (items, *shape), generator)
-
-    def choose(column: int, share: float, changed: Tensor, unchanged: Tensor) -> Tensor:
-        return torch.where((chance[:, column] < share).unsqueeze(-1), changed, unchanged)
+        return draw_uniform(low, high, (len(speech), *shape), generator)
 
     signal = speech
-    snr_db = uniform(-5.0, 20.0)
-    ratio = uniform(1.5, 4.0)
     if noise is not None:
-        signal = choose(0, 0.4, mix(signal, noise, snr_db, sample_rate), signal)
-    level = uniform(*levels)
-    if not treated:
-        return set_level(signal, level)
-    compressed = choose(1, 0.2, compress(signal, ratio, sample_rate), signal)
-    signal = set_level(compressed, level)
-    gains = uniform(-15.0, 15.0, len(EQUALISER_FREQUENCIES))
-    equalised = equalise(signal, gains, torch.tensor(EQUALISER_FREQUENCIES), sample_rate)
-    signal = choose(2, 0.4, equalised, signal)
-    gains = ears * uniform(0.2, 0.8, 1)
-    amplified = equalise(signal, gains, torch.tensor(FREQUENCIES), sample_rate)
-    signal = choose(3, 0.4, amplified, signal)
-    return set_level(signal, level_spl(signal).clamp_max(HIGHEST_LEVEL))
+        noisy = mix(speech, noise, uniform(-5.0, 20.0), NEURO_RATE)
+        signal = replace_share(speech, noisy, 0.4, generator)
+    if treated:
+        compressed = compress(signal, uniform(1.5, 4.0), NEURO_RATE)
+        signal = replace_share(signal, compressed, 0.2, generator)
+    signal = set_level(signal, uniform(*levels))
+    if treated:
+        signal = equalise_share(signal, 0.4, generator)
+        gains_db = ears * uniform(0.2, 0.8, 1)
+        amplified = equalise(signal, gains_db, torch.tensor(FREQUENCIES), NEURO_RATE)
+        signal = replace_share(signal, amplified, 0.4, generator)
+        signal = set_level(signal, level_spl(signal).clamp_max(HIGHEST_LEVEL))
+    return signal

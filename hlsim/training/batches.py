@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
-from dataclasses import dataclass, field, fields, replace
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,28 +13,32 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from hlsim.audio import find_audio
-from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, Audiogram
+from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import (
-    EQUALISER_FREQUENCIES,
     augment_speech,
     draw_uniform,
-    equalise,
+    equalise_share,
     mix,
+    replace_share,
 )
 from hlsim.training.clips import Clips, Source
-from hlsim.training.corpora.manifest import SPLITS, read_manifest
-from hlsim.training.data_module import Batch, BatchData, Step
+from hlsim.training.corpora.manifest import read_manifest
+from hlsim.training.data_module import MAX_DEVICES, Batch, BatchData
 from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
-from hlsim.training.teacher import PluginTeacher, Teacher
 from hlsim.training.tones_and_clicks import draw_sounds
 
 _VALIDATION_SECONDS = 2.0
 """Duration of the clips for validation."""
+
+_VALIDATION_BATCH = 8
+"""Number of items in a batch for validation."""
+
+_MEASURED_SHARE = 0.5
+"""Share of measured ears, if there are any. The others are random."""
 
 _MAX_BABBLE_VOICES = 4
 """Largest number of voices in babble."""
@@ -66,7 +71,7 @@ class TrainingData:
     valid_speech: Source | None = None
     valid_noise: Source | None = None
     valid_audiograms: Path | None = None
-    workers: int = field(default=0, compare=False)
+    workers: int = 0
 
     @classmethod
     def from_manifest(
@@ -74,8 +79,7 @@ class TrainingData:
     ) -> TrainingData:
         """Return the training data of a manifest: its splits ``train`` and ``valid``.
 
-        The difference between the manifest's noisy and clean speech is the noise, unless there is
-        an attribute ``noise``.
+        The difference between the manifest's noisy and clean speech is the noise.
 
         Args:
             manifest: CSV file, see ``read_manifest``.
@@ -84,90 +88,43 @@ class TrainingData:
                 ``audiograms``, which replace what the manifest has.
 
         Raises:
-            ValueError: The manifest is invalid, or has no training speech.
+            ValueError: The manifest is invalid.
         """
         folder = Path(manifest).parent if root is None else Path(root)
-        speech: dict[str, list[Path]] = {split: [] for split in SPLITS}
-        pairs: dict[str, list[tuple[Path, Path]]] = {split: [] for split in SPLITS}
+        speech: dict[str, list[Path]] = defaultdict(list)
+        pairs: dict[str, list[tuple[Path, Path]]] = defaultdict(list)
         for row in read_manifest(manifest, root):
             clean = folder / row.path
             speech[row.split].append(clean)
             if row.noisy:
                 pairs[row.split].append((clean, folder / row.noisy))
-        if not speech["train"]:
-            raise ValueError(
-                f"{manifest}: no row has the split 'train', which holds the speech to train on; "
-                "correct the column 'split'"
-            )
-        if not (speech["valid"] or attributes.get("valid_speech")):
-            warnings.warn(
-                f"{manifest}: no row has the split 'valid', so training speech is used for "
-                "validation; 'hlsim prepare --valid-share 0.1' moves a tenth of the speakers to "
-                "that split",
-                stacklevel=2,
-            )
-        if not attributes.get("noise"):
-            attributes["noise"] = pairs["train"]
-            attributes["valid_noise"] = attributes.get("valid_noise") or pairs["valid"]
-        attributes["valid_speech"] = attributes.get("valid_speech") or speech["valid"]
-        return cls(speech["train"], **attributes)
+        sources: dict[str, Any] = {
+            "valid_speech": speech["valid"],
+            "noise": pairs["train"],
+            "valid_noise": pairs["valid"],
+        }
+        replacements = {name: value for name, value in attributes.items() if value}
+        return cls(speech["train"], **(sources | replacements))
 
     def validation(self) -> TrainingData:
         """Return the data for validation as ``speech``, ``noise`` and ``audiograms``.
 
         They are ``valid_speech``, ``valid_noise`` and ``valid_audiograms`` where these are set, and
         otherwise the data for training.
-
-        Raises:
-            ValueError: Training and validation share files of speech or noise.
         """
-        for name in ("speech", "noise"):
-            training = getattr(self, name)
-            validation = getattr(self, f"valid_{name}")
-            if not training or not validation:
-                continue
-            shared = _resolved_files(training) & _resolved_files(validation)
-            if shared:
-                raise ValueError(
-                    f"{len(shared)} files of {name} are used for both training and validation, "
-                    f"such as {min(shared)}; use other files for validation, or leave "
-                    f"--valid-{name} out"
-                )
         return TrainingData(
             self.valid_speech or self.speech,
             self.valid_noise or self.noise,
             self.valid_audiograms or self.audiograms,
         )
 
-    def identity(self) -> dict[str, str]:
-        """Describe the data in order to recognise a training that should resume.
-
-        Returns:
-            Paths, or hashes of lists of files, by the name of the attribute.
-        """
-        return {
-            entry.name: _describe(getattr(self, entry.name))
-            for entry in fields(self)
-            if entry.compare
-        }
-
-
-def _resolved_files(source: Source) -> set[Path]:
-    """Return the absolute paths of files, or of the noisy file of each pair."""
-    files = find_audio(source) if isinstance(source, str | Path) else source
-    paths = [file[-1] if isinstance(file, tuple) else file for file in files]
-    return {path.resolve() for path in paths}
-
-
-def _describe(source: Any) -> str:
-    if source is None or isinstance(source, str | Path):
-        return str(source)
-    names = "\n".join(map(str, source))
-    return f"{len(source)} files, sha256 {hashlib.sha256(names.encode()).hexdigest()}"
+    def identity(self) -> str:
+        """Compute a hash of all paths, in order to recognise a training that should resume."""
+        return hashlib.sha256(repr(replace(self, workers=0)).encode()).hexdigest()
 
 
 class _RandomBatches(Dataset[Batch]):
-    """Batches of random speech, noise and ears, which depend on seed, step and rank alone."""
+    """Batches of random speech, noise and ears, which depend on the seed and the index alone."""
 
     recipe: TrainingRecipe
 
@@ -181,10 +138,9 @@ class _RandomBatches(Dataset[Batch]):
             measured = read_audiograms(data.audiograms, simulated=True)
             self.measured_ears = torch.tensor([ear.thresholds for _, ear in measured])
 
-    def __getitem__(self, step: Step) -> Batch:
-        seed = (self.recipe.seed * 1_000_003 + step.number) * 64 + step.rank
-        generator = torch.Generator().manual_seed(seed % 2**63)  # Larger seeds are rejected.
-        return self.draw(self.recipe.batch, generator)
+    def __getitem__(self, index: int) -> Batch:
+        seed = self.recipe.seed * 1_000_003 * MAX_DEVICES + index
+        return self.draw(self.recipe.batch, torch.Generator().manual_seed(seed))
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """Draw the tensors of a batch.
@@ -199,35 +155,18 @@ class _RandomBatches(Dataset[Batch]):
         """
         raise NotImplementedError
 
-    def _join_measured_ears(
-        self, ears: Tensor, share: float, shift_db: float, generator: torch.Generator
-    ) -> Tensor:
-        """Replace a share of random ears by measured ones, if there are any.
-
-        Args:
-            ears: Thresholds in dB HL with shape (items, 8).
-            share: Probability with which an ear is replaced.
-            shift_db: Largest random shift of a measured ear in dB.
-            generator: Source of the random numbers.
-        """
+    def draw_ears(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw random and measured ears in dB HL. Shape: -> (count, 8)."""
+        ears = draw_thresholds(count, generator)
         if self.measured_ears is None:
             return ears
-        numbers = torch.randint(len(self.measured_ears), (len(ears),), generator=generator)
-        measured = self.measured_ears[numbers]
-        if shift_db:
-            shift = 2.0 * torch.rand(len(ears), 1, generator=generator) - 1.0
-            measured = (measured + shift_db * shift).clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
-        return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
+        numbers = torch.randint(len(self.measured_ears), (count,), generator=generator)
+        return replace_share(ears, self.measured_ears[numbers], _MEASURED_SHARE, generator)
 
-    def _join_sounds(
-        self, clips: Tensor, generator: torch.Generator, early_share: float = 0.0
-    ) -> Tensor:
+    def replace_by_sounds(self, clips: Tensor, generator: torch.Generator) -> Tensor:
         """Replace the recipe's share of clips by tones and clicks, see ``draw_sounds``."""
-        share = self.recipe.sounds
-        if not share:
-            return clips
-        sounds = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator, early_share)
-        return torch.where(torch.rand(len(clips), 1, generator=generator) < share, sounds, clips)
+        sounds = draw_sounds(len(clips), clips.shape[-1], generator)
+        return replace_share(clips, sounds, self.recipe.sounds, generator)
 
 
 class _SimulatorBatches(_RandomBatches):
@@ -236,40 +175,21 @@ class _SimulatorBatches(_RandomBatches):
     recipe: SimulatorRecipe
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        ears = draw_thresholds(count, generator)
-        ears = self._join_measured_ears(ears, 0.4, 5.0, generator)
+        ears = self.draw_ears(count, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
-        clips = self._join_sounds(self.speech.draw(count, generator), generator)
-        signal = augment_speech(
-            clips,
-            noise,
-            ears,
-            NEURO_RATE,
-            generator,
-            levels=self.recipe.levels,
-            treated=self.recipe.treated,
-        )
+        clips = self.replace_by_sounds(self.speech.draw(count, generator), generator)
+        treatment: dict[str, Any] = {"levels": self.recipe.levels, "treated": self.recipe.treated}
+        signal = augment_speech(clips, noise, ears, generator, **treatment)
         return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
 
 
-class CompensatorBatches(_RandomBatches):
-    """Data set of random batches for a compensator: clean or noisy speech, tones and clicks.
-
-    The index of the data set is a ``Step``, the number of the training step. An entry is a batch, a
-    dictionary: ``clean`` is the reference and ``signal`` the input of the aid, both in pascals with
-    shape (items, time); ``thresholds`` are the ears in dB HL with shape (items, 8). For tones and
-    clicks, both signals are the same. If ``recipe.unreduced`` is above 0, ``noise_reduction`` is 0
-    for items without noise reduction and 1 for others, with shape (items,).
+class _CompensatorBatches(_RandomBatches):
+    """Batches for a compensator: clean or noisy speech, tones and clicks.
 
     Args:
         recipe: Settings of the training.
         data: Speech, noise and ears.
         ear: Ear of all items; None draws random ears.
-
-    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
-    >>> batches = CompensatorBatches(CompensatorRecipe(), TrainingData(speech), ear=None)
-    >>> {name: tensor.shape[0] for name, tensor in batches[Step(0)].items()}
-    {'clean': 2, 'signal': 2, 'thresholds': 2}
     """
 
     recipe: CompensatorRecipe
@@ -282,39 +202,30 @@ class CompensatorBatches(_RandomBatches):
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         recipe = self.recipe
-
-        def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return draw_uniform(low, high, (count, *shape), generator)
-
-        def equalise_some(clips: Tensor) -> Tensor:
-            gains = uniform(-15.0, 15.0, len(EQUALISER_FREQUENCIES))
-            equalised = equalise(clips, gains, torch.tensor(EQUALISER_FREQUENCIES), NEURO_RATE)
-            return torch.where(uniform(0.0, 1.0, 1) < recipe.equalised, equalised, clips)
-
-        voices = equalise_some(self.speech.draw(count, generator))
-        # Some tones begin before the clip. Otherwise a hearing aid would learn that a tone always
-        # follows silence.
-        clips = self._join_sounds(voices, generator, early_share=1.0)
-        clean = set_level(clips, uniform(*recipe.levels))
+        voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)
+        clips = self.replace_by_sounds(voices, generator)
+        clean = set_level(clips, draw_uniform(*recipe.levels, (count,), generator))
         signal = clean
         if self.noise is not None:
-            noise = equalise_some(self.noise.draw(count, generator))
+            noise = self.noise.draw(count, generator)
+            noise = equalise_share(noise, recipe.equalised, generator)
             if recipe.babble:
-                noise = torch.where(uniform(0.0, 1.0, 1) < recipe.babble, _babble(voices), noise)
+                noise = replace_share(noise, _babble(voices), recipe.babble, generator)
+            noisy = mix(clean, noise, draw_uniform(*recipe.snr, (count,), generator), NEURO_RATE)
+            noisy = replace_share(clean, noisy, recipe.noisy, generator)
             is_speech = (clips == voices).all(-1, keepdim=True)
-            is_noisy = (uniform(0.0, 1.0, 1) < recipe.noisy) & is_speech
-            noisy = mix(clean, noise, uniform(*recipe.snr), NEURO_RATE)
-            signal = torch.where(is_noisy, noisy, clean)
+            signal = torch.where(is_speech, noisy, clean)
         if self.ear is not None:
             ears = self.ear.expand(count, -1)
         else:
-            ears = draw_thresholds(count, generator)
-            ears = self._join_measured_ears(ears, 0.5, 0.0, generator)
-        batch = {"clean": clean, "signal": signal, "thresholds": ears}
-        if recipe.unreduced:
-            is_reduced = uniform(0.0, 1.0) >= recipe.unreduced
-            batch["noise_reduction"] = is_reduced.to(clean.dtype)
-        return batch
+            ears = self.draw_ears(count, generator)
+        is_reduced = torch.rand(count, generator=generator) >= recipe.unreduced
+        return {
+            "clean": clean,
+            "signal": signal,
+            "thresholds": ears,
+            "noise_reduction": is_reduced.to(clean.dtype),
+        }
 
 
 def _babble(voices: Tensor) -> Tensor:
@@ -325,38 +236,41 @@ def _babble(voices: Tensor) -> Tensor:
 
 
 def simulator_data(
-    data: TrainingData, recipe: SimulatorRecipe, plugin: PluginTeacher | None = None
+    data: TrainingData, recipe: SimulatorRecipe, teacher: Callable[[Tensor, Tensor], Tensor]
 ) -> BatchData:
     """Make the Lightning data module with the batches for the training of a Neuro-MSBG.
+
+    Clips for validation are not equalised, amplified or compressed.
 
     Args:
         data: Speech, noise and ears.
         recipe: Settings of the training.
-        plugin: Simulator that replaces the exact MSBG as the teacher, whose output is learnt.
+        teacher: Simulator whose output is learnt, a function of signals and thresholds.
 
     Returns:
         Batches for training and validation, with the teacher.
 
     Raises:
-        ValueError: Files are missing or invalid.
+        ValueError: Files are missing or invalid, or used for both training and validation.
 
+    >>> from hlsim import MSBG
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
-    >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe())
-    >>> list(batches.training[Step(0)])
+    >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe(), MSBG())
+    >>> list(batches.training[0])
     ['clean', 'signal', 'thresholds']
     """
-    return BatchData(
-        _SimulatorBatches(recipe, data),
-        simulator_validation(data, recipe),
-        teacher=Teacher(NEURO_RATE, plugin),
-        workers=data.workers,
-    )
+    levels = (50.0, 80.0) if recipe.treated else recipe.levels
+    plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False)
+    validation = _SimulatorBatches(plain, data.validation())
+    return _make_data(data, _SimulatorBatches(recipe, data), validation, teacher)
 
 
 def compensator_data(
     data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
 ) -> BatchData:
     """Make the Lightning data module with the batches for the training of a compensator.
+
+    Clips for validation are not equalised.
 
     Args:
         data: Speech, noise and ears.
@@ -367,55 +281,48 @@ def compensator_data(
         Batches for training and validation.
 
     Raises:
-        ValueError: Files are missing or invalid, or the recipe requires noise and there is none.
+        ValueError: Files are missing or invalid, or used for both training and validation, or the
+            recipe requires noise and there is none.
 
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> batches = compensator_data(TrainingData(speech), CompensatorRecipe(), ear=None)
-    >>> len(batches.validation)  # of 4 items each
-    2
+    >>> len(batches.validation)  # of 8 items
+    1
     """
-    needs_noise = [name for name in ("denoising", "intelligibility") if recipe.weights.get(name)]
-    if recipe.babble:
-        needs_noise.append("babble")
-    if needs_noise and not data.noise:
+    if (recipe.trains_noise_reduction() or recipe.babble) and not data.noise:
         raise ValueError(
-            f"{needs_noise[0]} in the recipe requires noise, but the data has none; "
-            "add a folder of noise (--noise)"
+            "denoising, intelligibility and babble in the recipe require noise, but the data has "
+            "none; add a folder of noise (--noise)"
         )
-    plain = replace(recipe, equalised=0.0, seconds=_VALIDATION_SECONDS)
-    batches = CompensatorBatches(plain, data.validation(), ear)
-    generator = torch.Generator().manual_seed(2_000 + recipe.seed)
-    validation = [batches.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
-    return BatchData(CompensatorBatches(recipe, data, ear), validation, workers=data.workers)
+    plain = replace(recipe, seconds=_VALIDATION_SECONDS, equalised=0.0)
+    validation = _CompensatorBatches(plain, data.validation(), ear)
+    return _make_data(data, _CompensatorBatches(recipe, data, ear), validation)
 
 
-def simulator_validation(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
-    """Draw the validation batches of a simulator: fixed clips of 2 s.
-
-    They are drawn as for training, but not equalised, amplified or compressed. If the recipe trains
-    on tones and clicks, one item of them, marked with ``sounds``, is added per three items of
-    speech.
+def _make_data(
+    data: TrainingData,
+    training: _RandomBatches,
+    validation: _RandomBatches,
+    teacher: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> BatchData:
+    """Draw the batches for validation, whose speech must not be used for training.
 
     Args:
-        data: Speech, noise and ears for training and validation.
-        recipe: Settings of the training.
-
-    Raises:
-        ValueError: Files are missing or invalid, or used for both training and validation.
-
-    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
-    >>> len(simulator_validation(TrainingData(speech), SimulatorRecipe()))  # of 8 items each
-    6
+        data: Speech, noise and ears.
+        training: Batches for training.
+        validation: Batches from which those for validation are drawn once.
+        teacher: See ``BatchData``.
     """
-    data = data.validation()
+    shared = set(training.speech.files) & set(validation.speech.files)
+    if data.valid_speech and shared:
+        raise ValueError(
+            f"{len(shared)} files are used for both training and validation, such as "
+            f"{min(shared)}; use other files for validation, or leave --valid-speech out"
+        )
+    recipe = training.recipe
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
-    levels = (50.0, 80.0) if recipe.treated else recipe.levels
-    plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False, sounds=0.0)
-    speech = _SimulatorBatches(plain, data)
-    batches = [speech.draw(8, generator) for _ in range(0, recipe.validation_items, 8)]
-    if recipe.sounds:
-        sounds = _SimulatorBatches(replace(plain, sounds=1.0), replace(data, noise=None))
-        marked = {"sounds": torch.ones(8, dtype=torch.bool)}
-        for _ in range(0, recipe.validation_items, 24):
-            batches.append(sounds.draw(8, generator) | marked)
-    return batches
+    batches = [
+        validation.draw(_VALIDATION_BATCH, generator)
+        for _ in range(0, recipe.validation_items, _VALIDATION_BATCH)
+    ]
+    return BatchData(training, batches, teacher=teacher, workers=data.workers)

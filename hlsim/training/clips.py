@@ -27,13 +27,16 @@ In a list, a pair of files, clean speech and its noisy version, stands for the n
 _SILENT_POWER = 1e-7
 """Mean square up to which a clip counts as silent, if the peak of its recording is 1.0."""
 
+_LOWEST_PEAK = 1e-9
+"""Peak below which a recording counts as silent."""
+
 
 class Clips:
     """Clips of equal length from the first channels of recordings, at one sample rate.
 
     Recordings are decoded when they are first drawn, and kept as 16-bit samples, up to 2 GB. A file
-    that is broken, silent, or has an unsupported sample rate causes one warning. Whenever this file
-    is drawn, another one is drawn instead.
+    that is broken or has an unsupported sample rate causes a warning, and another one is drawn
+    instead.
 
     Args:
         source: Folder or files, see ``Source``.
@@ -47,7 +50,7 @@ class Clips:
         samples: Length of a clip in samples.
 
     Raises:
-        ValueError: The folder does not exist or has no audio in it, or the clips have no samples.
+        ValueError: There are no files, or the folder does not exist.
 
     >>> folder = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> clips = Clips(folder, sample_rate=16000, seconds=0.5)
@@ -67,42 +70,36 @@ class Clips:
         pairs = [file if isinstance(file, tuple) else (None, file) for file in files]
         self.files = [file for _, file in pairs]
         self._clean_files = [clean for clean, _ in pairs]
+        if not self.files:
+            raise ValueError("expected files of speech or noise, got an empty list; add some")
         self.sample_rate = sample_rate
         self.repeat = repeat
         self.samples = round(seconds * sample_rate)
-        if self.samples < 1:
-            raise ValueError(
-                f"expected clips of {1.0 / sample_rate:.2g} s or more, got {seconds} s; increase "
-                "seconds"
-            )
         self._recordings: dict[int, Tensor] = {}  # 16-bit samples by index of the file
-        self._errors: dict[int, str] = {}  # messages by index of the file
 
     def __len__(self) -> int:
         return len(self.files)
 
     def read_recording(self, index: int) -> Tensor:
-        """Return a whole recording, scaled to a peak of 1.0.
+        """Return a whole recording, scaled to a peak of 1.0, or silence if it cannot be read.
 
         Args:
             index: Index of the file in ``files``.
 
         Returns:
             Samples with shape (time,).
-
-        Raises:
-            ValueError: The file cannot be read, or its first channel is silent.
         """
         if index not in self._recordings:
-            waveform = self._decode(index)
-            peak = float(waveform.abs().max())
-            if peak == 0.0:
-                raise ValueError(
-                    f"{self.files[index]}: its first channel is silent, and no other channel is "
-                    "used; move the sound to the first channel, or remove the file"
-                )
+            try:
+                waveform = self._decode(index)
+            except ValueError as error:
+                warnings.warn(f"left out: {error}", stacklevel=4)
+                waveform = torch.zeros(1)
+            peak = max(float(waveform.abs().max()), _LOWEST_PEAK)
             self._recordings[index] = (waveform / peak * 32767.0).round().to(torch.int16)
-            self._limit_memory()
+            while sum(map(len, self._recordings.values())) > MAX_SAMPLES_IN_MEMORY:
+                oldest = next(iter(self._recordings))
+                del self._recordings[oldest]
         return self._recordings[index].float() / 32767.0
 
     def cut_clip(self, index: int, position: float) -> Tensor:
@@ -141,21 +138,17 @@ class Clips:
         failures = 0
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
-            # Also drawn for a bad file, so that all processes draw the same numbers, whether they
-            # know the file already or not.
             position = float(torch.rand((), generator=generator))
-            if self._is_usable(index):
-                clip = self.cut_clip(index, position)
-                if float(clip.square().mean()) > _SILENT_POWER:
-                    clips.append(clip)
-                    failures = 0
-                    continue
+            clip = self.cut_clip(index, position)
+            if float(clip.square().mean()) > _SILENT_POWER:
+                clips.append(clip)
+                failures = 0
+                continue
             failures += 1
             if failures == MAX_FAILURES:
-                reason = self._errors.get(index, f"{self.files[index]}: the clip is silent")
                 raise ValueError(
-                    f"{failures} draws in a row gave no clip, the last because of {reason}; remove "
-                    "broken and silent recordings, or draw longer clips"
+                    f"{failures} draws in a row gave no clip, the last from {self.files[index]}; "
+                    "remove broken and silent recordings, or draw longer clips"
                 )
         return torch.stack(clips)
 
@@ -166,24 +159,6 @@ class Clips:
         if clean_file is not None:
             waveform = read_noisy(file, waveform, rate) - waveform
         return resample(waveform[:1], rate, self.sample_rate).squeeze(0)
-
-    def _limit_memory(self) -> None:
-        """Remove the oldest recordings from memory, except the last one."""
-        total = sum(map(len, self._recordings.values()))
-        while total > MAX_SAMPLES_IN_MEMORY and len(self._recordings) > 1:
-            total -= len(self._recordings.pop(next(iter(self._recordings))))
-
-    def _is_usable(self, index: int) -> bool:
-        """Return whether a file can be decoded, and warn the first time that it cannot."""
-        if index in self._errors:
-            return False
-        try:
-            self.read_recording(index)
-        except ValueError as error:
-            self._errors[index] = str(error)
-            warnings.warn(f"left out: {error}", stacklevel=3)
-            return False
-        return True
 
 
 def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
@@ -206,14 +181,9 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
     torch.Size([1, 64320])
     """
     noisy, rate = read_audio(path)
-    if rate != clean_rate:
+    if (rate, noisy.shape) != (clean_rate, clean.shape):
         raise ValueError(
-            f"{path}: expected the sample rate of the clean version, {clean_rate} Hz, got {rate} "
-            "Hz; resample one of them"
-        )
-    if noisy.shape != clean.shape:
-        raise ValueError(
-            f"{path}: expected as many channels and samples as in the clean version, "
-            f"{tuple(clean.shape)}, got {tuple(noisy.shape)}; replace one of them"
+            f"{path}: expected {clean_rate} Hz and (channels, samples) {tuple(clean.shape)} as in "
+            f"the clean version, got {rate} Hz and {tuple(noisy.shape)}; replace one of them"
         )
     return noisy

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from compensators.hearing_aid import HearingAid
@@ -18,12 +19,9 @@ from hlsim.training.data_module import Batch
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe
-from hlsim.training.trainer import TrainerOptions, train_network
+from hlsim.training.trainer import train_network
 
 Simulator = str | Path | nn.Module
-
-_NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
-"""Criteria that train a hearing aid's noise reduction. ``HearingLossLoss`` has the others."""
 
 
 class CompensatorTraining(TrainingModule):
@@ -39,7 +37,6 @@ class CompensatorTraining(TrainingModule):
         recipe: Settings of the network and of the training.
         simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
 
-    >>> import torch
     >>> module = CompensatorTraining(CompensatorRecipe(model={"channels": 8, "blocks": 1}))
     >>> speech, ears = 0.02 * torch.randn(1, 8000), torch.full((1, 8), 40.0)
     >>> batch = {"signal": speech, "clean": speech, "thresholds": ears}
@@ -50,57 +47,45 @@ class CompensatorTraining(TrainingModule):
     recipe: CompensatorRecipe
 
     def __init__(self, recipe: CompensatorRecipe, *, simulator: Simulator = "neuro-msbg") -> None:
-        kind = CONFIGS[recipe.kind]
-        network = initial_network(recipe, kind, build_compensator, load_compensator)
+        config = CONFIGS[recipe.kind].from_dict(recipe.model)
+        network = initial_network(recipe, partial(build_compensator, config), load_compensator)
         super().__init__(network, recipe)
-        used = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
-        self.noise_weights = {
-            name: used.pop(name) for name in _NOISE_REDUCTION_CRITERIA if name in used
-        }
-        self.trains_amplification = bool(used)
-        self.loss = HearingLossLoss(
-            simulator=simulator, reference=recipe.reference, criterion=used or "coherent-bands"
-        )
-        if isinstance(network, HearingAid):
-            self._freeze_parts(network)
-
-    def _freeze_parts(self, aid: HearingAid) -> None:
+        weights = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
+        self.denoising = weights.pop("denoising", 0.0)
+        self.intelligibility = weights.pop("intelligibility", 0.0)
+        self.trains_amplification = bool(weights)
+        self.loss = HearingLossLoss(simulator=simulator, criterion=weights or "coherent-bands")
         if not self.trains_amplification:
-            aid.correct.requires_grad_(False)
-        elif not self.noise_weights:
-            for part in (aid.enter, aid.recur, aid.leave):
+            network.correct.requires_grad_(False)
+        elif isinstance(network, HearingAid) and not (self.denoising or self.intelligibility):
+            for part in (network.enter, network.recur, network.leave):
                 part.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
         loss = signal.new_zeros(())
-        if "denoising" in self.noise_weights:
+        if self.denoising:
             error = attenuation_error(self.network, signal, clean)
-            loss = loss + self.noise_weights["denoising"] * error.mean()
-        if "intelligibility" in self.noise_weights:
+            loss = loss + self.denoising * error.mean()
+        if self.intelligibility:
             missing = missing_intelligibility(self.network, signal, clean, ears)
-            loss = loss + self.noise_weights["intelligibility"] * missing.mean()
-        if self.trains_amplification:
-            loss = loss + self._amplification_loss(batch)
-        return loss
-
-    def _amplification_loss(self, batch: Batch) -> Tensor:
-        signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
-        if "noise_reduction" not in batch:
-            sliders = {"noise_reduction": 1.0} if isinstance(self.network, HearingAid) else {}
-            return self.loss(self.network(signal, ears, **sliders), clean, ears)
-        # An ear without noise reduction should perceive the noisy speech.
+            loss = loss + self.intelligibility * missing.mean()
+        if not self.trains_amplification:
+            return loss
+        if not isinstance(self.network, HearingAid):
+            return loss + self.loss(self.network(signal, ears), clean, ears)
         slider = batch["noise_reduction"]
-        reference = signal + slider.unsqueeze(-1) * (clean - signal)
-        return self.loss(self.network(signal, ears, slider), reference, ears)
+        # An ear without noise reduction should perceive the noisy speech.
+        reference = torch.lerp(signal, clean, slider.unsqueeze(-1))
+        return loss + self.loss(self.network(signal, ears, slider), reference, ears)
 
-    def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the loss of a validation batch, ``valid_loss`` with shape (1,)."""
-        return {"valid_loss": self.training_loss(batch)[None]}
+    def evaluate(self, batch: Batch) -> Tensor:
+        """Compute the loss of a validation batch, with shape (1,)."""
+        return self.training_loss(batch)[None]
 
-    def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+    def summarise(self, values: Tensor) -> dict[str, float]:
         """Compute ``valid_loss``, the mean over validation batches, and ``score``, minus that."""
-        mean = float(values["valid_loss"].double().mean())
+        mean = float(values.double().mean())
         return {"score": -mean, "valid_loss": mean}
 
 
@@ -111,7 +96,7 @@ def train_compensator(
     out: str | Path,
     audiogram: Audiogram | None = None,
     simulator: Simulator = "neuro-msbg",
-    **options: Unpack[TrainerOptions],
+    **options: Any,
 ) -> Path:
     """Train a compensator, or resume its training, and save it as it is when it validates best.
 
@@ -121,7 +106,7 @@ def train_compensator(
         out: Folder for the results. A training that was interrupted resumes from it.
         audiogram: Ear of a personal compensator; None trains a general one on random ears.
         simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
-        options: Device, time limit and progress, see ``TrainerOptions``.
+        options: ``max_minutes`` and options of Lightning's ``Trainer``, see ``train_network``.
 
     Returns:
         The folder that ``load_compensator`` reads, ``out/checkpoint``.
@@ -134,22 +119,21 @@ def train_compensator(
     ...     ear = Audiogram.standard("N4")
     ...     return load_compensator(train_compensator(data, recipe, out=out, audiogram=ear))
     """
-    module = CompensatorTraining(recipe, simulator=simulator)
-    batches = compensator_data(data, recipe, audiogram)
-    is_module = isinstance(simulator, nn.Module)
     about: dict[str, Any] = {
+        "data": data.identity(),
         "audiogram": audiogram.to_dict() if audiogram else None,
-        "simulator": type(simulator).__name__ if is_module else str(simulator),
+        "simulator": str(simulator),
     }
-    if not is_module and str(simulator) != "msbg":
+    if isinstance(simulator, nn.Module):
+        about["simulator"] = type(simulator).__name__
+    elif str(simulator) != "msbg":
         # The folder may contain another simulator when the training resumes.
-        about["simulator_sha256"] = read_record(simulator)["sha256"]  # type: ignore[arg-type]
+        about["simulator_sha256"] = read_record(simulator)["sha256"]
     return train_network(
-        module,
-        batches,
+        CompensatorTraining(recipe, simulator=simulator),
+        compensator_data(data, recipe, audiogram),
         recipe.kind,
         out=out,
-        identity=data.identity() | about,
         about=about,
         **options,
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import lightning as L
 import torch
@@ -13,13 +13,8 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from hlsim.neuro.config import ModelConfig
-from hlsim.training.callbacks import remove_score
 from hlsim.training.data_module import Batch
 from hlsim.training.recipes import TrainingRecipe
-
-Network = TypeVar("Network", bound=nn.Module)
-Config = TypeVar("Config", bound=ModelConfig)
 
 _WARM_UP_STEPS = 50
 """Number of steps over which the learning rate rises."""
@@ -38,13 +33,11 @@ class TrainingModule(L.LightningModule):
     Attributes:
         validation: Results of the last validation by name. The best network has the highest
             ``score``.
-        start_validation: Results of the validation before the first step.
-        description: Recipe and data. A training resumes only with the same description.
 
     >>> from hlsim.training.recipes import CompensatorRecipe
     >>> module = TrainingModule(nn.Linear(2, 1), CompensatorRecipe())
-    >>> [parameter.numel() for parameter in module.trained_parameters()]
-    [2, 1]
+    >>> list(module.state_dict())
+    ['network.weight', 'network.bias']
     """
 
     def __init__(self, network: nn.Module, recipe: TrainingRecipe) -> None:
@@ -52,43 +45,38 @@ class TrainingModule(L.LightningModule):
         self.network: Any = network
         self.recipe = recipe
         self.validation: dict[str, float] = {}
-        self.start_validation: dict[str, float] = {}
-        self.description: dict[str, Any] = {}
-        self._evaluations: list[dict[str, Tensor]] = []
+        self._measured_values: list[Tensor] = []
 
     def training_loss(self, batch: Batch) -> Tensor:
         """Compute the loss of a batch, a scalar."""
         raise NotImplementedError
 
-    def evaluate(self, batch: Batch) -> dict[str, Tensor]:
+    def evaluate(self, batch: Batch) -> Tensor:
         """Measure the network on a validation batch.
 
         Returns:
-            Named measured values, each with shape (items,) or, for a mean over items, (1,).
+            Measured values with shape (items,) or, for a mean over items, (1,).
         """
         raise NotImplementedError
 
-    def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+    def summarise(self, values: Tensor) -> dict[str, float]:
         """Summarise the measured values of all validation batches.
 
         Args:
-            values: Values of all items under each name, see ``evaluate``.
+            values: Values of all items, see ``evaluate``.
 
         Returns:
             Named means or quantiles, and ``score``, which is highest for the best network.
         """
         raise NotImplementedError
 
-    def trained_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that the optimiser changes."""
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = self.training_loss(batch)
-        if not math.isfinite(float(loss.detach())):
+        value = float(loss.detach())
+        if not math.isfinite(value):
             raise ValueError(
-                f"the loss is {float(loss.detach())} at step {self.global_step}, expected a finite "
-                "value; lower learning_rate in the recipe"
+                f"the loss is {value} at step {self.global_step}, expected a finite value; lower "
+                "learning_rate in the recipe"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
@@ -100,26 +88,21 @@ class TrainingModule(L.LightningModule):
             self.trainer.should_stop = True
 
     def on_validation_epoch_start(self) -> None:
-        self._evaluations = []
+        self._measured_values = []
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        self._evaluations.append(self.evaluate(batch))
+        self._measured_values.append(self.evaluate(batch))
 
     def on_validation_epoch_end(self) -> None:
-        self.validation = self.summarise(concatenate(self._evaluations))
+        self.validation = self.summarise(torch.cat(self._measured_values))
         self.log_dict(self.validation, prog_bar=True, batch_size=1, sync_dist=True)
         if self.trainer.progress_bar_callback is None:  # a progress bar shows the measures
-            measures = remove_score(self.validation)
-            texts = [f"{name} {value:.3f}" for name, value in measures.items()]
-            self.print(f"step {self.global_step} of {self.trainer.max_steps}: {', '.join(texts)}")
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["start_validation"] = self.start_validation
-        checkpoint["description"] = self.description
+            texts = [f"{name} {value:.3f}" for name, value in self.validation.items()]
+            self.print(f"step {self.global_step} of {self.recipe.steps}: {', '.join(texts)}")
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         optimizer = torch.optim.AdamW(
-            self.trained_parameters(), lr=self.recipe.learning_rate, weight_decay=1e-4
+            self.network.parameters(), lr=self.recipe.learning_rate, weight_decay=1e-4
         )
         scheduler = LambdaLR(optimizer, partial(relative_learning_rate, steps=self.recipe.steps))
         return {
@@ -146,62 +129,36 @@ def relative_learning_rate(step: int, steps: int) -> float:
     return rise * max(0.01, fall)
 
 
-def concatenate(evaluations: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Concatenate the measured values of several batches by name. A batch may lack names.
-
-    >>> concatenate([{"snr": torch.ones(1)}, {"snr": torch.zeros(1)}, {}])
-    {'snr': tensor([1., 0.])}
-    """
-    lists: dict[str, list[Tensor]] = {}
-    for evaluation in evaluations:
-        for name, values in evaluation.items():
-            lists.setdefault(name, []).append(values)
-    return {name: torch.cat(values) for name, values in lists.items()}
-
-
 def initial_network(
-    recipe: TrainingRecipe,
-    config_kind: type[Config],
-    build: Callable[[Config], Network],
-    load: Callable[[str], nn.Module],
-) -> Network:
+    recipe: TrainingRecipe, build: Callable[[], nn.Module], load: Callable[[str], nn.Module]
+) -> Any:
     """Build the network to train, with random weights or with those of a checkpoint.
 
     Args:
         recipe: Recipe with the name of the checkpoint (``start``), the settings of the network
             (``model``) and the seed of random weights.
-        config_kind: Class of the network's settings, such as ``NeuroConfig``.
-        build: Function that builds a network with such settings.
+        build: Function that builds a network with the settings of the recipe.
         load: Function that loads the network of a checkpoint by its name.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind, or its settings differ from
             those of the recipe.
 
-    >>> from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
+    >>> from hlsim.neuro import NeuroMSBG, load_pretrained
     >>> from hlsim.training.recipes import SimulatorRecipe
-    >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
-    >>> initial_network(recipe, NeuroConfig, NeuroMSBG, load_pretrained).config.channels
-    4
+    >>> recipe = SimulatorRecipe(start="neuro-msbg-cnn")
+    >>> initial_network(recipe, NeuroMSBG, load_pretrained).config.channels
+    32
     """
-    config = config_kind.from_dict(recipe.model)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.seed)
+        network: Any = build()
     if not recipe.start:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(recipe.seed)
-            return build(config)
-    network: Any = load(recipe.start)
-    if not isinstance(getattr(network, "config", None), config_kind):
+        return network
+    start: Any = load(recipe.start)
+    if type(start) is not type(network) or (recipe.model and start.config != network.config):
         raise ValueError(
-            f"the checkpoint {recipe.start!r} is a {type(network).__name__}, expected a network "
-            f"with {config_kind.__name__}; choose another start"
+            f"the start {recipe.start!r} is not a {type(network).__name__} with the settings "
+            "'model' of the recipe; choose another start, or leave 'model' out"
         )
-    if recipe.model and config != network.config:
-        settings = config.to_dict()
-        start_settings = network.config.to_dict()
-        names = [name for name, value in settings.items() if value != start_settings[name]]
-        raise ValueError(
-            f"the recipe's model differs from its start {recipe.start!r} in {', '.join(names)}; "
-            "leave 'model' out"
-        )
-    trained: Network = network.train().requires_grad_(True)
-    return trained
+    return start.train().requires_grad_(True)

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Unpack
+from typing import Any
 
 import torch
+from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
 from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
+from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
+from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.batches import TrainingData, simulator_data
-from hlsim.training.callbacks import WeightAverage
+from hlsim.training.callbacks import update_averages
 from hlsim.training.data_module import Batch
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.teacher import find_teacher
-from hlsim.training.trainer import TrainerOptions, train_network
+from hlsim.training.trainer import train_network
 
 _POWER_FLOOR = 1e-18
 """Power in Pa^2 that is added to the power of a signal before dividing by it."""
@@ -37,14 +40,15 @@ class SimulatorTraining(TrainingModule):
     >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
     >>> signal, ears = 0.02 * torch.randn(1, 4000), torch.full((1, 8), 40.0)
     >>> batch = {"signal": signal, "thresholds": ears, "impaired": 0.1 * signal}
-    >>> SimulatorTraining(recipe).evaluate(batch)["valid_snr"].shape
+    >>> SimulatorTraining(recipe).evaluate(batch).shape
     torch.Size([1])
     """
 
     recipe: SimulatorRecipe
 
     def __init__(self, recipe: SimulatorRecipe) -> None:
-        network = initial_network(recipe, NeuroConfig, NeuroMSBG, load_pretrained)
+        build = partial(NeuroMSBG, NeuroConfig.from_dict(recipe.model))
+        network = initial_network(recipe, build, load_pretrained)
         network.autocast_dtype = None if recipe.precision == "float32" else torch.bfloat16
         super().__init__(network, recipe)
 
@@ -64,34 +68,23 @@ class SimulatorTraining(TrainingModule):
             parts |= paper_parts(perceived, target)
         return weighted_sum(parts, weights).mean()
 
-    def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the ratio of the teacher's output to the network's error for each item.
-
-        Returns:
-            The ratios in dB, (items,), under one name: ``valid_snr`` for a batch of speech, or
-            ``valid_sounds_snr`` for a batch of tones and clicks.
-        """
+    def evaluate(self, batch: Batch) -> Tensor:
+        """Compute the ratio of the teacher's output to the network's error in dB for each item."""
         perceived = self.network(batch["signal"], batch["thresholds"])
-        name = "valid_sounds_snr" if "sounds" in batch else "valid_snr"
-        return {name: -noise_to_signal_db(perceived, batch["impaired"])}
+        return -noise_to_signal_db(perceived, batch["impaired"])
 
-    def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+    def summarise(self, values: Tensor) -> dict[str, float]:
         """Compute the median and the 10th percentile of the ratios, and a score for the network.
 
-        The score is the median plus half the 10th percentile in dB. Those of speech and of sounds
-        are weighted by their shares in training.
+        The score is the median plus half the 10th percentile in dB.
         """
-        summary: dict[str, float] = {}
-        score = 0.0
-        for name, snr in values.items():
-            median = float(snr.median())
-            lowest_tenth = float(snr.quantile(0.1))
-            summary[f"{name}_median"] = median
-            summary[f"{name}_worst_tenth"] = lowest_tenth
-            sounds = self.recipe.sounds
-            share = sounds if name == "valid_sounds_snr" else 1.0 - sounds
-            score += share * (median + 0.5 * lowest_tenth)
-        return {"score": score, **summary}
+        median = float(values.median())
+        worst_tenth = float(values.quantile(0.1))
+        return {
+            "score": median + 0.5 * worst_tenth,
+            "valid_snr_median": median,
+            "valid_snr_worst_tenth": worst_tenth,
+        }
 
 
 def train_simulator(
@@ -100,7 +93,7 @@ def train_simulator(
     *,
     out: str | Path,
     teacher: str = "msbg",
-    **options: Unpack[TrainerOptions],
+    **options: Any,
 ) -> Path:
     """Train a simulator, or resume its training, and save it as it is when it validates best.
 
@@ -109,7 +102,7 @@ def train_simulator(
         recipe: Network, criteria and number of steps.
         out: Folder for the results. A training that was interrupted resumes from it.
         teacher: ``"msbg"``, the exact MSBG, or the name of a plug-in, see ``PluginTeacher``.
-        options: Device, time limit and progress, see ``TrainerOptions``.
+        options: ``max_minutes`` and options of Lightning's ``Trainer``, see ``train_network``.
 
     Returns:
         The folder that ``load_pretrained`` reads, ``out/checkpoint``.
@@ -122,17 +115,17 @@ def train_simulator(
     ...     recipe = SimulatorRecipe(steps=1000)
     ...     return load_pretrained(train_simulator(TrainingData(Path(speech)), recipe, out=out))
     """
-    module = SimulatorTraining(recipe)
     plugin = find_teacher(teacher)
-    about = {} if plugin is None else {"teacher": str(plugin)}
-    batches = simulator_data(data, recipe, plugin)
+    about = {"data": data.identity()}
+    if plugin is not None:
+        about["teacher"] = str(plugin)
+    average = partial(update_averages, decay=recipe.average)
     return train_network(
-        module,
-        batches,
+        SimulatorTraining(recipe),
+        simulator_data(data, recipe, plugin or MSBG(sample_rate=NEURO_RATE)),
         SIMULATOR,
         out=out,
-        identity=data.identity() | about,
         about=about,
-        callbacks=[WeightAverage(recipe.average)] if recipe.average else [],
+        callbacks=[WeightAveraging(use_buffers=False, multi_avg_fn=average)],
         **options,
     )

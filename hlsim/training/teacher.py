@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
-from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
 
@@ -31,16 +30,13 @@ class PluginTeacher:
             half a second of noise has another shape, is delayed or is not finite.
 
     >>> teacher = PluginTeacher("hlsim:MSBG")
-    >>> teacher(0.02 * torch.randn(1, 16000), torch.zeros(1, 8), sample_rate=16000).shape
+    >>> teacher(0.02 * torch.randn(1, 16000), torch.zeros(1, 8)).shape
     torch.Size([1, 16000])
     """
 
     def __init__(self, name: str) -> None:
         self.plugin = WaveformPlugin(name, "teacher")
-        try:
-            rate = check_rate(getattr(self.plugin.function, "sample_rate", NEURO_RATE))
-        except ValueError as error:
-            raise ValueError(f"teacher {name}: {error}") from error
+        rate = check_rate(getattr(self.plugin.function, "sample_rate", NEURO_RATE))
         self.sample_rate = rate
         noise = torch.randn(1, rate // 2, generator=torch.Generator().manual_seed(0))
         self.plugin.check_aligned(set_level(noise, 65.0), rate, torch.zeros(1, len(FREQUENCIES)))
@@ -48,53 +44,18 @@ class PluginTeacher:
     def __str__(self) -> str:
         return str(self.plugin)
 
-    def __call__(self, signals: Tensor, thresholds: Tensor, sample_rate: int) -> Tensor:
+    def __call__(self, signals: Tensor, thresholds: Tensor) -> Tensor:
         """Simulate hearing losses. Signals are resampled to the simulator's rate and back.
 
         Args:
-            signals: Signals in pascals with shape (items, time).
-            thresholds: Ears in dB HL with shape (items, 8).
-            sample_rate: Sample rate of the signals in Hz.
-
-        Returns:
-            Perceived signals in pascals with shape (items, time).
-        """
-        perceived = self.plugin(resample(signals, sample_rate, self.sample_rate), thresholds)
-        return resample(perceived, self.sample_rate, sample_rate)[..., : signals.shape[-1]]
-
-
-class Teacher(nn.Module):
-    """Simulator whose output a network learns: the exact MSBG, or a user's simulator.
-
-    Args:
-        sample_rate: Sample rate of the signals in Hz.
-        plugin: Simulator that replaces the exact MSBG.
-
-    >>> Teacher(16000)(0.02 * torch.randn(2, 8000), torch.full((2, 8), 40.0)).shape
-    torch.Size([2, 8000])
-    """
-
-    def __init__(self, sample_rate: int, plugin: PluginTeacher | None = None) -> None:
-        super().__init__()
-        self.sample_rate = sample_rate
-        self.plugin = plugin
-        self.msbg = MSBG(sample_rate=sample_rate)
-
-    @torch.no_grad()
-    def forward(self, signals: Tensor, thresholds: Tensor) -> Tensor:
-        """Simulate hearing losses.
-
-        Args:
-            signals: Signals in pascals with shape (items, time).
+            signals: Signals at 16 kHz in pascals with shape (items, time).
             thresholds: Ears in dB HL with shape (items, 8).
 
         Returns:
-            Perceived signals in pascals with shape (items, time), time-aligned with ``signals``.
+            Perceived signals at 16 kHz in pascals with shape (items, time).
         """
-        if self.plugin is not None:
-            return self.plugin(signals, thresholds, self.sample_rate)
-        perceived: Tensor = self.msbg(signals, thresholds)
-        return perceived
+        perceived = self.plugin(resample(signals, NEURO_RATE, self.sample_rate), thresholds)
+        return resample(perceived, self.sample_rate, NEURO_RATE)[..., : signals.shape[-1]]
 
 
 def find_teacher(name: str) -> PluginTeacher | None:

@@ -9,6 +9,7 @@ import math
 import torch
 from torch import Tensor
 
+from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import draw_uniform
 
 _LOWEST_TONE, _HIGHEST_TONE = 100.0, 7500.0  # in Hz
@@ -17,17 +18,12 @@ _MAX_CLICKS = 8
 _RISE_SECONDS = 0.01
 
 
-def draw_sounds(
-    items: int,
-    samples: int,
-    sample_rate: int,
-    generator: torch.Generator,
-    early_share: float = 0.0,
-) -> Tensor:
-    """Draw sounds that are not speech, without a calibrated level.
+def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
+    """Draw sounds at 16 kHz that are not speech, without a calibrated level.
 
     Items 0, 2, 4 and so on have one to four steady tones, which begin together at a random time, in
-    the first half of the item or before it, and rise over 10 ms. The other items have one to eight
+    the first half of the item or before it, and rise over 10 ms. If no tone began before the item,
+    a network would learn that a tone always follows silence. The other items have one to eight
     clicks of one sample.
 
     The frequency of about half of the tones is a multiple of 250 Hz, as in audiometry. Such a tone
@@ -37,15 +33,12 @@ def draw_sounds(
     Args:
         items: Number of sounds.
         samples: Length of each sound in samples.
-        sample_rate: Sample rate in Hz.
         generator: Source of the random numbers.
-        early_share: Longest time by which the tones may begin before the start of the item, as a
-            share of half its length. With 0, they begin within the item.
 
     Returns:
         Sounds with shape (items, samples).
 
-    >>> draw_sounds(4, 16000, 16000, torch.Generator()).shape
+    >>> draw_sounds(4, 16000, torch.Generator()).shape
     torch.Size([4, 16000])
     """
 
@@ -62,10 +55,10 @@ def draw_sounds(
     time = torch.arange(samples)
     # In single precision, the rounding errors of the phase would be noise 50 dB below the tone.
     start_periods = uniform(0.0, 1.0, _MAX_TONES).unsqueeze(-1)
-    periods = start_periods + hertz.double().unsqueeze(-1) * time / sample_rate
+    periods = start_periods + hertz.double().unsqueeze(-1) * time / NEURO_RATE
     tones = amplitudes.unsqueeze(-1) * torch.sin(2.0 * math.pi * periods).float()
-    starts = uniform(-early_share * 0.5 * samples, 0.5 * samples, 1)
-    rise = ((time - starts) / (_RISE_SECONDS * sample_rate)).clamp(0.0, 1.0)
+    starts = uniform(-0.5 * samples, 0.5 * samples, 1)
+    rise = ((time - starts) / (_RISE_SECONDS * NEURO_RATE)).clamp(0.0, 1.0)
 
     positions = (uniform(0.0, 1.0, _MAX_CLICKS) * samples).long().clamp_max(samples - 1)
     heights = uniform(-1.0, 1.0, _MAX_CLICKS)

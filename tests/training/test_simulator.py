@@ -1,4 +1,4 @@
-"""A simulator learns, and its batches match their description."""
+"""A simulator learns, from the exact MSBG or from another teacher."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,16 +9,14 @@ import torch
 
 pytest.importorskip("lightning")
 
-from hlsim.audio import find_audio, write_audio
-from hlsim.calibration import level_spl
+from hlsim import MSBG
+from hlsim.audio import write_audio
 from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
-from hlsim.training.batches import TrainingData, simulator_data, simulator_validation
-from hlsim.training.data_module import Batch, Step
-from hlsim.training.module import concatenate
+from hlsim.training.batches import TrainingData, simulator_data
+from hlsim.training.data_module import Batch
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
-from hlsim.training.teacher import PluginTeacher
 from tests.helpers import write_ears
 from tests.training.gradients import check_gradients
 
@@ -44,59 +42,33 @@ def rich(speech_dir: Path, tmp_path: Path) -> TrainingData:
     return TrainingData(speech_dir / "train", noise, ears, valid_speech=valid)
 
 
-def training_batch(data: TrainingData, recipe: SimulatorRecipe, step: int = 0) -> Batch:
-    batches = simulator_data(data, recipe)
-    batch: Batch = batches.on_after_batch_transfer(batches.training[Step(step)], 0)
-    return batch
+def training_batch(data: TrainingData, recipe: SimulatorRecipe) -> Batch:
+    batches = simulator_data(data, recipe, MSBG())
+    return batches.on_after_batch_transfer(batches.training[0], 0)
 
 
-def validation(module: SimulatorTraining, data: TrainingData) -> dict[str, float]:
-    """Validate without a Trainer."""
-    with torch.no_grad():
-        batches = list(simulator_data(data, module.recipe).val_dataloader())
-        values = [module.evaluate(batch) for batch in batches]
-    return module.summarise(concatenate(values))
-
-
-def test_a_training_leaves_a_checkpoint_with_its_record(data: TrainingData, tmp_path: Path) -> None:
-    folder = train_simulator(data, SMALL, out=tmp_path / "out", accelerator="cpu")
+def test_a_training_leaves_the_best_average_with_its_record(
+    data: TrainingData, tmp_path: Path
+) -> None:
+    recipe = replace(SMALL, learning_rate=0.02)
+    folder = train_simulator(data, recipe, out=tmp_path, accelerator="cpu")
     about = read_record(folder)["about"]
-    assert about["recipe"]["batch"] == 2 and about["steps"] in (4, 8)
-    module = SimulatorTraining(SMALL)
+    assert about["recipe"]["batch"] == 2 and about["steps"] == 8
+    module = SimulatorTraining(recipe)
     for name in ("start_validation", "validation"):
-        summary = validation(module, data)
-        score = summary.pop("score")
-        assert about[name] == pytest.approx(summary, abs=1e-3) and score == pytest.approx(
-            summary["valid_snr_median"] + 0.5 * summary["valid_snr_worst_tenth"]
-        )
+        batches = simulator_data(data, recipe, MSBG())
+        with torch.no_grad():
+            values = [
+                module.evaluate(batches.on_after_batch_transfer(batch, 0))
+                for batch in batches.validation
+            ]
+        assert about[name] == pytest.approx(module.summarise(torch.cat(values)), abs=1e-3)
         module.network = load_pretrained(folder)
-
-
-def test_the_average_is_validated_and_saved(data: TrainingData, tmp_path: Path) -> None:
-    folder = train_simulator(data, replace(SMALL, steps=4), out=tmp_path, accelerator="cpu")
-    assert read_record(folder)["about"]["steps"] == 4
-    released = load_pretrained(folder).state_dict()
+    saved = module.network.state_dict()
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)
     average, current = state["state_dict"], state["current_model_state"]
-    assert all(torch.equal(released[name], average[f"network.{name}"]) for name in released)
-    assert any(not torch.equal(released[name], current[f"network.{name}"]) for name in released)
-
-
-@pytest.mark.slow
-def test_a_short_training_beats_the_untrained_network(data: TrainingData, tmp_path: Path) -> None:
-    recipe = SimulatorRecipe(
-        model={"channels": 16, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
-        steps=60,
-        batch=3,
-        seconds=0.6,
-        learning_rate=3e-3,
-        average=0.9,
-        validate_every=60,
-        validation_items=16,
-    )
-    about = read_record(train_simulator(data, recipe, out=tmp_path, accelerator="cpu"))["about"]
-    gain = about["validation"]["valid_snr_median"] - about["start_validation"]["valid_snr_median"]
-    assert gain > 0.5
+    assert all(torch.equal(saved[name], average[f"network.{name}"]) for name in saved)
+    assert any(not torch.equal(saved[name], current[f"network.{name}"]) for name in saved)
 
 
 def test_a_start_has_the_same_trained_parameters_as_random_weights() -> None:
@@ -143,12 +115,6 @@ def test_another_teacher_is_recorded_and_needs_another_folder(
     assert read_record(folder)["about"]["teacher"] == "dead_region:DeadRegion"
     with pytest.raises(ValueError, match="differs in teacher;"):
         train_simulator(data, recipe, **settings)
-    targets = []
-    for teacher in (None, PluginTeacher("dead_region:DeadRegion")):
-        batches = simulator_data(data, SMALL, teacher)
-        targets.append(batches.on_after_batch_transfer(batches.training[Step(0)], 0))
-    assert torch.equal(targets[0]["signal"], targets[1]["signal"])
-    assert not torch.allclose(targets[0]["impaired"], targets[1]["impaired"])
 
 
 @pytest.mark.parametrize("missing", ["speech", "noise", "audiograms", "valid_speech"])
@@ -160,57 +126,3 @@ def test_missing_data_is_named_before_anything_is_written(
     with pytest.raises(ValueError, match=f"^{nowhere}"):
         train_simulator(TrainingData(**sources), SMALL, out=tmp_path / "out", accelerator="cpu")
     assert not (tmp_path / "out").exists()
-
-
-def test_files_are_not_used_for_both_training_and_validation(
-    speech_dir: Path, tmp_path: Path
-) -> None:
-    train_dir, valid = speech_dir / "train", speech_dir / "valid"
-    link = tmp_path / "link"
-    link.symlink_to(train_dir)
-    files = [*find_audio(train_dir), *find_audio(valid)]
-    sources: tuple[dict[str, Any], ...] = (
-        {"speech": speech_dir, "valid_speech": valid},
-        {"speech": train_dir, "valid_speech": link},
-        {"speech": files, "valid_speech": valid},
-        {"speech": train_dir, "noise": speech_dir, "valid_noise": valid},
-    )
-    for source in sources:
-        with pytest.raises(ValueError, match="both training and validation"):
-            simulator_data(TrainingData(**source), SMALL)
-
-
-def test_the_validation_set_is_fixed_and_as_described(rich: TrainingData) -> None:
-    recipe = replace(SMALL, validation_items=24)
-    batches = simulator_validation(rich, recipe)
-    for first, second in zip(batches, simulator_validation(rich, recipe), strict=True):
-        assert all(torch.equal(first[name], second[name]) for name in ("signal", "thresholds"))
-    signals = torch.cat([batch["signal"] for batch in batches])
-    ears = torch.cat([batch["thresholds"] for batch in batches])
-    assert signals.shape == (24, 32000) and ears.shape == (24, 8)
-    levels = level_spl(signals)
-    assert float(levels.min()) >= 50.0 and float(levels.max()) <= 80.0 and float(levels.std()) > 5.0
-    again = simulator_validation(rich, replace(recipe, seed=1))
-    other = torch.cat([batch["signal"] for batch in again])
-    assert not torch.equal(other, signals)
-
-
-def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
-    speech, both = (
-        validation(SimulatorTraining(recipe), data)
-        for recipe in (SMALL, replace(SMALL, sounds=0.25))
-    )
-    median, low = both["valid_sounds_snr_median"], both["valid_sounds_snr_worst_tenth"]
-    assert both["valid_snr_median"] == speech["valid_snr_median"]
-    assert both["score"] == pytest.approx(0.75 * speech["score"] + 0.25 * (median + 0.5 * low))
-
-
-@pytest.mark.parametrize(("treated", "low", "high"), [(True, 50.0, 80.0), (False, 85.0, 90.0)])
-def test_validation_has_the_levels_of_speech_before_treatment(
-    treated: bool, low: float, high: float, rich: TrainingData
-) -> None:
-    recipe = SimulatorRecipe(sounds=0.1, treated=treated, levels=(85.0, 90.0))
-    batches = simulator_validation(rich, recipe)
-    levels = torch.cat([level_spl(batch["signal"]) for batch in batches])
-    assert len(levels) == 64 and sum("sounds" in batch for batch in batches) == 2
-    assert low - 0.01 <= float(levels.min()) < float(levels.max()) <= high + 0.01

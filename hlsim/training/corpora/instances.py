@@ -19,11 +19,11 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.active_level import active_level_db
 from hlsim.dsp.resample import resample
+from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.clips import read_noisy
 from hlsim.training.corpora.manifest import Utterance
 from hlsim.training.ears import draw_thresholds
-from hlsim.training.teacher import Teacher
 
 _Input = Literal["clean", "noisy"]
 """Version of an utterance that an instance processes."""
@@ -69,7 +69,7 @@ class Instances(Dataset[dict[str, Tensor]]):
     ) -> None:
         self.root = Path(root)
         self.level = level
-        self.teacher = Teacher(NEURO_RATE)
+        self.msbg = MSBG(sample_rate=NEURO_RATE)
         self.items: list[tuple[Utterance, Audiogram, _Input]] = []
         turns = cycle(ears)
         for utterance in utterances:
@@ -80,6 +80,7 @@ class Instances(Dataset[dict[str, Tensor]]):
     def __len__(self) -> int:
         return len(self.items)
 
+    @torch.no_grad()
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         utterance, ear, name = self.items[index]
         thresholds = torch.tensor(ear.thresholds)
@@ -88,7 +89,7 @@ class Instances(Dataset[dict[str, Tensor]]):
         # Few different lengths save time, because MSBG computes new filters for each length.
         padding = -len(signal) % (NEURO_RATE // 2)
         padded = functional.pad(signal, (0, padding))
-        impaired = self.teacher(padded[None], thresholds[None])[0, : len(signal)]
+        impaired = self.msbg(padded[None], thresholds[None])[0, : len(signal)]
         return {"clean": clean, "signal": signal, "impaired": impaired, "thresholds": thresholds}
 
     def read(self, utterance: Utterance) -> tuple[Tensor, Tensor]:
