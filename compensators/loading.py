@@ -141,7 +141,7 @@ def trained_for(name: str | Path) -> Audiogram | None:
         name: Name or folder, as in ``load_compensator``.
 
     Raises:
-        ValueError: There is no such checkpoint, or its record of the ear is no audiogram.
+        ValueError: There is no such checkpoint.
 
     >>> trained_for("hearing-aid") is None
     True
@@ -149,4 +149,4 @@ def trained_for(name: str | Path) -> Audiogram | None:
     if _untrained(name) is not None:
         return None
     audiogram = read_record(name).get("about", {}).get("audiogram")
-    return None if audiogram is None else Audiogram.from_dict(audiogram)
+    return None if audiogram is None else Audiogram(**audiogram)

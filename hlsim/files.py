@@ -90,7 +90,8 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
         without surrounding blanks. Missing values are empty.
 
     Raises:
-        ValueError: The file cannot be read, a column appears twice, or a row has too many values.
+        ValueError: The file cannot be read or has no rows, a column appears twice, or a row has too
+            many values.
 
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_atomically(f"{folder}/ears.csv", "name;500 Hz\\nA;20\\n")
@@ -127,6 +128,10 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
         ) from error
     except (OSError, csv.Error) as error:
         raise ValueError(f"{path}: cannot read {contents}: {error}") from error
+    if not rows:
+        raise ValueError(
+            f"{path}: expected {contents} with a header and rows, got no rows; add them"
+        )
     return rows
 
 

@@ -15,7 +15,7 @@ from hlsim.audiogram.scale import (
     SEVERITY_LIMITS,
     STANDARD,
 )
-from hlsim.audiogram.value import Audiogram, severity_index
+from hlsim.audiogram.value import Audiogram, as_audiogram, severity_index
 
 __all__ = [
     "FREQUENCIES",
@@ -26,5 +26,6 @@ __all__ = [
     "SEVERITY_LIMITS",
     "STANDARD",
     "Audiogram",
+    "as_audiogram",
     "severity_index",
 ]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from hlsim.audiogram.conversion import EarLike, as_audiogram
-from hlsim.audiogram.plot import draw_png
 from hlsim.audiogram.scale import EarName
-from hlsim.audiogram.value import Audiogram
+from hlsim.audiogram.value import Audiogram, EarLike, as_audiogram
 
 EARS: tuple[EarName, EarName] = ("left", "right")
 
@@ -23,7 +22,7 @@ EAR_NAMES: dict[str, EarName] = {
 """Texts for an ear in a table, in lower case."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Listener:
     """The audiograms of both ears of a person, for waveforms (..., 2, time), left ear first.
 
@@ -59,25 +58,16 @@ class Listener:
         if not self.ears():
             raise ValueError("expected an audiogram of at least one ear of the listener, got none")
 
-    def __repr__(self) -> str:
-        ears = [f"{name}={ear and ear.short_text()}" for name, ear in vars(self).items()]
-        return f"Listener({', '.join(ears)})"
-
     def ears(self) -> dict[EarName, Audiogram]:
         """Return the audiograms of the known ears, under the keys ``"left"`` and ``"right"``."""
         ears = zip(EARS, (self.left, self.right), strict=True)
         return {name: ear for name, ear in ears if ear is not None}
 
-    def _repr_png_(self) -> bytes | None:
-        """Return the drawn audiograms for a notebook, or ``None`` without matplotlib."""
-        return draw_png(self.plot)
-
-    def plot(self, axes: Any = None, **style: Any) -> Any:
+    def plot(self, axes: Any = None) -> Any:
         """Draw the audiograms of both ears, the left one blue and the right one red.
 
         Args:
             axes: Matplotlib axes to draw on; by default new axes.
-            style: Matplotlib's properties of the lines, such as ``linewidth=2``.
 
         Returns:
             The axes.
@@ -86,17 +76,8 @@ class Listener:
             MissingExtraError: matplotlib is not installed.
         """
         for name, ear in self.ears().items():
-            axes = ear.plot(axes, ear=name, **style)
+            axes = ear.plot(axes, ear=name)
         return axes
-
-    def to_rows(self, name: str) -> list[dict[str, str]]:
-        """Return one row of a CSV file per known ear, in the form that ``read_listeners`` reads.
-
-        Args:
-            name: Name of the listener in the file.
-        """
-        ears = self.ears().items()
-        return [{"listener": name, "ear": side, **ear.to_row()} for side, ear in ears]
 
     @classmethod
     def from_clarity(cls, source: Any) -> Listener:
@@ -106,6 +87,10 @@ class Listener:
             source: pyclarity's ``Listener``, or an entry of Clarity's ``listeners.json``.
 
         Raises:
-            ValueError: The source is neither.
+            ValueError: An ear is missing or not valid.
         """
-        return cls(*(Audiogram.from_clarity(source, name) for name in EARS))
+        if isinstance(source, Mapping):
+            frequencies: Any = source.get("audiogram_cfs")
+            levels: list[Any] = [source.get(f"audiogram_levels_{side}") for side in ("l", "r")]
+            return cls(*(Audiogram(ear_levels, frequencies) for ear_levels in levels))
+        return cls(*(getattr(source, f"audiogram_{name}", None) for name in EARS))

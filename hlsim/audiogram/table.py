@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from hlsim.audiogram.listener import EAR_NAMES, Listener
 from hlsim.audiogram.scale import HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD
 from hlsim.audiogram.value import Audiogram, convert_at
 from hlsim.files import read_table
+
+_Builders = Mapping[str, Callable[[], Listener]]
+"""Functions that build listeners, under the names of the listeners."""
 
 
 def read_audiograms(
@@ -45,36 +48,10 @@ def read_audiograms(
         standard = [(name, Audiogram.standard(name)) for name in STANDARD if name != "NH"]
         return [({"listener": name}, ear) for name, ear in standard if max(ear.levels) <= highest]
     ears = []
-    for line, row in read_rows(path):
+    for line, row in read_table(path, "audiograms"):
         ear = convert_at(f"{path}, line {line}", Audiogram.from_row, row, highest)
         ears.append((row, ear))
     return ears
-
-
-def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
-    """Read the rows of a table of audiograms.
-
-    Args:
-        path: CSV file.
-
-    Returns:
-        A list with two members per row: the number of its line, and its texts by column.
-
-    Raises:
-        ValueError: The file cannot be read or has no rows.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     _ = Path(f"{folder}/ears.csv").write_text("hl_500\\n20\\n")
-    ...     read_rows(f"{folder}/ears.csv")
-    [(2, {'hl_500': '20'})]
-    """
-    rows = read_table(path, "audiograms")
-    if not rows:
-        raise ValueError(
-            f"{path}: no audiograms; expected a header such as hl_250,hl_500 and one row per ear"
-        )
-    return rows
 
 
 def read_listeners(path: str | Path, names: Collection[str] | None = None) -> dict[str, Listener]:
@@ -99,45 +76,42 @@ def read_listeners(path: str | Path, names: Collection[str] | None = None) -> di
     >>> with TemporaryDirectory() as folder:
     ...     _ = Path(f"{folder}/ears.csv").write_text("listener,ear,500 Hz\\nA,L,20\\nA,R,30\\n")
     ...     read_listeners(f"{folder}/ears.csv")
-    {'A': Listener(left={500: 20}, right={500: 30})}
+    {'A': Listener(left=Audiogram({500: 20}), right=Audiogram({500: 30}))}
     """
     is_json = str(path).lower().endswith(".json")
-    sources = _read_entries(path) if is_json else _group_rows(path)
-    unknown = sorted(set(names or ()) - sources.keys())
-    if unknown:
-        few = ", ".join(list(sources)[:5]) + (", ..." if len(sources) > 5 else "")
-        raise ValueError(f"{path}: no listener {unknown[0]!r}; expected one of {few}")
-    wanted = sources if names is None else names
-    if not is_json:
-        return {name: _join_ears(sources[name]) for name in wanted}
-    return {
-        name: convert_at(f"{path}, listener {name}", Listener.from_clarity, sources[name])
-        for name in wanted
-    }
+    builders = _read_entries(path) if is_json else _group_rows(path)
+    for name in names or ():
+        if name not in builders:
+            examples = ", ".join([*builders][:5])
+            raise ValueError(f"{path}: no listener {name!r}; expected a name such as {examples}")
+    return {name: builders[name]() for name in (builders if names is None else names)}
 
 
-def _read_entries(path: str | Path) -> Mapping[str, Any]:
-    """Read the entries of Clarity's ``listeners.json``."""
+def _read_entries(path: str | Path) -> _Builders:
+    """Read Clarity's ``listeners.json``, and return functions that build the listeners."""
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, RecursionError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: cannot read listeners: {error}") from error
     if not isinstance(entries, Mapping) or not entries:
         raise ValueError(f"{path}: expected one entry per listener, as in Clarity's listeners.json")
-    return entries
+    return {
+        name: partial(convert_at, f"{path}, listener {name}", Listener.from_clarity, entry)
+        for name, entry in entries.items()
+    }
 
 
-def _group_rows(path: str | Path) -> dict[str, list[tuple[str, dict[str, str]]]]:
-    """Read the rows of each listener of a CSV file."""
+def _group_rows(path: str | Path) -> _Builders:
+    """Read the rows of a CSV file, and return functions that build the listeners."""
     rows: dict[str, list[tuple[str, dict[str, str]]]] = {}
-    for line, row in read_rows(path):
+    for line, row in read_table(path, "audiograms"):
         place = f"{path}, line {line}"
         columns = {column.lower(): text for column, text in row.items()}
         name = columns.get("listener")
         if not name:
             raise ValueError(f"{place}: expected a name in the column listener, got none; add it")
         rows.setdefault(name, []).append((place, columns))
-    return rows
+    return {name: partial(_join_ears, rows_of_name) for name, rows_of_name in rows.items()}
 
 
 def _join_ears(rows: Sequence[tuple[str, dict[str, str]]]) -> Listener:

@@ -11,11 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram.conversion import EarLike, find_audiogram
 from hlsim.audiogram.devices import known_on_host, on_device, on_host
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.scale import FREQUENCIES, HIGHEST_SIMULATED, LOWEST_LEVEL
-from hlsim.audiogram.value import Audiogram, check_range, join_numbers
+from hlsim.audiogram.value import Audiogram, EarLike, check_range, find_audiogram
 from hlsim.checks import broadcast_shape
 from hlsim.torchtools import constant_like
 
@@ -35,8 +34,7 @@ def as_thresholds(
 
     The last dimension holds the thresholds at 250, 500, 1000, 2000, 3000, 4000, 6000 and 8000 Hz,
     the ``FREQUENCIES``. An ``Audiogram`` with other frequencies is interpolated over log frequency
-    (``Audiogram.thresholds``). In a list of tensors, (8,) tensors are one ear each, and eight
-    (batch,) tensors are one frequency each, as torch's ``default_collate`` stacks them.
+    (``Audiogram.thresholds``).
 
     A tensor on a GPU is not validated, because the CPU would have to wait for its values: instead,
     an ear with a level out of range becomes NaN, and so do the outputs that are computed with it.
@@ -64,7 +62,7 @@ def as_thresholds(
         audiogram = torch.tensor(audiogram.astype(np.float32))
     listed = _list_ears(audiogram)
     if listed is None:
-        return _check_tensor(_stack(audiogram), highest, consumer)
+        return _check_tensor(audiogram, highest, consumer)
     ears, shape = listed
     rows = []
     for index, ear in enumerate(ears):
@@ -284,42 +282,18 @@ def interpolation_weights(
     return np.stack([np.interp(frequencies, grid, row) for row in np.eye(len(grid))])
 
 
-def _stack(tensors: Any) -> Any:
-    """Stack tensors of one ear each, (8,), or eight tensors of one frequency each, (batch,).
-
-    Any other value is returned as it is.
-    """
-    if not isinstance(tensors, list | tuple):
-        return tensors
-    shapes = {tuple(tensor.shape) if isinstance(tensor, Tensor) else None for tensor in tensors}
-    shape = shapes.pop() if len(shapes) == 1 else None
-    if shape is None or len(shape) != 1:
-        return tensors
-    has_ears, has_frequencies = shape[0] == len(FREQUENCIES), len(tensors) == len(FREQUENCIES)
-    if has_ears and has_frequencies:
-        raise ValueError(
-            "expected one tensor, got a list of eight tensors of 8 levels, which may be ears or "
-            "frequencies; stack ears with torch.stack(audiogram), frequencies with "
-            "torch.stack(audiogram, -1)"
-        )
-    if not has_ears and not has_frequencies:
-        return tensors
-    return torch.stack(tuple(tensors), 0 if has_ears else -1)
-
-
 def _check_tensor(levels: Any, highest: float, consumer: str) -> Tensor:
     """Validate a tensor of thresholds, as ``as_thresholds`` describes."""
     if not isinstance(levels, Tensor):
         raise ValueError(
             f"expected an audiogram, got {type(levels).__name__}; pass an Audiogram, a name such "
-            "as 'N3', a Listener, a sequence with one of these per item, or thresholds in dB HL of "
-            "shape (..., 8)"
+            "as 'N3', a Listener, a sequence with one of these per item, or a tensor of thresholds "
+            "in dB HL of shape (..., 8); stack tensors of one ear each with "
+            "torch.stack(audiogram), of one frequency each with torch.stack(audiogram, -1)"
         )
-    if levels.is_complex() or levels.dtype == torch.bool:
-        raise ValueError(f"expected an audiogram of real numbers in dB HL, got {levels.dtype}")
     if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
         raise ValueError(
-            f"expected an audiogram tensor of shape (..., 8), at {join_numbers(FREQUENCIES)} Hz, "
+            f"expected an audiogram tensor of shape (..., 8), at {FREQUENCIES} Hz, "
             f"got {tuple(levels.shape)}; for other frequencies pass a dictionary of each frequency "
             "in Hz to its threshold, such as {500: 20, 4000: 50}"
         )

@@ -1,4 +1,4 @@
-"""The audiogram of one ear: validated, converted, and classified by severity of the loss."""
+"""The audiogram of one ear: converted, validated, and classified by severity of the loss."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram.plot import draw_png, plot_thresholds
+from hlsim.audiogram.plot import EAR_STYLES, frequency_axis
 from hlsim.audiogram.scale import (
     FREQUENCIES,
     HIGHEST_LEVEL,
@@ -26,7 +26,6 @@ from hlsim.audiogram.scale import (
     EarName,
 )
 from hlsim.extras import require
-from hlsim.files import read_table
 
 Result = TypeVar("Result")
 
@@ -71,7 +70,7 @@ class Audiogram:
         if len(levels) != len(frequencies):
             raise ValueError(
                 f"expected one level per frequency, got {len(levels)} levels for "
-                f"{len(frequencies)} frequencies, {join_numbers(frequencies)} Hz; for other "
+                f"{len(frequencies)} frequencies, {frequencies.tolist()} Hz; for other "
                 "frequencies pass a dictionary of each frequency in Hz to its threshold, such as "
                 "{500: 20, 4000: 50}"
             )
@@ -88,7 +87,7 @@ class Audiogram:
             raise ValueError(
                 "expected levels at ascending frequencies in Hz that overlap the range from "
                 f"{FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g}, got levels at "
-                f"{join_numbers(frequencies)} Hz; sort the frequencies, or multiply kHz by 1000"
+                f"{frequencies.tolist()} Hz; sort the frequencies, or multiply kHz by 1000"
             )
         object.__setattr__(self, "levels", tuple(levels.tolist()))
         object.__setattr__(self, "frequencies", tuple(frequencies.tolist()))
@@ -121,48 +120,15 @@ class Audiogram:
                 f"unknown standard audiogram {name!r}; expected one of {names} (simulators accept "
                 "all but N7)"
             )
-        return cls(tuple(float(level) for level in STANDARD[key]))
-
-    @classmethod
-    def from_csv(cls, path: str | Path, name: str | None = None) -> Audiogram:
-        """Read the audiogram of one ear from a CSV file.
-
-        Args:
-            path: Table with one row per ear, and columns such as ``hl_250`` or ``250 Hz``.
-            name: Text in any column of the row to read, such as ``"N3"``. It may be left out if
-                the table has one row. Other rows are not validated.
-
-        Raises:
-            ValueError: The table cannot be read, not exactly one row has the name, or the row is
-                not an audiogram.
-        """
-        rows = read_table(path, "audiograms")
-        matches = [(line, row) for line, row in rows if name is None or name in row.values()]
-        if len(matches) != 1:
-            raise ValueError(
-                f"{path}: expected one row with the name {name!r} in a column, found "
-                f"{len(matches)} rows; pass the name of one row"
-            )
-        line, row = matches[0]
-        return convert_at(f"{path}, line {line}", cls.from_row, row)
+        return cls(STANDARD[key])
 
     def __repr__(self) -> str:
-        return f"Audiogram({self.short_text()})"
-
-    def short_text(self) -> str:
-        """Return the audiogram as short text, such as ``'N3'`` or ``{500: 20, 4000: 55}``.
-
-        This is the name of a standard audiogram, or the threshold in dB HL at each frequency in Hz.
-        """
         for name, levels in STANDARD.items():
             if self.frequencies == FREQUENCIES and self.levels == levels:
-                return repr(name)
+                return f"Audiogram({name!r})"
         points = zip(self.frequencies, self.levels, strict=True)
-        return f"{{{', '.join(f'{frequency:g}: {level:g}' for frequency, level in points)}}}"
-
-    def _repr_png_(self) -> bytes | None:
-        """Return the drawn audiogram for a notebook, or ``None`` without matplotlib."""
-        return draw_png(self.plot)
+        text = ", ".join(f"{frequency:g}: {level:g}" for frequency, level in points)
+        return f"Audiogram({{{text}}})"
 
     @property
     def thresholds(self) -> tuple[float, ...]:
@@ -174,7 +140,7 @@ class Audiogram:
         if self.frequencies == FREQUENCIES:
             return self.levels
         values = np.interp(np.log(FREQUENCIES), np.log(self.frequencies), self.levels)
-        return tuple(float(value) for value in values)
+        return tuple(values.tolist())
 
     @property
     def severity(self) -> str:
@@ -190,16 +156,15 @@ class Audiogram:
     def pta(self) -> float:
         """Pure-tone average in dB HL: mean threshold at 500, 1000, 2000 and 4000 Hz."""
         levels = dict(zip(FREQUENCIES, self.thresholds, strict=True))
-        return (levels[500.0] + levels[1000.0] + levels[2000.0] + levels[4000.0]) / 4.0
+        return sum(levels[hz] for hz in (500.0, 1000.0, 2000.0, 4000.0)) / 4.0
 
-    def plot(self, axes: Any = None, *, ear: EarName | None = None, **style: Any) -> Any:
-        """Draw the audiogram as audiologists do, with bands for mild, moderate and severe losses.
+    def plot(self, axes: Any = None, *, ear: EarName | None = None) -> Any:
+        """Draw the audiogram as audiologists do, with the hearing loss downwards.
 
         Args:
             axes: Matplotlib axes to draw on, which may show other ears; by default new axes.
             ear: ``"left"`` draws blue crosses and ``"right"`` red circles, as audiologists do, with
                 the ear and its pure-tone average in the legend.
-            style: Matplotlib's properties of the line, such as ``color="tab:green"``.
 
         Returns:
             The axes.
@@ -207,28 +172,19 @@ class Audiogram:
         Raises:
             MissingExtraError: matplotlib is not installed.
         """
+        if axes is None:
+            _, axes = require("matplotlib.pyplot", "eval").subplots(layout="constrained")
+        label = None if ear is None else f"{ear}, PTA {self.pta:.0f} dB HL"
+        axes.plot(self.frequencies, self.levels, label=label, **EAR_STYLES[ear])
+        frequency_axis(axes, FREQUENCIES)
+        axes.set(ylim=(HIGHEST_LEVEL, LOWEST_LEVEL), ylabel="threshold (dB HL)")
         if ear is not None:
-            style = {"label": f"{ear}, PTA {self.pta:.0f} dB HL"} | style
-        return plot_thresholds(self.frequencies, self.levels, axes, ear, **style)
+            axes.legend()
+        return axes
 
     def to_dict(self) -> dict[str, list[float]]:
         """Return a dictionary of ``levels`` and ``frequencies``, which can be written as JSON."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Audiogram:
-        """Convert a dictionary, the result of ``to_dict``, into an audiogram.
-
-        Args:
-            data: Lists under the keys ``levels``, in dB HL, and, optionally, ``frequencies``, in
-                Hz.
-
-        Raises:
-            ValueError: The data is not such a dictionary.
-        """
-        if not isinstance(data, Mapping) or "levels" not in data:
-            raise ValueError(f"expected a dictionary with 'levels', got {data!r}")
-        return cls(data["levels"], data.get("frequencies", FREQUENCIES))
 
     def to_row(self) -> dict[str, str]:
         """Return the thresholds as texts for a CSV file by column: ``hl_250``, ``hl_500``, ..."""
@@ -283,32 +239,72 @@ class Audiogram:
         module = require("clarity.utils.audiogram", "dev")
         return module.Audiogram(np.array(self.levels), np.array(self.frequencies))
 
-    @classmethod
-    def from_clarity(cls, source: Any, ear: EarName | None = None) -> Audiogram:
-        """Convert an audiogram of pyclarity, or one ear of a listener of pyclarity.
 
-        Args:
-            source: pyclarity's ``Audiogram``; or, with ``ear``, its ``Listener`` or an entry of
-                Clarity's ``listeners.json``.
-            ear: Ear of a listener, ``"left"`` or ``"right"``.
+EarLike = Audiogram | str | Sequence[float] | NDArray[Any] | Tensor | Mapping[float, float]
+"""An audiogram, or what ``as_audiogram`` converts into one."""
 
-        Raises:
-            ValueError: The source is none of these, or ``ear`` does not fit.
-        """
-        if isinstance(source, Mapping):
-            side = {"left": "l", "right": "r"}.get(str(ear))
-            levels = source.get(f"audiogram_levels_{side}")
-            frequencies = source.get("audiogram_cfs")
-        else:
-            audiogram = source if ear is None else getattr(source, f"audiogram_{ear}", None)
-            levels = getattr(audiogram, "levels", None)
-            frequencies = getattr(audiogram, "frequencies", None)
-        if levels is None or frequencies is None:
-            raise ValueError(
-                "expected pyclarity's Audiogram, or ear='left' or ear='right' with its Listener or "
-                f"an entry of listeners.json, got {type(source).__name__} with ear={ear!r}"
-            )
-        return cls(levels, frequencies)
+
+def as_audiogram(ear: EarLike) -> Audiogram:
+    """Convert the description of one ear into an ``Audiogram``.
+
+    Args:
+        ear: An ``Audiogram`` of hlsim or pyclarity; the name of a standard audiogram, such as
+            ``"N3"`` or ``"n3"``; eight thresholds in dB HL at ``FREQUENCIES``, as a sequence, an
+            array or a tensor; or a mapping of frequencies in Hz to thresholds in dB HL.
+
+    Raises:
+        ValueError: The value is none of these, or its thresholds are not valid.
+
+    Example:
+        >>> from hlsim.audiogram import as_audiogram
+        >>> as_audiogram("n3")
+        Audiogram('N3')
+        >>> as_audiogram({250: 20, 1000: 30, 8000: 70}).levels
+        (20.0, 30.0, 70.0)
+    """
+    audiogram = find_audiogram(ear)
+    if audiogram is None:
+        raise ValueError(
+            f"expected an ear, got {type(ear).__name__}; pass an Audiogram, a name such as 'N3', "
+            "eight thresholds in dB HL, or a dictionary of frequencies in Hz to thresholds"
+        )
+    return audiogram
+
+
+def find_audiogram(ear: Any) -> Audiogram | None:
+    """Convert a value as ``as_audiogram`` does, or return ``None`` if it does not describe one ear.
+
+    Raises:
+        ValueError: The value describes one ear, but its thresholds are not valid.
+
+    >>> find_audiogram("n3"), find_audiogram(3)
+    (Audiogram('N3'), None)
+    """
+    if isinstance(ear, Audiogram):
+        return ear
+    if isinstance(ear, str):
+        return Audiogram.standard(ear)
+    if hasattr(ear, "levels") and hasattr(ear, "frequencies"):  # pyclarity's
+        return Audiogram(ear.levels, ear.frequencies)
+    if isinstance(ear, Mapping):
+        return _from_mapping(ear)
+    if isinstance(ear, np.ndarray | Tensor):
+        return Audiogram(tuple(ear.tolist())) if ear.ndim == 1 else None
+    if isinstance(ear, Sequence) and ear and all(isinstance(level, Real | None) for level in ear):
+        return Audiogram(tuple(ear))
+    return None
+
+
+def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
+    """Convert a mapping of frequencies, in any order, to thresholds."""
+    try:
+        frequencies = sorted(levels, key=float)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"expected a dictionary of frequencies in Hz to thresholds in dB HL, got {levels!r}; "
+            "for two ears, pass Listener(left, right)"
+        ) from None
+    return Audiogram(tuple(levels[frequency] for frequency in frequencies), tuple(frequencies))
 
 
 def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -> Tensor:
@@ -378,24 +374,10 @@ def check_range(
     for level, frequency in zip(levels, frequencies, strict=True):
         if LOWEST_LEVEL <= level <= highest:
             continue
-        fix = "limit it to this range"
-        if math.isnan(level):
-            fix = "replace it by a threshold"
-        elif highest < HIGHEST_LEVEL:
-            fix += " (the standard audiogram N7 exceeds it)"
         raise ValueError(
             f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}, "
-            f"got {level:g} at {frequency:g} Hz; {fix}"
+            f"got {level:g} at {frequency:g} Hz; pass a level in this range"
         )
-
-
-def join_numbers(values: Iterable[float]) -> str:
-    """Return numbers as text, separated by commas, for a message.
-
-    >>> join_numbers([250.0, 707.1])
-    '250, 707.1'
-    """
-    return ", ".join(f"{value:g}" for value in values)
 
 
 def _column_frequency(column: str) -> float | None:

@@ -20,7 +20,7 @@ def demo(parser: Parser) -> None:
 
 def _demo(options: argparse.Namespace) -> None:
     check_extras("train", "eval")
-    from hlsim.audiogram.conversion import as_audiogram
+    from hlsim.audiogram import as_audiogram
     from hlsim.cli.demo_study import run_demo
 
     ear = as_audiogram(options.audiogram)

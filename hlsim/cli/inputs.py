@@ -46,7 +46,7 @@ def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
     Raises:
         ValueError: There is no such file or listener, or an ear is missing.
     """
-    from hlsim.audiogram.conversion import as_audiogram
+    from hlsim.audiogram import as_audiogram
 
     if getattr(options, "listener", None):
         return _read_listener(options.listener)

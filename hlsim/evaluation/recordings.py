@@ -27,7 +27,6 @@ from torch import Tensor
 from hlsim.audio import EXTENSIONS, find_audio, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import EAR_NAMES, EARS
-from hlsim.audiogram.table import read_rows
 from hlsim.audiogram.value import convert_at
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.comparison import PlannedComparison, compare
@@ -449,8 +448,6 @@ def _read_manifest(
     """
     folder = Path(Path(path).parent if root is None else root).resolve()
     rows = read_table(path, "the manifest")
-    if not rows:
-        raise ValueError(f"{path}: the manifest has no rows; add one for each output file")
     columns = rows[0][1].keys()
     for column in _REQUIRED_COLUMNS:
         if column not in columns:
@@ -540,8 +537,7 @@ def _merge(recording: Recording, other: Recording) -> Recording:
     if recording.audiogram != other.audiogram:
         raise ValueError(
             f"expected the audiogram of earlier rows of {recording.name}, "
-            f"{recording.audiogram.short_text()}, got {other.audiogram.short_text()}; write one "
-            "audiogram in all its rows"
+            f"{recording.audiogram}, got {other.audiogram}; write one audiogram in all its rows"
         )
     return replace(recording, outputs={**recording.outputs, **other.outputs})
 
@@ -577,7 +573,7 @@ def _read_ears(path: str | Path, column: str) -> _Ears:
         column: Column with the name of the ear, ``"listener"`` or ``"file"``.
     """
     ears: dict[tuple[str, str], tuple[str, _Row]] = {}
-    for line, row in read_rows(path):
+    for line, row in read_table(path, "audiograms"):
         place = f"{path}, line {line}"
         name = row.get(column, "")
         if column == "file":

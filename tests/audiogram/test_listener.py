@@ -120,37 +120,15 @@ def test_the_better_ears_metric_leaves_a_missing_ear_out(scene: Tensor) -> None:
         metric.update(outputs[:1], scene[None], [BOTH, BOTH])
 
 
-def test_written_and_read(tmp_path: Path) -> None:
-    torch.save(BOTH, tmp_path / "listener.pt")
-    with torch.serialization.safe_globals([Audiogram, Listener]):
-        assert torch.load(tmp_path / "listener.pt", weights_only=True) == BOTH
-    assert Listener.from_clarity(ENTRY) == BOTH
+def test_read_from_csv_json_and_pyclarity(tmp_path: Path) -> None:
+    table = tmp_path / "ears.csv"
+    table.write_text("Listener;EAR;250;8 kHz\nA;R;10;20\nA;Left;;40\nb;le;5;\n")
+    expected = {"A": Listener({8000: 40}, {250: 10, 8000: 20}), "b": Listener({250: 5}, None)}
+    assert read_listeners(table) == expected
     (tmp_path / "listeners.json").write_text(json.dumps({"L0001": ENTRY}))
     assert read_listeners(tmp_path / "listeners.json") == {"L0001": BOTH}
-    rows = [*reversed(BOTH.to_rows("a")), *Listener(LEFT, None).to_rows("b")]
-    rows[0]["ear"], rows[1]["ear"] = "r", "Left"
-    table = tmp_path / "ears.csv"
-    table.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
-    assert read_listeners(table) == {"a": BOTH, "b": Listener(LEFT, None)}
-
-
-def test_pyclaritys_listeners() -> None:
     clarity = pytest.importorskip("clarity.utils.audiogram")
     assert Listener.from_clarity(clarity.Listener.from_dict(ENTRY)) == BOTH
-
-
-def test_prints_compactly() -> None:
-    assert repr(BOTH) == "Listener(left='N2', right='N4')"
-    right_only = Listener(None, {250: 20, 8000: 60})
-    assert repr(right_only) == "Listener(left=None, right={250: 20, 8000: 60})"
-
-
-@pytest.mark.parametrize("names", [("l", "r"), ("L", "R"), ("Left", "RIGHT"), ("LE", "re")])
-def test_names_of_ears_in_a_table(tmp_path: Path, names: tuple[str, str]) -> None:
-    table = tmp_path / "ears.csv"
-    table.write_text(f"Listener;EAR;250;8 kHz\nA;{names[0]};10;20\nA;{names[1]};;40\n")
-    expected = Listener({250: 10, 8000: 20}, {8000: 40})
-    assert read_listeners(table) == {"A": expected}
 
 
 def test_only_the_listeners_that_are_asked_for_are_validated(tmp_path: Path) -> None:
@@ -165,29 +143,33 @@ def test_only_the_listeners_that_are_asked_for_are_validated(tmp_path: Path) -> 
         for names in (None, ["L0002"]):
             with pytest.raises(ValueError, match=r"line 4|listener L0002"):
                 read_listeners(tmp_path / name, names)
-        with pytest.raises(ValueError, match="no listener 'L3'; expected one of L0001, L0002"):
+        with pytest.raises(ValueError, match="no listener 'L3'; expected a name such as L0001"):
             read_listeners(tmp_path / name, ["L0001", "L3"])
 
 
-def test_bad_listeners(tmp_path: Path, scene: Tensor) -> None:
+def test_bad_listeners(scene: Tensor) -> None:
     for ears in ((None, None), (LEFT, "N9"), (LEFT, 3)):
         with pytest.raises(ValueError):
             Listener(*ears)
     with pytest.raises(ValueError, match="no left ear"):
         MSBG()(scene, Listener(None, RIGHT))
-    one_ear = {key: value for key, value in ENTRY.items() if key != "audiogram_levels_r"}
-    with pytest.raises(ValueError):
-        Listener.from_clarity(one_ear)
-    files = {
-        "a.json": "{",
-        "b.json": "[]",
-        "c.json": '{"L1": {}}',
-        "d.csv": "listener,ear\n",
-        "e.csv": "listener,ear,hl_500\nA,both,20\n",
-        "f.csv": "listener,ear,hl_500\nA,l,20\nA,left,20\n",
-        "g.csv": "listener,ear,hl_500\n,l,20\n",
-    }
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
-        with pytest.raises(ValueError, match=rf"{name}"):
-            read_listeners(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", "{"),
+        ("b.json", "[]"),
+        ("c.json", '{"L1": {}}'),
+        ("d.json", '{"L1": []}'),
+        ("e.json", json.dumps({"L1": {key: ENTRY[key] for key in list(ENTRY)[:3]}})),
+        ("f.csv", "listener,ear\n"),
+        ("g.csv", "listener,ear,hl_500\nA,both,20\n"),
+        ("h.csv", "listener,ear,hl_500\nA,l,20\nA,left,20\n"),
+        ("i.csv", "listener,ear,hl_500\n,l,20\n"),
+    ],
+)
+def test_errors_name_the_file_of_listeners(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=name):
+        read_listeners(tmp_path / name)

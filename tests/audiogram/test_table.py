@@ -57,8 +57,8 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["no audiograms"]),
-        ("hl_250,hl_500\n", ["no audiograms"]),
+        ("", ["no rows"]),
+        ("hl_250,hl_500\n", ["no rows"]),
         ("hl_250,hl_500\n10,20\n10,x\n", ["line 3", "hl_500", "'x'"]),
         ("hl_250,hl_500\n\n\n10,NR\n", ["line 4", "hl_500", "'NR'", "no response"]),
         ("hl_250,8 kHz\n10,110+\n", ["line 2", "8 kHz", "110+", "highest level"]),
@@ -107,13 +107,3 @@ def test_standard_audiograms_have_a_name_in_place_of_a_file() -> None:
 def test_the_example_table_has_the_standard_ears_that_simulators_take() -> None:
     tables = [read_audiograms(path, simulated=True) for path in (EARS_FILE, "standard")]
     assert [ear for _, ear in tables[0]] == [ear for _, ear in tables[1]]
-
-
-def test_one_ear_is_read_by_any_name_in_its_row(tmp_path: Path) -> None:
-    assert Audiogram.from_csv(EARS_FILE, "S2") == Audiogram.standard("S2")
-    path = tmp_path / "ear.csv"
-    path.write_text("hl_250,hl_500\n10,20\n", encoding="utf-8")
-    assert Audiogram.from_csv(path) == Audiogram((10, 20), (250, 500))
-    for name in (None, "N9"):
-        with pytest.raises(ValueError, match="expected one row"):
-            Audiogram.from_csv(EARS_FILE, name)

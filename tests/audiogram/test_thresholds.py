@@ -27,9 +27,9 @@ def test_thresholds_for_a_simulator() -> None:
 NO_EARS: list[Any] = [
     *(torch.zeros(7), torch.tensor(3.0), torch.tensor([0.0] * 7 + [float("nan")])),
     *(torch.tensor([0.0] * 7 + [100.1]), torch.tensor([[0.0] * 8, [-10.1] * 8])),
-    *(torch.zeros(0, 8), torch.zeros(8, dtype=torch.bool), torch.zeros(8, dtype=torch.complex64)),
+    torch.zeros(0, 8),
     *([0.0] * 7, [[0.0] * 7], (torch.zeros(7), torch.zeros(7)), [], "loud", "N7", np.zeros(7)),
-    *({"levels": [torch.zeros(2)] * 8}, {"hl_250": "20"}, None),
+    *([torch.zeros(8), torch.zeros(8)], [torch.zeros(3)] * 8, {"hl_250": "20"}, None),
 ]
 
 
@@ -42,9 +42,9 @@ def test_values_that_are_not_ears_for_a_simulator_are_rejected(audiogram: Any) -
 def test_the_error_for_a_level_names_its_frequency() -> None:
     levels = torch.zeros(2, 8)
     levels[1, 6] = torch.nan
-    with pytest.raises(ValueError, match="got nan at 6000 Hz; replace it"):
+    with pytest.raises(ValueError, match="got nan at 6000 Hz"):
         as_thresholds(levels)
-    with pytest.raises(ValueError, match="got 130 at 4000 Hz; limit it"):
+    with pytest.raises(ValueError, match="got 130 at 4000 Hz"):
         Audiogram((20.0, 130.0), (500.0, 4000.0))
 
 
@@ -52,8 +52,6 @@ def test_the_error_for_a_level_names_its_frequency() -> None:
 def test_another_number_of_thresholds_suggests_a_dictionary(ear: Any) -> None:
     with pytest.raises(ValueError, match=r"pass a dictionary .* such as \{500: 20, 4000: 50\}"):
         as_thresholds(ear)
-    with pytest.raises(ValueError, match="the standard audiogram N7"):
-        as_thresholds("N7")
 
 
 def test_mono_items_have_one_ear_each() -> None:
@@ -72,18 +70,13 @@ def test_mono_items_have_one_ear_each() -> None:
 
 
 @pytest.mark.parametrize("make", [MSBG, NALR])
-def test_a_stored_ear_is_a_copy(make: Any) -> None:
+def test_a_stored_ear_is_a_copy_that_may_be_trained(make: Any) -> None:
     levels = torch.full((8,), 40.0)
-    module = make(levels)
+    with torch.inference_mode():
+        module = make(levels)
     levels.fill_(105.0)
     assert torch.equal(module.thresholds, torch.full((8,), 40.0))
-
-
-@pytest.mark.parametrize("make", [MSBG, NALR])
-def test_an_ear_stored_in_inference_mode_trains_later(make: Any) -> None:
-    with torch.inference_mode():
-        modules = [make(ear) for ear in (Audiogram.standard("N3"), torch.full((8,), 40.0))]
-    assert not any(module.thresholds.is_inference() for module in modules)
+    assert not module.thresholds.is_inference()
 
 
 def test_thresholds_keep_their_gradient() -> None:
@@ -102,13 +95,3 @@ def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
         assert interpolated.shape == (2, 3, 9) and interpolated.dtype == ears.dtype
         np.testing.assert_allclose(interpolated.reshape(6, 9).numpy(), expected, rtol=1e-5)
     np.testing.assert_allclose(rows @ interpolation_weights(hz), expected, rtol=1e-12)
-
-
-def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
-    ears = [Audiogram.standard(name).thresholds for name in ("N1", "N3", "S2")]
-    collated = torch.utils.data.default_collate(ears)  # eight tensors of shape (3,)
-    assert len(collated) == 8
-    assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
-    assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
-    with pytest.raises(ValueError, match=r"stack ears with torch\.stack\(audiogram\)"):
-        as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))

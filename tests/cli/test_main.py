@@ -166,7 +166,11 @@ def test_a_presentation_level_is_that_of_the_input(
 
 
 def write_listeners(folder: Path, **listeners: Listener) -> Path:
-    rows = [row for name, listener in listeners.items() for row in listener.to_rows(name)]
+    rows = [
+        {"listener": name, "ear": side, **ear.to_row()}
+        for name, listener in listeners.items()
+        for side, ear in listener.ears().items()
+    ]
     return write_table(folder / "ears.csv", rows)
 
 
