@@ -1,10 +1,9 @@
 """Settings of the two trainable compensators, which a checkpoint stores as JSON."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Literal
 
-from hlsim.checks import check_number, describe, is_finite
+from hlsim.checks import check_number
 from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
 
 
@@ -13,8 +12,8 @@ class MappingConfig(NetworkConfig):
     """Settings of a ``MappingCompensator``, in addition to the sizes in ``NetworkConfig``.
 
     Attributes:
-        start: Gain before training, to which the network adds a correction: ``"nalr"`` for that of
-            the prescription, or a share from 0 to 1 of the hearing loss in dB.
+        start: Gain before training, to which the network adds a correction: that of the
+            prescription, ``"nalr"``.
         phase: Phase of the output: ``input`` for that of the input, or ``predicted`` by the
             network, as in Neuro-MSBG. Do not combine ``predicted`` with a criterion that compares
             only levels, such as ``"bands"``. Training may then find phases that differ between
@@ -31,7 +30,7 @@ class MappingConfig(NetworkConfig):
     'predicted'
     """
 
-    start: str | float = "nalr"
+    start: Literal["nalr"] = "nalr"
     phase: Phase = "input"
     bands: int = 20
     reach_db: float = 40.0
@@ -39,12 +38,6 @@ class MappingConfig(NetworkConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_share = is_finite(self.start) and 0.0 <= float(self.start) <= 1.0
-        if self.start != "nalr" and not is_share:
-            raise ValueError(
-                "expected start to be 'nalr' or a share of the loss from 0 to 1, "
-                f"got {describe(self.start)}"
-            )
         check_number("bands", self.bands, 4, 40, whole=True)
         check_number("limit_spl", self.limit_spl, 60.0, 140.0)
         check_number("reach_db", self.reach_db, 0.1, 60.0)

@@ -8,8 +8,6 @@ to a delay of 64 samples. Three terms of all wearable aids:
 - An *excess gain* is a linear gain minus 1. With 0 in all bands, no bit of the signal changes.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -4,8 +4,6 @@ The insertion gain is the level of an aid's output minus that of its input in dB
 octave around a frequency.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,7 +21,7 @@ from hlsim.torchtools import constant_like
 class MeasuredAid(nn.Module):
     """Base class of aids with a method ``gains``, which measures how much they amplify a noise.
 
-    Subclasses implement ``_amplify_noise``.
+    Subclasses implement ``_amplify``.
 
     >>> from compensators import WDRC
     >>> isinstance(WDRC(), MeasuredAid)
@@ -56,19 +54,17 @@ class MeasuredAid(nn.Module):
         ears = thresholds.reshape(-1, len(FREQUENCIES))
         noise = constant_like(ears, _speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
         # The first second, in which gains settle, is left out.
-        output = self._amplify_noise(noise.repeat(len(ears), 2), ears)[:, RATE:]
+        output = self._amplify(noise.repeat(len(ears), 2), ears)[:, RATE:]
         in_third = constant_like(ears, _thirds_of_octave)
         output_power, noise_power = (
             power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
         )
         return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
 
-    def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
-        """Return the output before its limit. Shape: (items, time), (items, 8) -> (items, time).
+    def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """Return the output for signals in pascals at 16 kHz, without noise reduction and limit.
 
-        Args:
-            noise: Noise in pascals at 16 kHz.
-            ears: Thresholds in dB HL.
+        Shape: (items, time), (items, 8) in dB HL -> (items, time).
         """
         raise NotImplementedError
 

@@ -1,8 +1,6 @@
 """A hearing aid with trained gains and trained noise reduction, and a delay of 4 ms."""
 
-from __future__ import annotations
-
-from typing import Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -86,8 +84,7 @@ class HearingAid(Wearable):
     torch.Size([64320])
     """
 
-    SLIDERS = ("noise_reduction", "amplification")
-    DEFAULT_SLIDERS = (DEFAULT_NOISE_REDUCTION, 1.0)
+    SLIDERS: ClassVar = {"noise_reduction": DEFAULT_NOISE_REDUCTION, "amplification": 1.0}
 
     def __init__(
         self,

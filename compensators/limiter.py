@@ -2,6 +2,8 @@
 
 from torch import Tensor
 
+from hlsim.calibration import PASCAL_SPL
+
 EXPONENT = 8.0
 """Exponent of the curve. The higher it is, the closer the curve is to clipping."""
 
@@ -12,18 +14,19 @@ Its eighth power fits into float32.
 """
 
 
-def soft_limit(waveform: Tensor, peak: float) -> Tensor:
+def soft_limit(waveform: Tensor, limit_spl: float) -> Tensor:
     """Limit the magnitude of samples without the edges of clipping: x / (1 + |x / peak|^8)^(1/8).
 
     Below half of the peak, samples are attenuated by 0.004 dB at most.
 
     Args:
-        waveform: Samples. Any shape.
-        peak: Magnitude that no sample of the result exceeds, in the unit of the samples.
+        waveform: Samples in pascals. Any shape.
+        limit_spl: Peak in dB SPL that the magnitude of no sample of the result exceeds.
 
     >>> import torch
-    >>> soft_limit(torch.tensor([0.1, 2.0, 100.0]), peak=2.0)
-    tensor([0.1000, 1.8340, 2.0000])
+    >>> soft_limit(torch.tensor([0.1, 2.0, 100.0]), limit_spl=100.0)  # 2 pascals
+    tensor([0.1000, 1.8318, 1.9953])
     """
+    peak = 10.0 ** ((limit_spl - PASCAL_SPL) / 20.0)
     bounded = waveform.clamp(-HIGHEST_RATIO * peak, HIGHEST_RATIO * peak)
     return bounded * (1.0 + (bounded / peak).abs() ** EXPONENT) ** (-1.0 / EXPONENT)

@@ -28,26 +28,19 @@ UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
 """Compensators without a checkpoint."""
 
 
-def build_compensator(
-    config: MappingConfig | HearingAidConfig,
-    *,
-    sample_rate: int = NEURO_RATE,
-    full_scale_spl: float = PASCAL_SPL,
-) -> Trained:
+def build_compensator(config: MappingConfig | HearingAidConfig, **levels: Any) -> Trained:
     """Build an untrained compensator from its settings.
 
     Args:
         config: Settings. Their class decides which kind of compensator is built.
-        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        levels: ``sample_rate`` and ``full_scale_spl``, as in ``load_compensator``.
 
     >>> build_compensator(HearingAidConfig(bands=12)).bands
     12
     """
-    options: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     if isinstance(config, HearingAidConfig):
-        return HearingAid(config, **options)
-    return MappingCompensator(config, **options)
+        return HearingAid(config, **levels)
+    return MappingCompensator(config, **levels)
 
 
 def load_compensator(
@@ -78,12 +71,12 @@ def load_compensator(
     >>> aid = load_compensator("hearing-aid")
     >>> output = aid(hlsim.example_speech(), "N3")
     """
-    untrained = _untrained(name)
+    levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     compensator: Trained | NALR | WDRC
-    if untrained is not None:
-        compensator = untrained(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    if str(name) in UNTRAINED:
+        compensator = UNTRAINED[str(name)](**levels)
     else:
-        build = partial(build_compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+        build = partial(build_compensator, **levels)
         kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
         compensator = read_checkpoint(name, kinds, build)
     compensator.eval().requires_grad_(False)
@@ -95,11 +88,6 @@ def load_compensator(
             "linked"
         )
     return compensator
-
-
-def _untrained(name: str | Path) -> type[NALR | WDRC] | None:
-    """Return the class of a compensator without a checkpoint. "NAL-R" is also accepted."""
-    return UNTRAINED.get(str(name).lower().replace("-", ""))
 
 
 def save_compensator(
@@ -146,7 +134,7 @@ def trained_for(name: str | Path) -> Audiogram | None:
     >>> trained_for("hearing-aid") is None
     True
     """
-    if _untrained(name) is not None:
+    if str(name) in UNTRAINED:
         return None
     audiogram = read_record(name).get("about", {}).get("audiogram")
     return None if audiogram is None else Audiogram(**audiogram)

@@ -1,7 +1,5 @@
 """The compensator of the Neuro-MSBG paper, whose gains change over time and frequency."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -35,8 +33,8 @@ LOWEST_CENTRE = 100.0
 class MappingCompensator(MeasuredAid, EarNetwork):
     """A trainable aid for whole signals: a network that amplifies each point of the spectrogram.
 
-    In dB, the gain at a time and a frequency is that of a prescription (``config.start``) plus a
-    correction by the network, which is smooth over time and frequency, and 0 before training. The
+    In dB, the gain at a time and a frequency is that of the prescription NAL-R plus a correction by
+    the network, which is smooth over time and frequency, and 0 before training. The
     network gets the log magnitude of the input, the audiogram and the prescribed gain. It has the
     encoder, dual-path blocks and decoder of Neuro-MSBG. Training needs the prescription: an
     inaudible band has almost no gradient, and without a prescription the trained network is worse
@@ -91,34 +89,13 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         # The gains are averaged over one point of the feature maps.
         self._additional_field = config.step - config.hop
 
-    def _start_gains_db(self, thresholds: Tensor) -> Tensor:
-        """Return the gain before training at each frequency of the spectrogram.
-
-        Shape: (items, 8) dB HL -> (items, frequencies) dB.
-        """
-        start = self.config.start
-        if start == "nalr":
-            gains = nalr_gains_db(thresholds)
-        else:
-            gains = float(start) * thresholds.clamp_min(0.0)
-        return interpolate(gains, self.config.hz)
-
-    def extra_repr(self) -> str:
-        return (
-            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
-            f"start={self.config.start!r}"
-        )
-
-    def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
-        return self._process(noise, ears)
-
     def _finish(self, result: Tensor) -> Tensor:
         # The limit is the last step, because resampling can overshoot.
-        return soft_limit(result, 10.0 ** ((self.config.limit_spl - PASCAL_SPL) / 20.0))
+        return soft_limit(result, self.config.limit_spl)
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         spectrum = self.stft.analyse(signals)
-        start = self._start_gains_db(ears) / NEPER_DB
+        start = interpolate(nalr_gains_db(ears), self.config.hz) / NEPER_DB
         features = self._features(spectrum, ears, start)
         features = features.contiguous(memory_format=torch.channels_last)
         features = self.encoder(features).permute(0, 2, 3, 1)
@@ -133,6 +110,8 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         else:
             factor = phase_factor(self.phase_decoder(features, size), gain)
         return self.stft.synthesise(spectrum * factor, signals.shape[-1])
+
+    _amplify = _process
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
         """Return the correction in nepers, smooth over time and frequency.

@@ -1,8 +1,5 @@
 """NAL-R, a prescription of gains for an audiogram that do not depend on the level."""
 
-from __future__ import annotations
-
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,7 +18,7 @@ from hlsim.audiogram.thresholds import (
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.dsp.windows import hamming
 from hlsim.torchtools import constant_like
@@ -43,9 +40,8 @@ class NALR(nn.Module):
 
     Args:
         audiogram: Audiogram of one ear, or of several, which is used by all calls that pass none.
-            A tensor that requires a gradient must be passed to each call instead. The thresholds
-            at 250, 500, 1000, 2000, 4000 and 6000 Hz are used, interpolated over log frequency
-            where they were not measured.
+            The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz are used, interpolated over log
+            frequency where they were not measured.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0. It has no effect here; all
             compensators accept it.
@@ -75,15 +71,10 @@ class NALR(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        check_number("order", order, 2, 1022, whole=True)
-        if order % 2:
-            raise ValueError(f"expected an even order of the NAL-R filter, got {order}")
+        if order not in range(2, 1024, 2):
+            raise ValueError(f"expected an even order from 2 to 1022, got {order!r}")
         self.order = order
         thresholds = store_thresholds(audiogram, **THRESHOLD_OPTIONS)
-        if thresholds is not None and thresholds.requires_grad:
-            raise ValueError(
-                "expected an audiogram without gradient; pass one that is trained to each call"
-            )
         self.register_buffer("thresholds", thresholds, persistent=False)
         self._two_ears = has_listeners(audiogram)
 
@@ -143,18 +134,9 @@ class NALR(nn.Module):
 
         Shape: (..., 8) dB HL -> (..., order + 1).
         """
-        gains = nalr_gains_db(thresholds.double())
-        gains = interpolate(gains, _even_frequencies(self.sample_rate, self.order + 1))
-        taps = (10.0 ** (gains / 20.0)) @ constant_like(gains, _design, self.order)
-        impulse = torch.zeros_like(taps)
-        impulse[..., self.order // 2] = 1.0
-        return torch.where(_has_loss(thresholds), taps, impulse)
-
-    def extra_repr(self) -> str:
-        return (
-            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
-            f"order={self.order}"
-        )
+        frequencies = np.linspace(0.0, self.sample_rate / 2.0, self.order + 1)
+        gains = interpolate(nalr_gains_db(thresholds.double()), tuple(frequencies.tolist()))
+        return (10.0 ** (gains / 20.0)) @ constant_like(gains, _design, self.order)
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
@@ -172,7 +154,7 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     >>> nalr_gains_db(torch.tensor([20.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 50.0])).round()
     tensor([ 0.,  2., 13., 14., 15., 16., 18., 18.])
     """
-    losses = _formula_levels(thresholds)
+    losses = torch.cat((thresholds[..., :4], thresholds[..., 5:7]), -1)  # without 3 and 8 kHz
     three_frequency_sum = losses[..., 1:4].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
     common = torch.where(
         three_frequency_sum <= 180.0,
@@ -184,26 +166,8 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     low, high = gains[..., :4], gains[..., 4:]
     at_3_khz = 0.5 * (low[..., -1:] + high[..., :1])
     all_gains = torch.cat((low, at_3_khz, high, high[..., -1:]), -1)
-    return torch.where(_has_loss(thresholds), all_gains, 0.0)
-
-
-def _has_loss(thresholds: Tensor) -> Tensor:
-    """Return whether each ear has a loss. NaN is treated as a loss, and so reaches the output."""
-    return ~(_formula_levels(thresholds) <= 0.0).all(-1, keepdim=True)
-
-
-def _formula_levels(thresholds: Tensor) -> Tensor:
-    """Select the thresholds at the frequencies of the formula. Shape: (..., 8) -> (..., 6).
-
-    These are all but 3000 and 8000 Hz.
-    """
-    return torch.cat((thresholds[..., :4], thresholds[..., 5:7]), -1)
-
-
-@lru_cache(maxsize=8)
-def _even_frequencies(sample_rate: int, count: int) -> tuple[float, ...]:
-    highest = sample_rate / 2.0
-    return tuple(torch.linspace(0.0, highest, count, dtype=torch.float64, device="cpu").tolist())
+    has_no_loss = (losses <= 0.0).all(-1, keepdim=True)
+    return torch.where(has_no_loss, 0.0, all_gains)
 
 
 def _design(order: int) -> NDArray[np.float64]:

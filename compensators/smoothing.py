@@ -4,8 +4,6 @@ A smoother gets the values of some frames, and returns its memory after the last
 gets this memory, so that a signal may be processed in chunks of any number of frames.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -55,12 +53,10 @@ def follow_peaks(
     blocks = []
     for block in (values - averages).split(BLOCK_FRAMES, 1):
         powers = constant_like(values, _powers, block.shape[1], fall)
-        highest = block / powers
-        if block.shape[1] > 1:  # a stream saves the call
-            highest = _running_maximum(highest)
+        highest = _running_maximum(block / powers)
         blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
         excess = blocks[-1][:, -1]
-    peaks = averages + _join(blocks)
+    peaks = averages + torch.cat(blocks, 1)
     results = _average(peaks, result, rise)
     return results, torch.stack((averages[:, -1], excess, results[:, -1]), 1)
 
@@ -89,12 +85,7 @@ def _average(values: Tensor, before: Tensor, past: float) -> Tensor:
         old = constant_like(values, _powers, frames, past) * before.unsqueeze(1)
         averages.append(new + old)
         before = averages[-1][:, -1]
-    return _join(averages)
-
-
-def _join(blocks: list[Tensor]) -> Tensor:
-    """Concatenate blocks of frames. A single block is not copied."""
-    return blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1)
+    return torch.cat(averages, 1)
 
 
 def _running_maximum(values: Tensor) -> Tensor:

@@ -1,14 +1,13 @@
 """Streams, in which a wearable aid processes a signal in chunks of any size."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from compensators.filter_bank import DELAY, HOP, RATE, apply_gains
-from compensators.wearable import Slider, Wearable, check_slider
+from compensators.limiter import soft_limit
+from compensators.wearable import Slider, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_waveform
@@ -34,9 +33,10 @@ class Stream:
         sliders: Value from 0 to 1 under each slider's name, one number or one value per item.
 
     Raises:
-        ValueError: The aid has another sample rate, or rejects the ear, a slider or a chunk; the
-            leading dimensions change; or samples are NaN or infinite, which would affect all later
-            output. After a rejected chunk, the stream goes on as if there had been none.
+        ValueError: The aid has another sample rate, or rejects the ear; a call rejects the value of
+            a slider, other leading dimensions than before, and samples that are NaN or infinite,
+            which would affect all later output. After a rejected chunk, the stream goes on as if
+            there had been none.
         AttributeError: An attribute is set that is not a slider of the aid.
 
     >>> import hlsim
@@ -52,26 +52,20 @@ class Stream:
                 f"expected an aid with sample_rate={RATE} for a stream, got {aid.sample_rate}; "
                 f"use such an aid, and resample the signal to {RATE} Hz"
             )
-        as_thresholds(audiogram, consumer=type(aid).__name__)
+        as_thresholds(audiogram, consumer=type(aid).__name__)  # the first chunk may come later
         self._aid = aid
-        # A copy, because the caller may write into a tensor, and the first chunk may come later.
-        self._audiogram = audiogram.clone() if isinstance(audiogram, Tensor) else audiogram
+        self._audiogram = audiogram
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
         self._shape = self._batch = torch.Size()
         self._partial_hop = self._fitted = self._sliders = torch.empty(0)
-        for name, slider in sliders.items():
+        for name, slider in {**aid.SLIDERS, **sliders}.items():
             setattr(self, name, slider)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not name.startswith("_"):
-            if name not in self._aid.SLIDERS:
-                sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
-                aid = type(self._aid).__name__
-                raise AttributeError(
-                    f"the stream of a {aid} has no slider {name}; it has {sliders}"
-                )
-            items = value.shape if isinstance(value, Tensor) else torch.Size()
-            check_slider(name, value, items, torch.empty(0))
+        if not name.startswith("_") and name not in self._aid.SLIDERS:
+            sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
+            aid = type(self._aid).__name__
+            raise AttributeError(f"the stream of a {aid} has no slider {name}; it has {sliders}")
         super().__setattr__(name, value)
 
     def __call__(self, chunk: Tensor) -> Tensor:
@@ -84,16 +78,14 @@ class Stream:
             samples = flatten_items(chunk, self._batch, self._fitted.dtype) * gain
             outputs = []
             while samples.shape[-1] > 0:
-                time = samples.shape[-1]
-                missing = HOP - self._partial_hop.shape[-1]
-                if missing == HOP and time >= HOP:
-                    count = time // HOP * HOP
+                count = HOP - self._partial_hop.shape[-1]
+                if count == HOP <= samples.shape[-1]:
+                    count = samples.shape[-1] // HOP * HOP
                     outputs.append(self._process_hops(samples[:, :count]))
                 else:
-                    count = min(missing, time)
                     outputs.append(self._process_partial_hop(samples[:, :count]))
                 samples = samples[:, count:]
-            output = torch.cat(outputs, -1) / gain
+            output = soft_limit(torch.cat(outputs, -1), self._aid.limit_spl) / gain
             return output.reshape(*self._batch, -1).to(chunk.dtype)
 
     def flush(self) -> Tensor:
@@ -102,13 +94,8 @@ class Stream:
         The next chunk is the beginning of another signal.
 
         Shape: -> (..., latency), with the leading dimensions of the chunks.
-
-        Raises:
-            ValueError: There was no chunk.
         """
-        if not self._state:
-            raise ValueError("expected a chunk before flush, got none")
-        rest = self(self._fitted.new_zeros(*self._batch, DELAY))
+        rest = self(self._fitted.new_zeros(*self._shape, DELAY))
         self._state = {}
         return rest
 
@@ -118,7 +105,7 @@ class Stream:
         if is_first:
             self._shape = chunk.shape[:-1]
             self._batch, self._fitted = self._aid.prepare(chunk, self._audiogram)
-        elif chunk.shape[:-1] not in (self._shape, self._batch):
+        elif chunk.shape[:-1] != self._shape:
             raise ValueError(
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
                 f"got {tuple(chunk.shape)}"
@@ -130,7 +117,7 @@ class Stream:
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
 
     def _process_hops(self, samples: Tensor) -> Tensor:
-        output, self._state = self._aid.process_hops(
+        output, _, self._state = self._aid.process_hops(
             samples, self._fitted, self._sliders, self._state
         )
         return output
@@ -141,10 +128,8 @@ class Stream:
         self._partial_hop = torch.cat((self._partial_hop, samples), -1)
         needed = 2 * DELAY + samples.shape[-1]
         padded = torch.cat((self._state["past"], self._partial_hop), -1)[:, -needed:]
-        output = self._aid.limit(apply_gains(padded, self._state["gains"], position))
+        output = apply_gains(padded, self._state["gains"], position)
         if self._partial_hop.shape[-1] == HOP:
-            _, self._state = self._aid.excess_gains(
-                self._partial_hop, self._fitted, self._sliders, self._state
-            )
+            self._process_hops(self._partial_hop)
             self._partial_hop = self._partial_hop[:, :0]
         return output

@@ -1,7 +1,5 @@
 """Wide dynamic range compression around NAL-R, without trained parameters."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -15,6 +13,10 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
 from hlsim.torchtools import constant_like
 
+KNEE_DB = 20.0
+"""Level of a band in dB below that of average speech, below which softer sounds get no more gain.
+"""
+
 
 class WDRC(Wearable):
     """A hearing aid that amplifies loud sounds less than soft ones, without trained parameters.
@@ -27,12 +29,8 @@ class WDRC(Wearable):
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
-        bands: Number of bands, 4 to 40. Their centres are an equal number of ERBs (bandwidths of
-            the normal ear), but at least 125 Hz, apart.
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
         release: Time constant in seconds with which it falls, 0.01 to 2.
-        knee: Level of a band in dB below that of average speech, 0 to 60, below which softer sounds
-            have the same gain.
         limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds. A band is not
             amplified beyond this level.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
@@ -46,28 +44,24 @@ class WDRC(Wearable):
     torch.Size([64320])
     """
 
+    bands = 20
+
     def __init__(
         self,
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
-        bands: int = 20,
         attack: float = 0.005,
         release: float = 0.1,
-        knee: float = 20.0,
         limit_spl: float = 110.0,
         linked: bool = False,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl, linked)
-        check_number("bands", bands, 4, 40, whole=True)
         check_number("attack", attack, 0.0, 1.0)
         check_number("release", release, 0.01, 2.0)
-        check_number("knee", knee, 0.0, 60.0)
         check_number("limit_spl", limit_spl, 60.0, 140.0)
-        self.bands = bands
         self.attack = attack
         self.release = release
-        self.knee = knee
         self.limit_spl = limit_spl
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
@@ -121,6 +115,6 @@ class WDRC(Wearable):
         above_speech = levels - constant_like(levels, speech_band_levels, self.bands)
         prescribed, ratios = fitted.chunk(2, -1)
         slope = (1.0 / ratios - 1.0).unsqueeze(1)
-        gains = prescribed.unsqueeze(1) + slope * above_speech.clamp_min(-self.knee)
+        gains = prescribed.unsqueeze(1) + slope * above_speech.clamp_min(-KNEE_DB)
         highest_gains = (self.limit_spl - levels).clamp_min(0.0)
         return torch.minimum(gains.clamp_min(0.0), highest_gains), {"levels": memory}

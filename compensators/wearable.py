@@ -12,9 +12,8 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
   aid itself stores none, so that whole signals, streams and exported programs run the same code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +34,7 @@ from hlsim.audiogram.thresholds import (
     check_two_channels,
     resolve_thresholds,
 )
-from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.torchtools import flatten_items
@@ -65,8 +64,7 @@ class Wearable(MeasuredAid):
 
     A slider is a control that the user may set from 0 to 1, such as the strength of noise
     reduction. Subclasses define ``bands``, ``limit_spl``, ``fit`` and ``compute_gains``; if they
-    have sliders, ``SLIDERS`` with ``DEFAULT_SLIDERS``; and if their gains depend on the past,
-    ``initial_state``.
+    have sliders, ``SLIDERS``; and if their gains depend on the past, ``initial_state``.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
@@ -78,8 +76,7 @@ class Wearable(MeasuredAid):
             limited separately.
 
     Attributes:
-        SLIDERS: Names of the sliders.
-        DEFAULT_SLIDERS: Their default values.
+        SLIDERS: Default value of each slider under its name.
         bands: Number of bands.
         limit_spl: Peak of the output in dB SPL.
 
@@ -89,11 +86,10 @@ class Wearable(MeasuredAid):
     >>> from compensators import WDRC
     >>> aid = WDRC()
     >>> aid.SLIDERS, aid.latency
-    ((), 64)
+    ({}, 64)
     """
 
-    SLIDERS: tuple[str, ...] = ()
-    DEFAULT_SLIDERS: tuple[float, ...] = ()
+    SLIDERS: ClassVar[dict[str, float]] = {}
     bands: int
     limit_spl: float
 
@@ -184,44 +180,26 @@ class Wearable(MeasuredAid):
 
     def process_hops(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the output for some hops of 64 samples (4 ms) of the input.
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Compute the output, before its limit, for some hops of 64 samples (4 ms) of the input.
 
-        Args:
-            samples: Input in pascals at 16 kHz.
-            fitted: Parameters of the aid for the ear of each item, from ``fit``.
-            sliders: New values of the sliders, such as noise reduction. A slider changes gradually
-                from its previous value to the new one.
-            state: Memory of earlier hops: ``initial_state``, or the state that the call for the
-                preceding hops returned.
+        The arguments are those of ``excess_gains``.
 
         Returns:
-            The output in pascals, delayed by 64 samples, and the state after the last hop.
+            The output in pascals, delayed by 64 samples; linear gains minus 1 of the highest band
+            at the end of each hop; and the state after the last hop.
 
-        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, hops * HOP).
-        """
-        output, _, state = self._amplify(samples, fitted, sliders, state)
-        return self.limit(output), state
-
-    def _amplify(
-        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Return the output of ``process_hops`` before the limit, excess gains, and the state.
-
-        The gains are those of the highest band at the end of each hop, (items, hops).
+        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, hops * HOP), (items,
+            hops).
         """
         gains, next_state = self.excess_gains(samples, fitted, sliders, state)
         padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
         return apply_gains(padded, gains[:, :-1]), gains[:, 2:, -1], next_state
 
-    def _amplify_noise(self, noise: Tensor, ears: Tensor) -> Tensor:
-        sliders = noise.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
-        sliders = sliders.expand(len(noise), -1)
-        return self._amplify(noise, self.fit(ears), sliders, self.initial_state(sliders))[0]
-
-    def limit(self, samples: Tensor) -> Tensor:
-        """Return samples in pascals, of any shape, whose magnitude is limited to ``limit_spl``."""
-        return soft_limit(samples, 10.0 ** ((self.limit_spl - PASCAL_SPL) / 20.0))
+    def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
+        sliders = signals.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
+        sliders = sliders.expand(len(signals), -1)
+        return self.process_hops(signals, self.fit(ears), sliders, self.initial_state(sliders))[0]
 
     def _process(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
@@ -250,7 +228,7 @@ class Wearable(MeasuredAid):
             padded = nn.functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
             block_samples = max(1, BLOCK_SAMPLES // (len(low) * HOP)) * HOP
             for block in padded.split(block_samples, -1):
-                output, gains, state = self._amplify(block, fitted, settings, state)
+                output, gains, state = self.process_hops(block, fitted, settings, state)
                 outputs.append(output)
                 highest_gains.append(gains)
             aligned = torch.cat(outputs, -1)[:, DELAY : DELAY + low_time]
@@ -259,8 +237,8 @@ class Wearable(MeasuredAid):
                 above_8_khz = signals - resample(low, RATE, self.sample_rate)[:, :time]
                 gains = gain_at_rate(torch.cat(highest_gains, -1), self.sample_rate, time)
                 result = result[:, :time] + (1.0 + gains) * above_8_khz
-            result = self.limit(result)
-            return (result / gain).reshape(*batch, time).to(waveform.dtype)
+            limited = soft_limit(result, self.limit_spl)
+            return (limited / gain).reshape(*batch, time).to(waveform.dtype)
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None
@@ -289,6 +267,9 @@ class Wearable(MeasuredAid):
     def stack_sliders(self, sliders: Sequence[Slider], batch: torch.Size, like: Tensor) -> Tensor:
         """Stack the values of the sliders, such as noise reduction, to one row per item.
 
+        Values on a GPU are not read, because the host would wait for the GPU. Those that are out of
+        range become NaN instead of raising an error.
+
         Args:
             sliders: Value of each slider in the order of ``SLIDERS``.
             batch: Leading dimensions of the signals and ears.
@@ -297,12 +278,20 @@ class Wearable(MeasuredAid):
         Returns: Values from 0 to 1, (items, sliders).
 
         Raises:
-            ValueError: A value is outside 0 to 1, or a shape does not broadcast to ``batch``.
+            ValueError: A value is outside 0 to 1.
+            RuntimeError: A shape does not broadcast to ``batch``.
         """
-        values = [
-            check_slider(name, slider, batch, like)
-            for name, slider in zip(self.SLIDERS, sliders, strict=True)
-        ]
+        values = []
+        for name, slider in zip(self.SLIDERS, sliders, strict=True):
+            if not isinstance(slider, Tensor):
+                check_number(name, slider, 0.0, 1.0)
+                slider = like.new_full((), slider)
+            in_range = (slider >= 0.0) & (slider <= 1.0)
+            if slider.device.type == "cpu" and not bool(in_range.all()):
+                raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
+            value = torch.where(in_range, slider, torch.nan)
+            value = value.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
+            values.append(value.expand(batch))
         if not values:
             return like.new_zeros(batch.numel(), 0)
         return torch.stack(values, -1).reshape(-1, len(values))
@@ -312,43 +301,6 @@ class Wearable(MeasuredAid):
             f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
             f"bands={self.bands}"
         )
-
-
-def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> Tensor:
-    """Return the value of a slider for each item.
-
-    Values on a GPU are not read, because the host would wait for the GPU. Those that are out of
-    range become NaN instead of raising an error.
-
-    Args:
-        name: Name of the slider, for messages.
-        slider: Number from 0 to 1, or a tensor that broadcasts to ``batch``.
-        batch: Shape of the result, the leading dimensions of a call.
-        like: Tensor whose type and device the result has.
-
-    Raises:
-        ValueError: A value is outside 0 to 1, or the shape does not broadcast.
-
-    >>> check_slider("amplification", 0.5, torch.Size([2]), torch.empty(0))
-    tensor([0.5000, 0.5000])
-    """
-    if not isinstance(slider, Tensor):
-        check_number(name, slider, 0.0, 1.0)
-        return like.new_full(batch, float(slider))
-    is_on_cpu = slider.device.type == "cpu"
-    in_range = None if slider.is_complex() else (slider >= 0.0) & (slider <= 1.0)
-    if in_range is None or (is_on_cpu and not bool(in_range.all())):
-        raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
-    values = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
-    if not is_on_cpu:
-        values = torch.where(in_range, values, torch.nan)
-    try:
-        return values.expand(batch)
-    except RuntimeError:
-        raise ValueError(
-            f"expected one value of {name}, or one per item in the shape {tuple(batch)}, "
-            f"got shape {tuple(values.shape)}"
-        ) from None
 
 
 def _glide(start: Tensor, target: Tensor, frames: int) -> Tensor:

@@ -33,7 +33,7 @@ FRAME_HOP = 50
 POWER_FLOOR = 1e-12
 """Power that is added to those of bands, so that silence has a gain of 0 dB."""
 
-LIMIT = 10.0 ** ((110.0 - 94.0) / 20.0)
+LIMIT_SPL = 110.0
 """Largest sample in pascals, as for both aids: 110 dB SPL."""
 
 
@@ -71,7 +71,7 @@ class PromptGains(nn.Module):
         gains = interpolate(gains, ends / FRAME_HOP)
         padded = functional.pad(waveform, (2 * DELAY, hops * HOP - time))
         amplified = apply_gains(padded[None], (10.0 ** (gains / 20.0) - 1.0)[None])[0]
-        return soft_limit(amplified[DELAY : DELAY + time], LIMIT)
+        return soft_limit(amplified[DELAY : DELAY + time], LIMIT_SPL)
 
     def band_levels(self, waveform: Tensor) -> Tensor:
         """Return the level of each band in each frame in dB. Shape: (time,) -> (frames, 20)."""

@@ -48,6 +48,7 @@ import torch
 from torch import Tensor, nn
 
 from compensators.filter_bank import HOP, RATE
+from compensators.limiter import soft_limit
 from compensators.wearable import Slider, Wearable
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
@@ -98,7 +99,7 @@ class _FitCall(nn.Module):
 
 
 class _HopCall(nn.Module):
-    """``Wearable.process_hops`` as a module with named inputs and outputs."""
+    """``Wearable.process_hops``, with the limit, as a module with named inputs and outputs."""
 
     def __init__(self, aid: Wearable) -> None:
         super().__init__()
@@ -110,7 +111,8 @@ class _HopCall(nn.Module):
         empty = inputs["samples"][:, :0]
         sliders = inputs.get("sliders", empty)
         state = {"gliding": empty} | inputs  # An aid without sliders has no such state.
-        output, next_state = self.aid.process_hops(samples, inputs["fitted"], sliders, state)
+        output, _, next_state = self.aid.process_hops(samples, inputs["fitted"], sliders, state)
+        output = soft_limit(output, self.aid.limit_spl)
         names = [name for name in inputs if name not in STATELESS_INPUTS]
         return {"output": output / gain} | {f"next_{name}": next_state[name] for name in names}
 
@@ -200,7 +202,7 @@ def first_inputs(
         items: Number of signals per call.
         hops: Number of hops of 64 samples per call.
         sliders: Values of sliders from 0 to 1 by name, one for all items or one per item; by
-            default those of ``aid.DEFAULT_SLIDERS``.
+            default those of ``aid.SLIDERS``.
 
     Returns:
         Tensors by the names of inputs that the module's docstring lists.
@@ -217,8 +219,7 @@ def first_inputs(
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
     check_names(sliders, aid.SLIDERS, "sliders")
     weight = next(aid.parameters(), torch.empty(0))
-    defaults = zip(aid.SLIDERS, aid.DEFAULT_SLIDERS, strict=True)
-    values = [sliders.get(name, default) for name, default in defaults]
+    values = [sliders.get(name, default) for name, default in aid.SLIDERS.items()]
     with torch.no_grad():
         samples = weight.new_zeros(items, hops * HOP)
         batch, fitted = aid.prepare(samples, audiogram)

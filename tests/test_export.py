@@ -130,7 +130,7 @@ def test_onnx_gives_the_outputs_of_the_stream(name: str, tmp_path: Path) -> None
     inputs = {name: torch.zeros(shape) for name, shape in shapes.items()}
     inputs |= open_onnx(tmp_path / "fit.onnx")[0]({"thresholds": EARS[:1]})
     for name in {"sliders", "gliding"} & set(inputs):
-        inputs[name] = torch.tensor([aid.DEFAULT_SLIDERS])
+        inputs[name] = torch.tensor([list(aid.SLIDERS.values())])
     assert_equals_stream(call, inputs, aid, EAR, 0.02 * torch.randn(1, 6400), 1e-4)
 
 

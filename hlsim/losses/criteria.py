@@ -5,15 +5,12 @@ weighted sum is the loss.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from hlsim.checks import check_weights
 from hlsim.losses import coherent_bands, paper
-
-CriterionName = Literal["coherent-bands", "bands", "paper", "haspi", "hasqi", "interaural"]
 
 CRITERIA: dict[str, Mapping[str, float]] = {
     "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
@@ -25,7 +22,7 @@ CRITERIA: dict[str, Mapping[str, float]] = {
 }
 """Parts of each criterion with their default weights."""
 
-Criterion = CriterionName | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
+Criterion = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
 """Name of a criterion, weights of several by name, or a function of perceived speech and reference.
 
 Shape of the function: (items, time) twice, in pascals -> (items,).

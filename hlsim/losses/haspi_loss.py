@@ -1,7 +1,5 @@
 """HASPI as a training loss, with terms for the perceived level, peaks and quality."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from hlsim.audiogram.thresholds import AudiogramLike

@@ -1,8 +1,5 @@
 """The training loss of hearing aids: what an impaired ear perceives, compared with a normal ear."""
 
-from __future__ import annotations
-
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -40,9 +37,6 @@ from hlsim.torchtools import flatten_items, not_compiled
 _Reduction = Literal["mean", "none"]
 
 _EarsName = Literal["mean", "better"]
-
-_CRITERIA_OF_OUTPUT = {*SCORES, "interaural"}
-"""Criteria of the output of the compensator. The others compare what is perceived of it."""
 
 _TEMPERATURE = 0.1
 """Temperature of ``ears="better"``.
@@ -327,58 +321,53 @@ class HearingLossLoss(nn.Module):
             """Return a waveform in pascals, (items, time)."""
             return waveform.expand_as(perceived).reshape(-1, time) * gain
 
-        signals = {"perceived": as_items(perceived), "output": as_items(output)}
-        for name in self.criteria:
-            if name not in _CRITERIA_OF_OUTPUT:
-                reference = self._frozen.reference(name, clean, ears, batch, lengths)
-                signals[name] = as_items(reference)
-        if lengths is None:
-            ends = [time] * math.prod(batch)
-            parts = self._compare_perceived(signals)
-        else:
-            ends = lengths.expand(batch).flatten().tolist()
-            items = []
-            for item, end in enumerate(ends):
-                alone = {name: signal[item, None, :end] for name, signal in signals.items()}
-                items.append(self._compare_perceived(alone))
-            parts = {name: torch.cat([item[name] for item in items]) for name in items[0]}
         aided, target = as_items(limited), as_items(clean)
         item_ears = flatten_items(ears, batch, ears.dtype)
-        for name in [name for name in self.criteria if name in SCORES]:
-            parts[name] = score_loss(name, aided, target, item_ears, ends, self.sample_rate)
-        if "interaural" in self.criteria:
-            shape = perceived.shape
-            changes = interaural_loss(aided.view(shape), target.view(shape), self.sample_rate)
-            parts["interaural"] = changes.unsqueeze(-1).expand(batch)
+        ends = [time] * len(aided) if lengths is None else lengths.expand(batch).flatten().tolist()
+        parts: dict[str, Tensor] = {}
+        for name in self.criteria:
+            if name in SCORES:
+                parts[name] = score_loss(name, aided, target, item_ears, ends, self.sample_rate)
+            elif name == "interaural":
+                shape = perceived.shape
+                changes = interaural_loss(aided.view(shape), target.view(shape), self.sample_rate)
+                parts[name] = changes.unsqueeze(-1).expand(batch)
+            else:
+                reference = self._frozen.reference(name, clean, ears, batch, lengths)
+                signals = [as_items(waveform) for waveform in (perceived, reference, output)]
+                parts |= self._compare_perceived(name, signals, None if lengths is None else ends)
         return {name: part.reshape(batch) for name, part in parts.items()}
 
-    def _compare_perceived(self, signals: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Compute the parts of the criteria that compare what is perceived.
+    def _compare_perceived(
+        self, name: str, signals: list[Tensor], ends: list[int] | None = None
+    ) -> dict[str, Tensor]:
+        """Compute the parts of a criterion that compares what is perceived.
 
         Args:
-            signals: ``perceived``, ``output``, and the reference of each criterion by its name,
-                (items, time) each, in pascals.
+            name: Name of the criterion.
+            signals: The perceived signal, the reference and the output, (items, time) in pascals.
+            ends: Number of samples of each item, or None if all are as long as the batch.
 
         Returns:
             Parts, each under its name, (items,) each.
         """
-        perceived = signals["perceived"]
-        parts: dict[str, Tensor] = {}
-        for name in self.criteria:
-            if name in _CRITERIA_OF_OUTPUT:
-                continue
-            pair = perceived, signals[name]
-            if name == "coherent-bands":
-                parts |= coherent_bands.coherent_band_parts(*pair, self.sample_rate)
-                parts["peaks"] = coherent_bands.peak_excess(signals["output"])
-            elif name == "bands":
-                parts["band_levels"] = band_level_loss(*pair, self.sample_rate)
-            elif name == "paper":
-                parts |= paper_parts(*(resample(x, self.sample_rate, NEURO_RATE) for x in pair))
-            else:
-                value = self._unregistered[1](*pair)
-                parts[name] = check_shape(value, "criterion", (len(perceived),))
-        return parts
+        if ends is not None:
+            items = []
+            for item, end in enumerate(ends):
+                alone = [signal[item, None, :end] for signal in signals]
+                items.append(self._compare_perceived(name, alone))
+            return {part: torch.cat([item[part] for item in items]) for part in items[0]}
+        perceived, reference, output = signals
+        if name == "coherent-bands":
+            parts = coherent_bands.coherent_band_parts(perceived, reference, self.sample_rate)
+            return parts | {"peaks": coherent_bands.peak_excess(output)}
+        if name == "bands":
+            return {"band_levels": band_level_loss(perceived, reference, self.sample_rate)}
+        if name == "paper":
+            estimate = resample(perceived, self.sample_rate, NEURO_RATE)
+            return paper_parts(estimate, resample(reference, self.sample_rate, NEURO_RATE))
+        value = self._unregistered[1](perceived, reference)
+        return {name: check_shape(value, "criterion", (len(perceived),))}
 
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move modules that are not registered along with the loss, but not to half precision."""

@@ -65,32 +65,29 @@ def test_a_slider_moves_in_a_stream_without_a_click() -> None:
     assert 10.0 * torch.log10(power[~is_near].sum() / power[is_near].sum()) < -40.0
 
 
-def test_a_stream_follows_a_slider_but_not_an_ear_that_is_written_into() -> None:
+def test_sliders_of_a_stream_are_tensors_or_numbers_by_name() -> None:
     aid: Any = varied_hearing_aid()
-    slider, ear = torch.tensor(aid.DEFAULT_SLIDERS[0]), torch.tensor(EAR.thresholds)
-    written, assigned = aid.stream(ear, slider), aid.stream(EAR)
-    signal = torch.randn(2000)
-    assert torch.equal(written(signal), assigned(signal))
+    slider, signal = torch.tensor(0.5), torch.randn(2000)
+    by_tensor, by_number = aid.stream(EAR, slider), aid.stream(EAR)
+    assert torch.equal(by_tensor(signal), by_number(signal))
     slider.fill_(0.0)
-    ear.fill_(80.0)
-    assigned.noise_reduction = 0.0
-    assert torch.equal(written(signal), assigned(signal))
-    for stream, name in ((assigned, "volume"), (WDRC().stream(EAR), "noise_reduction")):
+    by_number.noise_reduction = 0.0
+    assert torch.equal(by_tensor(signal), by_number(signal))
+    for stream, name in ((by_number, "volume"), (WDRC().stream(EAR), "noise_reduction")):
         with pytest.raises(AttributeError):
             setattr(stream, name, 0.0)
 
 
-BAD_TENSORS = [torch.tensor([0.0, 2.0]), torch.ones(3), torch.tensor(1j)]
-
-
-@pytest.mark.parametrize("slider", [1.5, -0.1, float("nan"), "loud", *BAD_TENSORS], ids=str)
+@pytest.mark.parametrize(
+    "slider", [1.5, -0.1, float("nan"), "loud", torch.tensor([0.0, 2.0])], ids=str
+)
 def test_a_bad_slider_raises_value_error(slider: Any) -> None:
     aid: Any = varied_hearing_aid()
     with pytest.raises(ValueError):
         aid(torch.randn(2, 100), EAR, 1.0, slider)
     stream = aid.stream(EAR)
+    stream.amplification = slider
     with pytest.raises(ValueError):
-        stream.amplification = slider
         stream(torch.randn(2, 100))
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from compensators import NALR, MappingCompensator
 from hlsim import Audiogram
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import level_spl
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_levels
 from hlsim.training.ears import draw_thresholds
@@ -20,7 +20,7 @@ def bands_db(waveform: Tensor) -> Tensor:
     return 10.0 * torch.log10((10.0 ** (band_levels(waveform, 16000) / 10.0)).mean(-2))
 
 
-def test_starts_as_nalr_or_as_a_share_of_the_loss(utterance: Tensor) -> None:
+def test_starts_as_nalr(utterance: Tensor) -> None:
     standard = torch.tensor([Audiogram.standard(name).thresholds for name in ("NH", "N2", "S2")])
     ears = torch.cat((standard, draw_thresholds(8, torch.Generator().manual_seed(1))))
     output, prescribed = MappingCompensator()(utterance, ears), NALR(ears)(utterance)
@@ -31,10 +31,6 @@ def test_starts_as_nalr_or_as_a_share_of_the_loss(utterance: Tensor) -> None:
     assert (level_spl(output) - level_spl(prescribed)).abs().max() < 0.5
     correlation = torch.fft.rfft(output, 48000) * torch.fft.rfft(utterance, 48000).conj()
     assert not torch.fft.irfft(correlation).argmax(-1).any()  # aligned
-
-    noise, flat_loss = set_level(torch.randn(16000), 40.0), torch.full((8,), 50.0)
-    output = MappingCompensator(replace(SMALL, start=0.4))(noise, flat_loss)
-    torch.testing.assert_close(output, 10.0 * noise, rtol=1e-3, atol=1e-3 * float(noise.max()))
 
 
 def test_the_gain_depends_on_the_level(utterance: Tensor) -> None:
