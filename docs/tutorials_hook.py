@@ -2,7 +2,8 @@
 
 Executed notebooks are kept in build/tutorials, and are run again if their cells have changed. ``mkdocs serve`` runs
 none, so that it starts soon: it shows the outputs that are stored. ``TUTORIALS=run mkdocs serve`` runs them, and
-``TUTORIALS=plain mkdocs build`` builds the site without running them.
+``TUTORIALS=plain mkdocs build`` builds the site without running them. The build fails if a notebook raises an error,
+or if what its text promises is no longer true.
 """
 
 import base64
@@ -24,6 +25,28 @@ EXECUTED = ROOT / "build" / "tutorials"
 TIMEOUT_SECONDS = 1800
 
 SUFFIXES = {"audio/flac": "flac", "image/svg+xml": "svg", "image/png": "png"}
+PROMISES = {
+    "hear-a-hearing-loss": """
+normal, mild, severe = (level_spl(hlsim.simulate(presented, name)) for name in ("NH", "N2", "N4"))
+assert bool((normal > mild).all()) and bool((mild > severe).all())
+assert abs(float(level_spl(speech) - level_spl(perceived)) - 55.0) < 3.0
+assert abs(float(normal[-1] - severe[-1]) - 15.0) < 3.0  # recruitment
+""",
+    "train-your-own-network": """
+results = table.set_index(["condition", "speech (dB SPL)"])
+network, nal_r = results.loc["this network"], results.loc["NAL-R"]
+assert bool((network["HASPI"] >= nal_r["HASPI"]).all())
+assert float(network["loudness error (dB)"].abs().max()) < 6.0
+assert sum(history[-20:]) < 0.5 * sum(history[:20])
+""",
+    "score-an-enhancement-system": """
+assert abs(float(level_spl(aided).mean()) - table["output level (dB SPL)"].iloc[-1]) < 0.01
+assert table["HASPI"].iloc[0] < table["HASPI"].iloc[1] < table["HASPI"].iloc[-1]
+assert binaural["noise in front"]["normal hearing"] < binaural["noise from the left"]["normal hearing"]
+""",
+}
+"""Assertions about the results of each notebook, which run after it and are not shown."""
+
 _DATA_URI = re.compile(r'src="data:([\w/+]+);base64,([^"]+)"')
 
 
@@ -42,6 +65,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             executed = execute(notebook, EXECUTED / path.name)
         notebook = executed or notebook
         page, media = render(notebook, path.name)
+        kinds = {name.rpartition(".")[2] for name in media}
+        assert executed is None or kinds >= {"flac", "png"}, f"{path.name} has no sound or picture"
         source = f"tutorials/{path.stem}"
         files.append(File.generated(config, f"{source}.md", content=page))
         for name, data in media.items():
@@ -59,9 +84,11 @@ def find_executed(notebook: NotebookNode, stored: Path) -> NotebookNode | None:
 
 
 def execute(notebook: NotebookNode, stored: Path) -> NotebookNode:
-    """Run a notebook, and store it with its outputs."""
+    """Run a notebook and the assertions about its results, and store it with its outputs."""
+    notebook.cells.append(nbformat.v4.new_code_cell(PROMISES[stored.stem]))
     client = NotebookClient(notebook, timeout=TIMEOUT_SECONDS, kernel_name="python3")
     executed = client.execute(cwd=str(ROOT))
+    executed.cells.pop()
     stored.parent.mkdir(parents=True, exist_ok=True)
     nbformat.write(executed, stored)
     return executed

@@ -30,8 +30,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Use one thread, because the rounding of transforms depends on the number of threads."""
+    """Use one thread, because the rounding of transforms depends on the number of threads.
+
+    Processes that tests start use one as well: several workers would wait for each other's threads.
+    """
     torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
     config.stash[NEW_OUTPUTS] = {}
 
 

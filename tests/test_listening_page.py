@@ -86,9 +86,6 @@ def opened(page: Any, address: str) -> Any:
     return page
 
 
-WIDTHS = pytest.mark.parametrize("page", [390, 1400], indirect=True)
-
-
 def wait(page: Any) -> None:
     """Wait until all versions are computed."""
     page.wait_for_function(COMPUTED)
@@ -135,7 +132,7 @@ def speech_file(folder: Path, samples: int) -> tuple[Path, Tensor]:
     return path, signal
 
 
-@pytest.mark.parametrize(("ear", "samples"), [("N2", 48_000), ("S3", 61_234), ("N6", 9_000)])
+@pytest.mark.parametrize(("ear", "samples"), [("S3", 61_234), ("N6", 9_000)])
 def test_outputs_equal_those_of_python(
     page: Any, address: str, tmp_path: Path, ear: str, samples: int
 ) -> None:
@@ -147,7 +144,7 @@ def test_outputs_equal_those_of_python(
         assert error_db(result(page, name), expected) < -60.0, name
 
 
-@WIDTHS
+@pytest.mark.parametrize("page", [390, 1400], indirect=True)
 def test_nothing_is_wider_than_the_screen(opened: Any) -> None:
     assert opened.evaluate("document.documentElement.scrollWidth") <= opened.viewport_size["width"]
     sizes = opened.evaluate(
@@ -157,7 +154,6 @@ def test_nothing_is_wider_than_the_screen(opened: Any) -> None:
     assert opened.locator("#dock").is_visible() == (opened.viewport_size["width"] < 960)
 
 
-@WIDTHS
 def test_a_dragged_point_moves_the_sounds_and_the_link(opened: Any) -> None:
     assert opened.locator("[aria-pressed=true]").first.inner_text() == "N3"
     before = result(opened, "ear")
@@ -255,10 +251,11 @@ def test_the_link_has_the_ear_and_the_sentence(opened: Any, chromium: Any) -> No
     wait(opened)
 
 
-def test_playback_starts_softly_and_is_limited(opened: Any) -> None:
+def test_playback_starts_softly_and_is_limited(page: Any, address: str) -> None:
     """For a tone 20 dB above full scale, and for one that the limiter should leave as it is."""
-    assert float(opened.locator("#volume").input_value()) <= 50
-    peaks = opened.evaluate(
+    page.goto(address)
+    assert float(page.locator("#volume").input_value()) <= 50
+    peaks = page.evaluate(
         """async () => {
             const { safeOutput } = await import('./player.js');
             const peakOf = async (amplitude) => {
