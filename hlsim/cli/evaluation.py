@@ -173,7 +173,7 @@ def clarity(parser: Parser) -> None:
 def _clarity(options: argparse.Namespace) -> None:
     check_extras("eval")
     from hlsim.evaluation.clarity import evaluate_scenes
-    from hlsim.report.clarity import scenes_page, write_scores
+    from hlsim.report.recordings import scenes_page, write_scores
 
     arguments = _arguments(options, evaluate_scenes)
     evaluation = evaluate_scenes(_read_labels(options.names), **arguments)

@@ -15,17 +15,15 @@ from hlsim.report.plots import (
     condition_colours,
     curves_picture,
     gain_picture,
-    means_picture,
-    pictures_sections,
+    scores_pictures,
 )
 from hlsim.report.results import (
     GAIN_NOTE,
     STATISTICS_NOTE,
+    VERSION_NOTE,
     Columns,
     comparison_table,
-    describe_software,
     detail_section,
-    paired_table,
     score_columns,
     split_rows,
     statistic,
@@ -138,8 +136,7 @@ def _about(evaluation: Evaluation) -> str:
     return (
         f"{settings['items']} items of {settings['seconds']:g} s; {ears} "
         f"{'ear' if ears == 1 else 'ears in turn'}; speech at {levels} dB SPL in turn; seed "
-        f"{settings['seed']}. {describe_software(evaluation)} Both compare with the clean speech, "
-        "in noise too."
+        f"{settings['seed']}. {VERSION_NOTE} Both compare with the clean speech, in noise too."
     )
 
 
@@ -154,7 +151,7 @@ def _details(evaluation: Evaluation) -> Section:
     sections = []
     for name, group in evaluation.groups.items():
         tables = [
-            summary_table(f"By {title}", *_rows(group, fact), folded=True)
+            summary_table(f"By {title}", *_rows(group, fact))
             for fact, title in {
                 "input_level": "input level (dB SPL)",
                 "severity": "degree of loss",
@@ -165,9 +162,13 @@ def _details(evaluation: Evaluation) -> Section:
         if name == "hard":
             tables.insert(0, summary_table("All items", *_rows(group)))
         gaps = summary_table("Mean loss", split_rows(group.table), _GAP_COLUMNS)
+        rivals = {condition.name: condition.rivals for condition in group.conditions}
+        tests = comparison_table(
+            [c for c in group.comparisons if c.before in rivals[c.after]],
+            "All items; p adjusted by Holm within each measure but for a planned comparison",
+        )
         inner_sections = [
-            *pictures_sections(group),
-            Section("Paired tests", tables=_test_tables(group)),
+            Section("Paired tests", tables=[tests], pictures=scores_pictures(group)),
             Section("Surrogate gap", [gap], [gaps]),
         ]
         sections.append(Section(_GROUPS[name], tables=tables, sections=inner_sections))
@@ -177,7 +178,7 @@ def _details(evaluation: Evaluation) -> Section:
 
 
 def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw the gain of each aid beside NAL-R's for each ear, and output level over input level."""
+    """Draw the gain of each aid beside NAL-R's for each ear."""
     colours = condition_colours(evaluation.conditions)
     curves = evaluation.details["gain_curves"]
     pictures = []
@@ -185,10 +186,6 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
         for aid in [COMPRESSION, *evaluation.of_kind("aid")]:
             rows = [row for row in curves if row["ear"] == ear and row["aid"] in (NAL_R, aid)]
             pictures.append(gain_picture(f"{aid}, ear {ear}", rows, colours))
-    clean = evaluation.groups.get("clean")
-    if clean is not None and clean.table["input_level"].nunique() > 1:
-        titles = ("output level (dB SPL)", "level of clean speech (dB SPL)")
-        pictures.append(means_picture(clean, "level", "input_level", *titles))
     return pictures
 
 
@@ -223,19 +220,3 @@ def _wearing_table(evaluation: Evaluation) -> Table:
         cells["Time for a second (ms)"] = f"{row['cpu_ms']:.1f}"
         rows.append(cells)
     return Table.from_rows("Look-ahead, gain for quiet noise, sidebands and cost", rows)
-
-
-def _test_tables(group: Evaluation) -> list[Table]:
-    """Return tables that compare each condition with its rivals, by items and by means of ears."""
-    rivals = {condition.name: condition.rivals for condition in group.conditions}
-    chosen = [c for c in group.comparisons if c.before in rivals[c.after]]
-    means = {
-        f"{c.title}: {c.before} to {c.after}": c.unit_means
-        for c in chosen
-        if c.unit_means is not None
-    }
-    caption = "All items; p adjusted by Holm within each measure but for a planned comparison"
-    tables = [comparison_table(chosen, caption)] if chosen else []
-    if means:
-        tables.append(paired_table("Means of each ear", means))
-    return tables

@@ -71,14 +71,14 @@ def demo_page(
         "Output of the aids": {"original speech": items[-1].clean, **last_outputs},
     }
     player = make_player(groups, rate)
-    details = score_details(evaluation, [_COMPARISON], [result_table(evaluation)])
     about_pictures = _ABOUT_PICTURES.format(
         steps=evaluation.settings["training_steps"], limit=MappingConfig().limit_spl
     )
     sections = [
         Section("Listen", [_LISTEN], player=player),
         Section("What training changed", [about_pictures], pictures=pictures),
-        details,
+        Section("Scores", [_COMPARISON], [result_table(evaluation)]),
+        score_details(evaluation),
     ]
     verdict = headline.verdict("The trained aid", "NAL-R at the same level")
     return Page(

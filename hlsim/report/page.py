@@ -37,37 +37,26 @@ class Table:
         caption: Caption.
         header: Titles of the columns.
         rows: Texts of each row, of which the first is the name of the row.
-        folded: Whether a page shows only the caption until a reader opens the table.
 
-    >>> Table("Scores", ("Aid", "HASPI"), [("NAL-R", "0.93")]).markdown()
-    '| Aid | HASPI |\\n| --- | --- |\\n| NAL-R | 0.93 |'
+    >>> Table.from_rows("Scores", [{"Aid": "NAL-R", "HASPI": "0.93"}]).header
+    ['Aid', 'HASPI']
     """
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    folded: bool = False
 
     @classmethod
-    def from_rows(
-        cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False
-    ) -> Table:
+    def from_rows(cls, caption: str, rows: Sequence[Mapping[str, str]]) -> Table:
         """Return the table of these rows, without columns that are "n/a" in all rows.
 
         Args:
             caption: Caption.
             rows: Texts, each under the title of its column, with the same titles in each row.
-            folded: Whether a page shows only the caption until a reader opens the table.
         """
         titles = rows[0] if rows else ()
         header = [title for title in titles if any(row[title] != "n/a" for row in rows)]
-        return cls(caption, header, [[row[title] for title in header] for row in rows], folded)
-
-    def markdown(self) -> str:
-        """Return the table in Markdown, without the caption."""
-        lines = [self.header, ["---"] * len(self.header), *self.rows]
-        escaped = [[cell.replace("|", "\\|") for cell in line] for line in lines]
-        return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+        return cls(caption, header, [[row[title] for title in header] for row in rows])
 
     def text(self) -> str:
         """Return the table for a terminal, without the caption and the title of the first column.
@@ -88,17 +77,15 @@ class Picture:
 
     Attributes:
         data: Contents of an SVG or PNG file.
-        alt: Text for readers who do not see the picture.
-        title: Heading above the picture.
+        title: Heading above the picture, and text for readers who do not see it.
         note: Sentence below the picture.
 
-    >>> Picture(b"<svg/>", "An empty picture").title
+    >>> Picture(b"<svg/>", "An empty picture").note
     ''
     """
 
     data: bytes
-    alt: str
-    title: str = ""
+    title: str
     note: str = ""
 
 
@@ -109,22 +96,19 @@ class Sound:
     Attributes:
         label: Name on the button.
         level: Level in dB SPL, which is shown beside the name.
-        audio: Contents of a FLAC or WAV file.
+        audio: Contents of a FLAC file.
         loudness: Level in dB relative to full scale with which the sound is played.
-        spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram; empty if
-            there is none.
-        note: Words that are shown on the spectrogram.
+        spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram.
 
-    >>> Sound("unaided", 10.2, b"fLaC").note
-    ''
+    >>> Sound("unaided", 10.2, b"fLaC", -30.0, b"\\x89PNG").label
+    'unaided'
     """
 
     label: str
     level: float
     audio: bytes
-    loudness: float = 0.0
-    spectrogram: bytes = b""
-    note: str = ""
+    loudness: float
+    spectrogram: bytes
 
 
 @dataclass(frozen=True)
@@ -138,9 +122,9 @@ class Player:
             played with one gain.
         seconds: Length of the sounds in seconds.
         full_scale: Level in dB SPL for which full scale stands in the sounds of the first group.
-        sentence: Words that are spoken.
 
-    >>> player = Player({"": [Sound("unaided", 10.2, b"fLaC")]}, seconds=4.0, full_scale=94.0)
+    >>> sounds = [Sound("unaided", 10.2, b"fLaC", -30.0, b"\\x89PNG")]
+    >>> player = Player({"": sounds}, seconds=4.0, full_scale=94.0)
     >>> [sound.label for sound in player.sounds]
     ['unaided']
     """
@@ -148,7 +132,6 @@ class Player:
     groups: Mapping[str, Sequence[Sound]]
     seconds: float
     full_scale: float
-    sentence: str = ""
 
     @property
     def sounds(self) -> list[Sound]:
@@ -240,19 +223,7 @@ class Page:
 
     def markdown(self) -> str:
         """Return text and tables in Markdown, without sounds and pictures. HTML tags stay text."""
-        blocks = [f"# {self.title}", self.verdict, *_markdown_blocks(self.sections, depth=2)]
-        return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", "\n\n".join(filter(None, blocks))) + "\n"
-
-
-def _markdown_blocks(sections: Sequence[Section], depth: int) -> list[str]:
-    blocks: list[str] = []
-    for section in sections:
-        inner = [f"**{table.caption}**\n\n{table.markdown()}" for table in section.tables]
-        inner += section.paragraphs
-        inner += _markdown_blocks(section.sections, depth + 1)
-        if inner:
-            blocks += [f"{'#' * depth} {section.title}", *inner]
-    return blocks
+        return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", _render("page.md", page=self))
 
 
 def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
@@ -266,7 +237,8 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
     Returns: The path of ``report.html``.
 
     Raises:
-        ValueError: The files cannot be written, or JSON cannot represent the data.
+        ValueError: The files cannot be written.
+        TypeError: JSON cannot represent the data.
         MissingExtraError: jinja2 is not installed.
 
     >>> import tempfile
@@ -274,10 +246,7 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
     ...     write_page(Page("Aids", "", []), {"rows": []}, folder).name
     'report.html'
     """
-    try:
-        text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"the results cannot be written as JSON: {error}") from error
+    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     contents = {
         "report.json": f"{text}\n",
         "report.md": page.markdown(),
@@ -295,7 +264,9 @@ def _environment() -> Any:
     jinja2 = require("jinja2", "eval")
     loader = jinja2.FileSystemLoader(_TEMPLATES)
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+        loader=loader,
+        autoescape=jinja2.select_autoescape(["html"]),
+        undefined=jinja2.StrictUndefined,
     )
     script = (_TEMPLATES / "player.js").read_text(encoding="utf-8")
     digest = hashlib.sha256(script.encode()).digest()
@@ -316,6 +287,6 @@ def _render(template: str, **values: Any) -> str:
 
 def _data_uri(data: bytes) -> str:
     """Return the contents of a file as a URI, whose type is known from its first bytes."""
-    types = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
+    types = {b"\x89PNG": "image/png", b"fLaC": "audio/flac"}
     media_type = types.get(data[:4], "image/svg+xml")
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"

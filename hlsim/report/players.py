@@ -15,7 +15,7 @@ from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.parallel import describe_error
 from hlsim.evaluation.result import Evaluation
-from hlsim.extras import MissingExtraError, require
+from hlsim.extras import require
 from hlsim.report.page import (
     SPECTROGRAM_COLOURS,
     SPECTROGRAM_LEVELS,
@@ -32,7 +32,6 @@ NORMAL_EAR = "normal ear (the goal)"
 
 _PEAK = 0.9  # largest sample of the sounds of a group
 _HIGHEST_HZ = 8000.0  # at which MSBG and HASPI end
-_EMPTY_SHARE = 0.03  # of the bins that are within the range of an almost empty spectrogram
 
 _EXPLANATION = (
     "What the impaired ear perceives, by MSBG. The goal is what a normal ear perceives of the "
@@ -119,7 +118,6 @@ def _item_section(
 def make_player(
     groups: Mapping[str, Mapping[str, Tensor]],
     sample_rate: int,
-    sentence: str = "",
     *,
     lowest_peak: float = 0.0,
 ) -> Player:
@@ -127,17 +125,16 @@ def make_player(
 
     All sounds of a group have one gain, so that their loudness can be compared. Groups may have
     different gains, because the output of an aid is much louder than what the ear perceives of it.
-    Without Pillow and matplotlib there are no spectrograms.
 
     Args:
         groups: For each group, under its heading, which may be empty, the signals in pascals, each
             under the label of its button. Shape of each signal: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
-        sentence: Words that are spoken, shown above the sounds.
         lowest_peak: Peak in pascals for which the gain leaves room, even if all signals are softer.
 
     Raises:
         ValueError: All signals of a group are silent.
+        MissingExtraError: matplotlib is not installed.
 
     >>> tone = torch.sin(torch.arange(16000) * 0.2)
     >>> player = make_player({"": {"tone": tone, "soft tone": 0.1 * tone}}, 16000)
@@ -156,12 +153,7 @@ def make_player(
             _make_sound(label, signal, sample_rate, peak) for label, signal in group.items()
         ]
     samples = max(signal.shape[-1] for group in groups.values() for signal in group.values())
-    return Player(
-        groups=sounds,
-        seconds=samples / sample_rate,
-        full_scale=_full_scale(first_peak),
-        sentence=sentence,
-    )
+    return Player(sounds, samples / sample_rate, _full_scale(first_peak))
 
 
 def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> Sound:
@@ -174,15 +166,12 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
         peak: Largest sample of all signals of the group, which is played as 0.9.
     """
     level = float(level_spl(signal.flatten()))
-    levels = spectrogram_levels(signal, sample_rate)
-    is_empty = float((levels > SPECTROGRAM_LEVELS[0]).float().mean()) < _EMPTY_SHARE
     return Sound(
         label,
         level,
         encode_flac(signal * (_PEAK / peak), sample_rate),
         loudness=level - _full_scale(peak),
-        spectrogram=_spectrogram_png(levels),
-        note="almost silence" if is_empty else "",
+        spectrogram=_spectrogram_png(spectrogram_levels(signal, sample_rate)),
     )
 
 
@@ -227,15 +216,9 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
 
 
 def _spectrogram_png(levels: Tensor) -> bytes:
-    """Return a PNG file with one pixel per bin and frame; nothing without Pillow or matplotlib.
-
-    Shape of the levels in dB SPL: (bins, frames).
-    """
-    try:
-        image = require("PIL.Image", "eval")
-        colours = require("matplotlib.colors", "eval").LinearSegmentedColormap
-    except MissingExtraError:  # Sounds can be played without it.
-        return b""
+    """Return a PNG file with one pixel per bin and frame, of levels in dB SPL (bins, frames)."""
+    image = require("PIL.Image", "eval")
+    colours = require("matplotlib.colors", "eval").LinearSegmentedColormap
     lowest, highest = SPECTROGRAM_LEVELS
     shares = ((levels - lowest) / (highest - lowest)).clamp(0.0, 1.0)
     pixels = (255.0 * shares).round().to(torch.uint8).flip(0).numpy()

@@ -18,11 +18,7 @@ from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
-from hlsim.report.page import Picture, Section
-from hlsim.report.results import sort_facts
-
-_MANY_POINTS = 2000
-"""Number of points above which they are drawn as pixels, so that a page stays small."""
+from hlsim.report.page import Picture
 
 INK = "#010203"
 """Stand-in for the colour of text, which is dark on a light page and light on a dark page."""
@@ -43,10 +39,7 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH_INCHES = 4.2
 _LEGEND_INCHES = 0.2  # for each row of a legend
 
-_INKED = (
-    "text.color axes.edgecolor axes.labelcolor xtick.color ytick.color boxplot.boxprops.color "
-    "boxplot.medianprops.color boxplot.whiskerprops.color"
-)
+_INKED = "text.color axes.edgecolor axes.labelcolor xtick.color ytick.color"
 
 _STYLE: dict[str, Any] = {
     **dict.fromkeys(_INKED.split(), INK),
@@ -65,18 +58,17 @@ Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mappin
 
 
 def _draw_picture(
-    draw: Callable[[Any], None], title: str, *, alt: str = "", note: str = "", height: float = 3.2
+    draw: Callable[[Any], None], title: str, note: str = "", height: float = 3.2
 ) -> Picture:
     """Return an SVG picture for a page of what a function draws on matplotlib axes.
 
     Args:
         draw: Function that is called with the axes.
         title: Heading above the picture.
-        alt: Text for readers who do not see the picture; by default the title.
         note: Sentence below the picture.
         height: Height in inches.
 
-    >>> _draw_picture(lambda axes: axes.plot([1, 2]), "A line").alt
+    >>> _draw_picture(lambda axes: axes.plot([1, 2]), "A line").title
     'A line'
     """
     figures = require("matplotlib.figure", "eval")
@@ -84,11 +76,10 @@ def _draw_picture(
     with require("matplotlib", "eval").rc_context(_STYLE):
         figure = figures.Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
         draw(figure.subplots())
-        style = {"transparent": True, "dpi": 150, "metadata": {"Date": None}}
-        figure.savefig(data, format="svg", **style)
+        figure.savefig(data, format="svg", transparent=True, metadata={"Date": None})
     svg = data.getvalue().replace(INK.encode(), b"currentColor")
     svg = svg.replace(b"</style>", _CSS + b"</style>", 1)
-    return Picture(svg, alt or title, title, note)
+    return Picture(svg, title, note)
 
 
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
@@ -110,93 +101,21 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     return colours
 
 
-def _draw_points(axes: Any, x: Any, y: Any, size: float) -> None:
-    """Draw one point per item, as pixels if there are many."""
-    style = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0]}
-    axes.scatter(x, y, s=size, rasterized=len(x) > _MANY_POINTS, **style)
-
-
-def scatter_picture(
-    x: Any, y: Any, axis_titles: tuple[str, str], title: str, axis_range: Any = None
-) -> Picture:
-    """Draw two values of each item against each other, and a line where both are equal.
-
-    Args:
-        x, y: Values of the items. Shape: (items,).
-        axis_titles: Titles of the horizontal and of the vertical axis.
-        title: Heading above the picture.
-        axis_range: Lower and upper end of both axes; by default that of the values.
-
-    >>> scatter_picture([0.2, 0.4], [0.3, 0.5], ("unaided", "aid"), "HASPI of 2 items").title
-    'HASPI of 2 items'
-    """
-
-    def draw(axes: Any) -> None:
-        axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
-        _draw_points(axes, x, y, size=16)
-        axes.set(
-            xlabel=axis_titles[0],
-            ylabel=axis_titles[1],
-            xlim=axis_range,
-            ylim=axis_range,
-        )
-
-    note = "Each point is an item; both values are equal on the dashed line."
-    return _draw_picture(draw, title, note=note)
-
-
-def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Picture:
-    """Draw the median, the quartiles and all values of each group of items.
-
-    Args:
-        groups: Values of each group as a pandas series, under the name of the group.
-        measure: Title of the values.
-        by: Noun for the groups, such as "condition".
-
-    >>> import pandas
-    >>> scores = {"unaided": pandas.Series([0.2, 0.4]), "aid": pandas.Series([0.5, 0.7])}
-    >>> distribution_picture(scores, "HASPI", "condition").alt
-    'HASPI by condition; medians: unaided 0.300, aid 0.600.'
-    """
-    values = {
-        name: group.dropna().to_numpy() for name, group in groups.items() if group.notna().any()
-    }
-
-    def draw(axes: Any) -> None:
-        names = [fill(name, 18) for name in values]
-        style = {"orientation": "horizontal", "tick_labels": names, "widths": 0.5}
-        axes.boxplot(list(values.values()), whis=0.0, showfliers=False, showcaps=False, **style)
-        generator = np.random.default_rng(0)
-        for place, group in enumerate(values.values(), 1):
-            heights = place + generator.uniform(-0.18, 0.18, len(group))
-            _draw_points(axes, group, heights, size=9)
-        axes.invert_yaxis()
-        axes.set(xlabel=measure)
-
-    medians = [f"{name} {np.median(group):.3f}" for name, group in values.items()]
-    title = f"{measure} by {by}"
-    alt = f"{title}; medians: {', '.join(medians)}."
-    note = "Box: the middle half of the items and their median. Points: all items."
-    return _draw_picture(draw, title, alt=alt, note=note, height=0.9 + 0.45 * len(values))
-
-
 def curves_picture(
     curves: Mapping[str, Curve],
     title: str,
     axis: str,
     *,
-    over: str = "",
     axis_range: tuple[float | None, float | None] = (None, None),
     note: str = "",
 ) -> Picture:
-    """Draw curves, with a legend below them.
+    """Draw curves over frequency in Hz, with a legend below them.
 
     Args:
-        curves: Horizontal values, vertical values and a dictionary of matplotlib's line properties
+        curves: Frequencies, vertical values and a dictionary of matplotlib's line properties
             for each curve, under the name that the legend shows.
         title: Heading above the picture.
         axis: Title of the vertical axis.
-        over: Title of the horizontal axis; by default, it is frequency in Hz.
         axis_range: Lower and upper end of the vertical axis; None is that of the curves.
         note: Sentence below the picture.
 
@@ -210,11 +129,7 @@ def curves_picture(
             # A label that begins with an underscore would be hidden.
             axes.plot(x, y, label=f" {fill(name, 26)}", **style)
         axes.set(ylabel=axis, ylim=axis_range)
-        if over:
-            axes.set(xlabel=over)
-            axes.grid(alpha=0.3)
-        else:
-            frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
+        frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
         style = {"frameon": False, "fontsize": 9, "handlelength": 1.5, "columnspacing": 1.0}
         axes.figure.legend(loc="outside lower left", ncols=2, **style)
 
@@ -250,42 +165,10 @@ def gain_picture(
     return curves_picture(curves, title, "insertion gain (dB)")
 
 
-def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, over: str) -> Picture:
-    """Draw mean scores against a property of the items, such as their SNR, per condition.
+def scores_pictures(evaluation: Evaluation) -> list[Picture]:
+    """Draw both scores of each item by which an evaluation's conditions are compared.
 
-    The curve of a condition has one point for each value of the property that occurs: the mean over
-    all items with this value.
-
-    Args:
-        evaluation: The evaluation.
-        column: Column of its table with the scores, such as ``"haspi"``.
-        fact: Column of its table with the property, such as ``"snr"``.
-        title: Title of the scores.
-        over: Title of the property.
-
-    >>> import pandas
-    >>> rows = [(0, "aid", 5.0, 0.5), (1, "aid", 10.0, 0.7)]
-    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "snr", "haspi"])
-    >>> evaluation = Evaluation([], [Condition("aid")], [], table)
-    >>> means_picture(evaluation, "haspi", "snr", "HASPI", "SNR (dB)").title
-    'Mean HASPI by SNR (dB)'
-    """
-    colours = condition_colours(evaluation.conditions)
-    means = evaluation.table.groupby(["condition", fact])[column].mean()
-    curves = {}
-    for name in means.index.unique(0).intersection(evaluation.names):
-        x = sort_facts(means[name].index)
-        style = {"color": colours[name], "marker": "."}
-        curves[name] = (x, [means[name][value] for value in x], style)
-    return curves_picture(curves, f"Mean {title} by {over}", title, over=over)
-
-
-def pictures_sections(evaluation: Evaluation) -> list[Section]:
-    """Return the section "Pictures" of a page with the scores by which its conditions are compared.
-
-    A picture that would show a single group or item is left out.
-
-    Returns: The section, or an empty list if there is no comparison.
+    Returns: The picture, or an empty list if there is no comparison of two or more items.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES, compare
@@ -293,23 +176,22 @@ def pictures_sections(evaluation: Evaluation) -> list[Section]:
     >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
     >>> conditions, comparisons = [Condition("a"), Condition("b")], compare(table, ["haspi"])
     >>> evaluation = Evaluation([], conditions, [MEASURES["haspi"]], table, comparisons)
-    >>> [picture.title for picture in pictures_sections(evaluation)[0].pictures]
-    ['HASPI by condition', 'HASPI of the 2 items']
+    >>> [picture.title for picture in scores_pictures(evaluation)]
+    ['HASPI of the 2 items']
     """
     c = evaluation.headline
     if c is None or c.overall.n < 2:
         return []
-    scores = evaluation.wide(c.measure)
-    before, after = scores[[c.before, c.after]].dropna().to_numpy().T
+    before, after = evaluation.wide(c.measure)[[c.before, c.after]].dropna().to_numpy().T
     scale = MEASURES[c.measure].score_range if c.measure in MEASURES else None
     axis_range = scale and (scale[0] - 0.03, scale[1] + 0.03)
-    axis_titles = (f"{c.title}, {c.before}", f"{c.title}, {c.after}")
-    title = f"{c.title} of the {len(before)} items"
-    pictures = [
-        distribution_picture(dict(scores.items()), c.title, "condition"),
-        scatter_picture(before, after, axis_titles, title, axis_range),
-    ]
-    for fact, name in {"severity": "degree of loss", "snr": "SNR (dB)"}.items():
-        if fact in evaluation.table and evaluation.table[fact].nunique() > 1:
-            pictures.append(means_picture(evaluation, c.measure, fact, c.title, name))
-    return [Section("Pictures", pictures=pictures)]
+
+    def draw(axes: Any) -> None:
+        axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
+        style = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0]}
+        axes.scatter(before, after, s=16, **style)
+        axes.set(xlabel=f"{c.title}, {c.before}", ylabel=f"{c.title}, {c.after}")
+        axes.set(xlim=axis_range, ylim=axis_range)
+
+    note = "Each point is an item; both scores are equal on the dashed line."
+    return [_draw_picture(draw, f"{c.title} of the {len(before)} items", note)]

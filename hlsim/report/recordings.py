@@ -1,23 +1,35 @@
-"""The page of ``haspi-report``, which presents what ``hlsim.evaluation.recordings`` computes."""
+"""The pages about recordings: those of ``haspi-report`` and of ``clarity``."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
-from hlsim.report.page import Page, Section, write_page
+from hlsim.files import write_atomically
+from hlsim.report.page import Page, Section, Table, write_page
 from hlsim.report.players import listening_sections
-from hlsim.report.plots import pictures_sections
+from hlsim.report.plots import scores_pictures
 from hlsim.report.results import (
     GAIN_NOTE,
     LEVEL,
+    Columns,
     comparison_table,
     score_columns,
     score_details,
     split_rows,
+    statistic,
     summary_table,
+)
+
+_ABOUT_SCENES = (
+    "Scores are those of the better ear, by each measure, and combined is the mean of HASPI and "
+    "HASQI, as in Clarity's challenge at ICASSP 2023. HASPI rewards any gain, so that the level "
+    "of the better ear stands beside it. The look-ahead is measured; the challenges allow "
+    f"{RULE_MS:g} ms."
 )
 
 
@@ -51,7 +63,7 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 
 
 def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
-    """Return the page about recorded speech: verdict, scores, sounds, pictures, details.
+    """Return the page about recorded speech: verdict, scores, sounds, details.
 
     Args:
         evaluation: Evaluation of ``haspi_report``.
@@ -75,9 +87,8 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
         tables.append(comparison_table([headline], "The comparison of the first sentence"))
         texts = [headline.limits(), *texts, *_words(evaluation, headline)]
     sections = [
-        Section("Scores", texts, tables),
+        Section("Scores", texts, tables, scores_pictures(evaluation)),
         *listening_sections(evaluation, listen),
-        *pictures_sections(evaluation),
         score_details(evaluation),
     ]
     measures = ", ".join(map(column_title, evaluation.scores))
@@ -109,3 +120,81 @@ def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
         "hearing aids (hlsim.metrics.words). HASPI ranks aids well, but says little about single "
         "listeners.",
     ]
+
+
+def write_scores(evaluation: Evaluation, out: str | Path) -> None:
+    """Write ``scores.csv`` with one row per scene, listener and condition.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_scenes``.
+        out: Folder of the file.
+
+    >>> import pandas
+    >>> import tempfile
+    >>> row = {"utterance": "S1", "listener": "L1", "condition": "aid", "haspi": 0.5, "hasqi": 0.3}
+    >>> evaluation = Evaluation([], [], [], pandas.DataFrame([row | {"level": 80.0}]))
+    >>> with tempfile.TemporaryDirectory() as out:
+    ...     write_scores(evaluation, out)
+    ...     print((Path(out) / "scores.csv").read_text().splitlines()[1])
+    S1,L1,aid,0.400000,0.500000,0.300000,80.000000
+    """
+    columns = ["utterance", "listener", "condition", "combined", "haspi", "hasqi", "level"]
+    scores = _add_combined(evaluation).table[columns].rename(columns={"utterance": "scene"})
+    write_atomically(Path(out) / "scores.csv", scores.to_csv(index=False, float_format="%.6f"))
+
+
+def _add_combined(evaluation: Evaluation) -> Evaluation:
+    """Add the column ``combined``, the mean of HASPI and HASQI, to the table of an evaluation."""
+    combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
+    return replace(evaluation, table=evaluation.table.assign(combined=combined))
+
+
+def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
+    """Return the page about scenes: verdict, conditions, sounds, details.
+
+    Args:
+        evaluation: Evaluation of ``evaluate_scenes``.
+        listen: Number of scenes with a player.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import Condition
+    >>> row = {"item": 0, "name": "S1", "condition": "unaided", "haspi": 0.5, "hasqi": 0.3}
+    >>> row |= {"level": 80.0, "clean_level": 65.0, "full_scale_spl": 100.0, "failure": None}
+    >>> further = {"settings": {"seed": 0}, "details": {"look_ahead_ms": {"unaided": 0.0}}}
+    >>> table, conditions = pandas.DataFrame([row]), [Condition("unaided")]
+    >>> scenes_page(Evaluation([], conditions, [], table, **further)).title
+    "Clarity's scenes: 1 pairs of scene and listener"
+    """
+    planned = [c.verdict() for c in evaluation.comparisons if c.planned]
+    verdict, *further_verdicts = planned or [f"No pair of aids could be compared with {NAL_R}."]
+    played = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
+    texts = [*further_verdicts, _ABOUT_SCENES]
+    tables, pictures = [_conditions_table(evaluation)], scores_pictures(evaluation)
+    sections = [
+        Section("Conditions", texts, tables, pictures),
+        *listening_sections(evaluation, listen, played),
+        score_details(evaluation),
+    ]
+    title = f"Clarity's scenes: {evaluation.table['item'].nunique()} pairs of scene and listener"
+    return Page(title, verdict, sections)
+
+
+def _conditions_table(evaluation: Evaluation) -> Table:
+    """Return a table with one row per condition.
+
+    The columns are mean scores, the level of the output, and the look-ahead in ms. Only those pairs
+    of scene and listener are used for which all conditions have scores, except conditions that have
+    no score at all.
+    """
+    evaluation = _add_combined(evaluation)
+    combined = evaluation.wide("combined").dropna(axis=1, how="all")
+    scored = combined.notna().all(axis=1)
+    table = evaluation.table[evaluation.table["item"].map(scored)]
+    scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
+    columns: Columns = {title: (statistic(score), ".3f") for title, score in scores.items()}
+    columns |= LEVEL
+    shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
+    caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
+    look_ahead = evaluation.details["look_ahead_ms"]
+    columns["Look-ahead (ms)"] = (lambda rows: look_ahead[rows["condition"].iloc[0]], ".1f")
+    return summary_table(caption, split_rows(table), columns)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from itertools import product
 from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +29,8 @@ STATISTICS_NOTE = (
     "(Hesterberg 2015); there is none for fewer than six. Wilcoxon's test leaves out items that "
     "did not change; W is the smaller rank sum."
 )
+
+VERSION_NOTE = "HASPI and HASQI are computed in version 2, as by pyclarity 0.9."
 
 Columns = dict[str, tuple[Callable[["DataFrame"], Any], str]]
 """Columns of a page's table by title: a function of some rows of the study's table, and a format.
@@ -87,8 +87,8 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
 
     Args:
         table: The table.
-        fact: Column with a property of the items, such as ``"snr"``, by whose values the rows are
-            split, too.
+        fact: Column with a property of the items, such as ``"snr"`` or ``"severity"``, by whose
+            values the rows are split, too, in ascending order.
 
     >>> import pandas
     >>> rows = [("unaided", 5.0), ("aid", 5.0), ("unaided", 0.0), ("aid", 0.0)]
@@ -98,30 +98,17 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     if not fact:
         return {name: table[table["condition"] == name] for name in table["condition"].unique()}
     rows = {}
-    for value in sort_facts(table[fact].dropna().unique()):
+    values = table[fact].dropna().unique()
+    degrees = {name: place for place, name in enumerate(SEVERITIES)}
+    for value in sorted(values, key=lambda value: degrees.get(value, value)):
         heading = value if isinstance(value, str) else f"{value:g}"
         for name, part in split_rows(table[table[fact] == value]).items():
             rows[f"{heading}, {name}"] = part
     return rows
 
 
-def sort_facts(values: Sequence[Any]) -> list[Any]:
-    """Return the values of a property of items in ascending order, degrees of loss by severity.
-
-    >>> sort_facts(["severe", "mild"]), sort_facts([10.0, 5.0])
-    (['mild', 'severe'], [5.0, 10.0])
-    """
-    degrees = {name: place for place, name in enumerate(SEVERITIES)}
-    return sorted(values, key=lambda value: (degrees.get(value, 0), value))
-
-
 def summary_table(
-    caption: str,
-    rows: Mapping[str, DataFrame],
-    columns: Columns,
-    *,
-    first: str = "Condition",
-    folded: bool = False,
+    caption: str, rows: Mapping[str, DataFrame], columns: Columns, first: str = "Condition"
 ) -> Table:
     """Return a table with one row of statistics for each part of a study's table.
 
@@ -130,7 +117,6 @@ def summary_table(
         rows: Parts of the study's table, each under its name, see ``split_rows``.
         columns: Statistics by the title of their column.
         first: Title of the first column, which contains the names.
-        folded: Whether the page shows only the caption until a reader opens the table.
 
     >>> import pandas
     >>> rows = {"unaided": pandas.DataFrame({"haspi": [0.2, 0.4]})}
@@ -143,7 +129,7 @@ def summary_table(
             title: format_number(compute(part), form) for title, (compute, form) in columns.items()
         }
         cells.append({first: name, **values})
-    return Table.from_rows(caption, cells, folded=folded)
+    return Table.from_rows(caption, cells)
 
 
 def format_number(value: Any, form: str) -> str:
@@ -167,22 +153,14 @@ def _mean_and_deviation(mean: float, deviation: float | None) -> str:
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 
 
-def loss_name(severity: str) -> str:
-    """Return the name of a degree of hearing loss for a table or a sentence.
-
-    >>> loss_name("mild"), loss_name("none")
-    ('mild loss', 'no loss')
-    """
-    return "no loss" if severity == "none" else f"{severity} loss"
-
-
 def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparisons") -> Table:
     """Return a table with one row per comparison of two conditions by one measure.
 
     The columns are the measure with the two conditions, the change of the output level in dB, the
     number of pairs n, the means under both conditions, their change with its 95 % interval, the
-    t-test, Wilcoxon's test, and Cohen's d. The p values are those of the sentences on the page:
-    adjusted by Holm's method unless the comparison was planned.
+    t-test, Wilcoxon's test, Cohen's d, and the p value of the t-test over the means of listeners or
+    another unit. The other p values are those of the sentences on the page: adjusted by Holm's
+    method unless the comparison was planned.
 
     >>> import pandas
     >>> from hlsim.evaluation import compare
@@ -196,7 +174,10 @@ def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparis
         planned = " (planned)" if c.planned else ""
         row = {"Comparison": f"{c.title}: {c.before} to {c.after}{planned}"}
         row["Level change (dB)"] = format_number(c.level_change, "+.1f")
-        rows.append(row | _paired_cells(c.overall, c.p_t, c.p_w))
+        row |= _paired_cells(c.overall, c.p_t, c.p_w)
+        means_p = None if c.unit_means is None else c.unit_means.p_t
+        row[f"t-test of {c.unit} means"] = "n/a" if means_p is None else format_p(means_p)
+        rows.append(row)
     return Table.from_rows(caption, rows)
 
 
@@ -238,8 +219,8 @@ def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> 
 def _comparison_sections(evaluation: Evaluation) -> list[Section]:
     """Return the sections of a page with the comparisons that the verdict leaves out.
 
-    These are all pairs of conditions, the verdict's pair for each degree of hearing loss, and this
-    pair by the means of listeners or another unit.
+    These are all pairs of conditions, and the verdict's pair by the means of listeners or another
+    unit and for each degree of hearing loss.
     """
     headline, sections = evaluation.headline, []
     if headline is None:
@@ -250,35 +231,27 @@ def _comparison_sections(evaluation: Evaluation) -> list[Section]:
         caption = "All comparisons; other p values are adjusted by Holm within each measure"
         table = comparison_table(evaluation.comparisons, caption)
         sections.append(Section("All comparisons", plan if headline.planned else [], [table]))
-    if len(headline.by_severity) > 1:
-        degrees = {loss_name(name): part for name, part in headline.by_severity.items()}
-        sections.append(Section("By degree of loss", tables=[paired_table(pair, degrees)]))
+    parts = {"all items": headline.overall}
     if headline.unit_means is not None:
-        units = {"items": headline.overall, f"{headline.unit} means": headline.unit_means}
-        table = paired_table(f"{pair}, items nested in {headline.unit}s", units)
-        sections.append(Section(f"Items and {headline.unit}s", tables=[table]))
+        parts[f"{headline.unit} means"] = headline.unit_means
+    if len(headline.by_severity) > 1:
+        parts |= {f"loss: {name}": part for name, part in headline.by_severity.items()}
+    if len(parts) > 1:
+        sections.append(Section("Parts of the items", tables=[paired_table(pair, parts)]))
     return sections
 
 
 def detail_section(
-    evaluation: Evaluation,
-    sections: Sequence[Section],
-    notes: Sequence[str],
-    *,
-    texts: Sequence[str] = (),
-    tables: Sequence[Table] = (),
+    evaluation: Evaluation, sections: Sequence[Section], notes: Sequence[str]
 ) -> Section:
     """Return the folded section "Details" at the end of a page.
 
-    It contains texts, tables and sections, the items that failed, and notes about the origin of
-    the values.
+    It contains sections, the items that failed, and notes about the origin of the values.
 
     Args:
         evaluation: The evaluation of the page.
         sections: Inner sections.
-        notes: Sentences about the origin of the values; empty ones are left out.
-        texts: Paragraphs to begin with.
-        tables: Tables to begin with.
+        notes: Sentences about the origin of the values.
 
     >>> import pandas
     >>> from hlsim.evaluation import Condition
@@ -295,19 +268,12 @@ def detail_section(
         further.append(Section("Failures", ["The other items were measured."], [table]))
     versions = ", ".join(f"{name} {v}" for name, v in evaluation.versions.items())
     origin = f"Seed {evaluation.settings['seed']}. Versions: {versions}."
-    further.append(Section("How the values were computed", [*filter(None, notes), origin]))
-    return Section("Details", texts, tables, sections=further, folded=True)
+    further.append(Section("How the values were computed", [*notes, origin]))
+    return Section("Details", sections=further, folded=True)
 
 
-def score_details(
-    evaluation: Evaluation, texts: Sequence[str] = (), tables: Sequence[Table] = ()
-) -> Section:
-    """Return the section "Details" of a page about scores, with all comparisons and items.
-
-    Args:
-        evaluation: The evaluation of the page.
-        texts: Paragraphs to begin with.
-        tables: Tables to begin with.
+def score_details(evaluation: Evaluation) -> Section:
+    """Return the section "Details" of a page about scores, with all comparisons and means by SNR.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report
@@ -315,58 +281,21 @@ def score_details(
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
     >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
     >>> [section.title for section in score_details(evaluation).sections]
-    ['All items', 'How the values were computed']
+    ['How the values were computed']
     """
-    item_tables = [_items_table(evaluation, "Scores and levels of every item")]
-    better_ear = ""
-    if "ears" in evaluation.groups:
-        caption = "Scores and levels of each ear"
-        item_tables.append(_items_table(evaluation.groups["ears"], caption))
-        better_ear = "Each score is that of the better ear, by each measure."
-    sections = [*_comparison_sections(evaluation), Section("All items", tables=item_tables)]
-    counts = evaluation.table.drop_duplicates("item")["severity"].value_counts()
-    degrees = ", ".join(f"{name} {counts[name]}" for name in SEVERITIES if name in counts)
     clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
     scales = " to ".join(f"{level:.1f}" for level in sorted({scale.min(), scale.max()}))
     notes = [
-        describe_software(evaluation),
-        f"Degrees of hearing loss by item: {degrees}.",
+        VERSION_NOTE,
         f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for {scales} "
         "dB SPL.",
-        better_ear,
         STATISTICS_NOTE,
     ]
-    return detail_section(evaluation, sections, notes, texts=texts, tables=tables)
-
-
-def _items_table(evaluation: Evaluation, caption: str) -> Table:
-    """Return a table with one row per item.
-
-    The columns are the name and the degree of loss, and each score and the output level in dB SPL
-    under each condition.
-    """
-    facts = evaluation.table.drop_duplicates("item").set_index("item")
-    columns = {"Item": facts["name"], "Loss": facts["severity"]}
-    formats = {**dict.fromkeys(evaluation.scores, ".3f"), "level": ".1f"}
-    for name, (column, form) in product(evaluation.names, formats.items()):
-        title = "dB SPL" if column == "level" else column_title(column)
-        values = evaluation.wide(column)[name]
-        columns[f"{title}, {name}"] = values.map(partial(format_number, form=form))
-    return Table(caption, list(columns), list(zip(*columns.values(), strict=True)))
-
-
-def describe_software(evaluation: Evaluation) -> str:
-    """Return a sentence that says which software computed HASPI and HASQI.
-
-    The sentence is empty if the evaluation has neither.
-
-    >>> import pandas
-    >>> from hlsim.evaluation import MEASURES
-    >>> evaluation = Evaluation([], [], [MEASURES["haspi"]], pandas.DataFrame({"haspi": [0.5]}))
-    >>> describe_software(evaluation)[-50:]
-    ' computes HASPI (version 2) as pyclarity 0.9 does.'
-    """
-    names = [column_title(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
-    software = f"hlsim {evaluation.versions['hlsim']}"
-    scores = " and ".join(names)
-    return f"{software} computes {scores} (version 2) as pyclarity 0.9 does." if names else ""
+    if "ears" in evaluation.groups:
+        notes.append("Each score is that of the better ear, by each measure.")
+    sections = _comparison_sections(evaluation)
+    if "snr" in evaluation.table and evaluation.table["snr"].nunique() > 1:
+        rows = split_rows(evaluation.table, "snr")
+        tables = [summary_table("Means by SNR (dB)", rows, score_columns(evaluation))]
+        sections.append(Section("By SNR", tables=tables))
+    return detail_section(evaluation, sections, notes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -11,15 +11,12 @@ import torch
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.simulators import agreement, example_item
 from hlsim.extras import install_command, is_installed
-from hlsim.report.page import Page, Picture, Section
+from hlsim.report.page import Page, Section
 from hlsim.report.players import make_player
-from hlsim.report.plots import distribution_picture, scatter_picture
 from hlsim.report.results import (
     Columns,
     comparison_table,
     detail_section,
-    loss_name,
-    sort_facts,
     split_rows,
     statistic,
     summary_table,
@@ -67,7 +64,7 @@ _FACTS = {
 
 
 def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
-    """Return the page about simulators: verdict, side by side, sounds, pictures, details.
+    """Return the page about simulators: verdict, side by side, sounds, details.
 
     Args:
         evaluation: Evaluation of ``evaluate_simulators``.
@@ -100,13 +97,8 @@ def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
         details.append(Section(title, tables=fact_tables))
     if listen:
         sections.append(_listening_section(evaluation))
-    first = next(iter(evaluation.groups.values()))
-    pictures = [
-        Section(name, pictures=[*_pictures(rows)]) for name, rows in split_rows(first.table).items()
-    ]
-    sections.append(Section("Pictures", sections=pictures))
     sections.append(detail_section(evaluation, details, [_about(evaluation)]))
-    return Page("Simulators", _verdict(evaluation, first), sections)
+    return Page("Simulators", _verdict(evaluation), sections)
 
 
 def _teacher(evaluation: Evaluation) -> str:
@@ -115,8 +107,9 @@ def _teacher(evaluation: Evaluation) -> str:
     return "the exact MSBG" if teacher == "msbg" else teacher
 
 
-def _verdict(evaluation: Evaluation, first: Evaluation) -> str:
+def _verdict(evaluation: Evaluation) -> str:
     """Return a sentence about the simulator that is closest to the teacher by median SNR."""
+    first = next(iter(evaluation.groups.values()))
     snr = first.wide("snr").dropna(axis=1, how="all")
     medians = snr.median().sort_values(ascending=False)
     best = snr[medians.index[0]].dropna()
@@ -161,25 +154,6 @@ def _listening_section(evaluation: Evaluation) -> Section:
     facts = item.facts
     text = (
         f"{_TREATMENTS[facts['treatment']]}, {facts['speech']}, {facts['input_level']:g} dB SPL, "
-        f"{loss_name(facts['severity'])}."
+        f"degree of loss: {facts['severity']}."
     )
     return Section("Listen", [text], player=player)
-
-
-def _pictures(rows: DataFrame) -> Iterator[Picture]:
-    """Draw the scores of a simulator over those of the teacher, and its errors by degree of loss.
-
-    The rows are those of one simulator in the study's table.
-    """
-    for score, title in (("stoi", "STOI"), ("pesq", "PESQ")):
-        pairs = rows.reindex(columns=[f"{score}_teacher", f"{score}_simulator"]).astype(float)
-        pairs = pairs.dropna()
-        if len(pairs) > 1:
-            axis_titles = (f"{title}, teacher", f"{title}, simulator")
-            teacher, simulator = pairs.to_numpy().T
-            yield scatter_picture(teacher, simulator, axis_titles, f"{title} of both outputs")
-    degrees = sort_facts(rows["severity"].unique())
-    for column, title in (("snr", "SNR (dB)"), ("band_error", "Band error (dB)")):
-        groups = {degree: rows.loc[rows["severity"] == degree, column] for degree in degrees}
-        if len(groups) > 1:
-            yield distribution_picture(groups, title, "degree of loss")

@@ -29,7 +29,7 @@ from hlsim.evaluation.clarity import (
     _Scene,
     evaluate_scenes,
 )
-from hlsim.report.clarity import _conditions_table, scenes_page
+from hlsim.report.recordings import _conditions_table, scenes_page
 
 RATE = 44100
 LOW_RATE = 16000
@@ -181,7 +181,7 @@ def test_the_command_writes_page_scores_and_signals_and_continues(
     command = [*map(str, arguments), "--enhancer", f"{__name__}:Halving"]
     assert main(command) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "Halving + soft" in printed and "8.0 no" in printed
+    assert "Halving + soft" in printed and "75.5 8.0" in printed
     with open(out / "scores.csv", newline="") as file:
         rows = [*csv.DictReader(file)]
     pairs = [(row["scene"], row["listener"]) for row in rows[::7]]

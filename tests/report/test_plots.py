@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from hlsim.evaluation import Condition
@@ -14,11 +13,9 @@ from hlsim.report.plots import (
     UNAIDED_COLOUR,
     condition_colours,
     curves_picture,
-    distribution_picture,
     gain_picture,
 )
 
-pandas = pytest.importorskip("pandas")
 pytest.importorskip("matplotlib")
 
 
@@ -53,12 +50,6 @@ def test_colours_of_conditions() -> None:
     assert colours["none"] == UNAIDED_COLOUR
     assert colours["NAL-R, same level"] == (colours["mine"], 0.6)
     assert len({str(colour) for colour in colours.values()}) == 4
-
-
-def test_a_distribution_names_the_medians_for_readers_who_do_not_see_it() -> None:
-    groups = {"N2": pandas.Series([0.1, 0.2, 0.6]), "empty": pandas.Series([np.nan])}
-    picture = distribution_picture(groups, "HASPI", "ear")
-    assert picture.alt == "HASPI by ear; medians: N2 0.200."
 
 
 def test_a_backend_of_a_notebook_that_is_not_installed_is_not_needed() -> None:

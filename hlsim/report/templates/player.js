@@ -64,7 +64,7 @@
         play();
       });
       const spectrogram = figure.querySelector(".spectrogram");
-      spectrogram?.addEventListener("click", (event) => {
+      spectrogram.addEventListener("click", (event) => {
         const box = spectrogram.getBoundingClientRect();
         select(number);
         current.currentTime = (seconds * (event.clientX - box.left)) / box.width;
