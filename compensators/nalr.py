@@ -20,7 +20,6 @@ from hlsim.audiogram.thresholds import (
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.dsp.windows import hamming
 from hlsim.torchtools import constant_like
 
 BIAS_DB = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
@@ -178,6 +177,5 @@ def _design(order: int) -> NDArray[np.float64]:
     Returns: (order + 1, order + 1), one row per frequency.
     """
     grid = np.arange(order + 1) / order
-    window = hamming(order + 1)
-    rows = [frequency_sampling_fir(order + 1, grid, gain, window) for gain in np.eye(order + 1)]
+    rows = [frequency_sampling_fir(order + 1, grid, gain) for gain in np.eye(order + 1)]
     return np.stack(rows)

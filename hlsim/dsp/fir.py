@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -24,7 +25,7 @@ def frequency_sampling_fir(
     taps: int,
     frequencies: NDArray[np.float64],
     gains: NDArray[np.float64],
-    window: NDArray[np.float64],
+    window: str | tuple[str, float] = "hamming",
 ) -> NDArray[np.float64]:
     """Design a linear-phase FIR filter from gains at some frequencies, as MATLAB's ``fir2`` does.
 
@@ -38,12 +39,12 @@ def frequency_sampling_fir(
             samples.
         frequencies: Ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
         gains: Linear gain at each frequency.
-        window: Window by which the coefficients are multiplied, (taps,).
+        window: Window by which the coefficients are multiplied, as in ``scipy.signal.get_window``.
 
     Returns:
         Coefficients of the filter, (taps,).
 
-    >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), np.ones(3))
+    >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), "boxcar")
     >>> print(abs(flat).round(6))
     [0. 2. 0.]
     """
@@ -59,7 +60,7 @@ def frequency_sampling_fir(
     intervals = _GRID_POINTS - 1
     delay = np.exp(-0.5j * (taps - 1) * np.pi * np.arange(_GRID_POINTS) / intervals)
     impulse_response = np.fft.irfft(grid_gains * delay, 2 * intervals)
-    return impulse_response[:taps] * window
+    return impulse_response[:taps] * scipy.signal.get_window(window, taps, fftbins=False)
 
 
 def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:

@@ -20,7 +20,6 @@ from torch.nn import functional
 from compensators.nalr import nalr_gains_db
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.dsp.windows import hamming
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
@@ -410,7 +409,7 @@ def _nalr_taps(thresholds: Tensor) -> NDArray[np.float64]:
     gains = nalr_gains_db(thresholds)[indices].numpy()
     grid = np.arange(NALR_ORDER + 1) / NALR_ORDER
     decibels = np.interp(grid * RATE / 2, AUDIOMETRIC_HZ, gains)
-    return frequency_sampling_fir(len(grid), grid, 10.0 ** (decibels / 20.0), hamming(len(grid)))
+    return frequency_sampling_fir(len(grid), grid, 10.0 ** (decibels / 20.0))
 
 
 def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:

@@ -26,15 +26,21 @@ from hlsim.msbg.envelope import (
 )
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
 from hlsim.msbg.filtfilt_end import end_correction
-from hlsim.msbg.multirate import MultirateBank, RateBand
+from hlsim.msbg.multirate import RateBand, multirate_bank
 from hlsim.msbg.recruitment import apply_gains, expand, recruitment_gains
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import compute_once, constant_like
 
 _TAIL = 3200
 """Samples of silence behind a signal, 73 ms.
 
 This is as long as the longest advance, and as the narrowest channel takes to decay by 80 dB.
 """
+
+_END_SAMPLES = 4096
+"""Samples at the end of an unaligned output for which all channels run at 44.1 kHz."""
+
+_END_LEAD_SAMPLES = 7296
+"""Samples before them on which they depend."""
 
 _MAX_COMMON_PERIOD = 10000
 """Largest number of samples of which FFT lengths that two rates share are multiples."""
@@ -96,7 +102,14 @@ def _whole_steps(rate_divisor: int) -> int:
 
 
 def simulate_cochlea(
-    spectrum: Tensor, ratios: Tensor, bank: MultirateBank, corrects_kinks: bool
+    signals: Tensor,
+    ratios: Tensor,
+    bank: FilterBank,
+    points: int,
+    *,
+    rate_divisor: int = 1,
+    highest: float = MSBG_RATE / 2,
+    corrects_kinks: bool = True,
 ) -> Tensor:
     """Simulate the cochlea of impaired ears: split signals into channels, and expand each channel.
 
@@ -104,13 +117,16 @@ def simulate_cochlea(
     each channel by a gain that follows its envelope, and the channels are added up. Each channel is
     computed at the lowest sample rate that its band allows.
 
-    Shape: complex (items, bins), (items, channels) -> complex (items, bins).
+    Shape: (items, time), (items, channels) -> complex (items, points // (2 * rate_divisor) + 1).
 
     Args:
-        spectrum: Fourier transforms of the signals, which are treated as periodic.
+        signals: Signals in Pa, which are followed by silence and then treated as periodic.
         ratios: dB by which each channel changes per dB of input, from ``expansion_ratios`` in
             ``hlsim.msbg.recruitment``.
-        bank: Filter bank for signals of this length.
+        bank: Filter bank for the severity of the ears.
+        points: FFT length in samples at 44.1 kHz, from ``cochlea_fft_length``.
+        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: Highest frequency in Hz that the output needs.
         corrects_kinks: Whether gains of slight losses are corrected where they change suddenly (see
             ``apply_gains``). This is not audible after smearing.
 
@@ -118,26 +134,27 @@ def simulate_cochlea(
         Fourier transforms of the sums of the channels.
 
     >>> from hlsim.msbg.filterbank import BANKS
-    >>> from hlsim.msbg.multirate import multirate_bank
-    >>> options = {"dtype": torch.float32, "device": torch.device("cpu")}
-    >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, **options)
-    >>> spectrum = torch.fft.rfft(torch.randn(1, 4800))
-    >>> simulate_cochlea(spectrum, torch.full((1, 19), 2.0), bank, corrects_kinks=False).shape
+    >>> signals, ratios = torch.randn(1, 1000), torch.full((1, 19), 2.0)
+    >>> simulate_cochlea(signals, ratios, BANKS["severe"], points=4800).shape
     torch.Size([1, 2401])
     """
-    signals = []
+    spectrum = rfft(signals, points // rate_divisor)
+    multirate = compute_once(
+        multirate_bank, bank, points, rate_divisor, highest, signals.dtype, signals.device
+    )
+    channels_of_bands = []
     sums = []
-    for band in bank.bands:
+    for band in multirate.bands:
         channels, sums_of_band = _filter_and_rectify(spectrum, band)
-        signals.append(channels)
+        channels_of_bands.append(channels)
         sums.append(sums_of_band)
-    envelopes = smooth(torch.cat(sums, -3), bank.lowpass)
-    ratios = ratios[..., : len(bank.lowpass)]
+    envelopes = smooth(torch.cat(sums, -3), multirate.lowpass)
+    ratios = ratios[..., : len(multirate.lowpass)]
     gains = recruitment_gains(envelopes, ratios)
 
     # Bands with the same rate are added up before their common Fourier transform.
     expanded: dict[tuple[int, bool], Tensor] = {}
-    for band, channels in zip(bank.bands, signals, strict=True):
+    for band, channels in zip(multirate.bands, channels_of_bands, strict=True):
         members = band.channels
         slight = (envelopes[..., members, :], ratios[..., members]) if corrects_kinks else None
         total = apply_gains(channels, gains[..., members, :], band.interpolation, slight)
@@ -172,12 +189,45 @@ def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tenso
     return analytic.real, sums
 
 
+def simulate_delayed_cochlea(
+    signals: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, is_last: bool
+) -> Tensor:
+    """Simulate the cochlea with its delay, and with the end of the signal that pyclarity computes.
+
+    Shape: (items, time), (items, channels) -> (items, time).
+
+    Args:
+        signals: Input of the cochlea at 44.1 kHz in Pa.
+        ratios: Expansion ratios of the channels.
+        bank: Filter bank for the severity of the ears.
+        smears: Whether the signals have been smeared.
+        is_last: Whether the signals end here, and are not cut from longer ones.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> ratios, bank = torch.full((1, 19), 2.0), BANKS["severe"]
+    >>> simulate_delayed_cochlea(torch.randn(1, 1000), ratios, bank, True, True).shape
+    torch.Size([1, 1000])
+    """
+    length = signals.shape[-1]
+    # With a slight loss and without smearing, nothing masks what lower rates change where the
+    # envelope is near 0.
+    if is_last and (length <= _END_SAMPLES + _END_LEAD_SAMPLES or not smears):
+        return simulate_cochlea_at_full_rate(signals, ratios, bank)
+    points = cochlea_fft_length(length, MSBG_RATE)
+    spectrum = simulate_cochlea(signals, ratios, bank, points, corrects_kinks=not smears)
+    output = torch.fft.irfft(spectrum, points)[..., :length]
+    if not is_last:
+        return output
+    end_input = signals[..., -_END_SAMPLES - _END_LEAD_SAMPLES :]
+    end = simulate_cochlea_at_full_rate(end_input, ratios, bank)
+    return torch.cat((output[..., :-_END_SAMPLES], end[..., -_END_SAMPLES:]), -1)
+
+
 def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
     """Simulate the cochlea of impaired ears with pyclarity's treatment of the end of a signal.
 
     ``simulate_cochlea`` is faster and gives nearly the same samples, except near the end of a
-    signal, because it treats signals as periodic. MSBG therefore uses this function for the last
-    samples of a signal, and for the whole signal if it is short or is not smeared.
+    signal, because it treats signals as periodic.
 
     A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
     each channel by a gain that follows its envelope, and the channels are added up. All channels

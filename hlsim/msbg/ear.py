@@ -7,22 +7,16 @@ cochlea. Its inverse turns the output of the cochlea back into sound, and a low-
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.dsp.windows import kaiser
 
 MSBG_RATE = 44100
 """Sample rate in Hz at which MSBG is defined."""
 
 EAR_DELAY = 507
 """Delay in samples of each of the two ear filters, which have 1015 taps and linear phase."""
-
-_LOWPASS_HZ = 18000.0
-"""Cut-off frequency of the final low-pass."""
-
-_LOWPASS_HALF_SECONDS = 0.0015
-"""Half the length of the final low-pass."""
 
 # The tables are those of the Cambridge hearing-loss simulator in pyclarity 0.9.0
 # (clarity/evaluator/msbg/msbg_utils.py). The gain from the frontal free field to the eardrum is
@@ -68,14 +62,13 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     gain_db = np.append(gain_db[below_nyquist], np.interp(nyquist, _TABLE_HZ, gain_db))
     # 23 ms, so that the gain is accurate down to about 100 Hz
     taps = 2 * EAR_DELAY + 1
-    return frequency_sampling_fir(taps, hz / nyquist, 10.0 ** (gain_db / 20.0), kaiser(taps, 4.0))
+    gains = 10.0 ** (gain_db / 20.0)
+    return frequency_sampling_fir(taps, hz / nyquist, gains, ("kaiser", 4.0))
 
 
 @lru_cache(maxsize=1)
 def lowpass_filter() -> NDArray[np.float64]:
     """Design the FIR low-pass that removes artefacts of the model above 18 kHz.
-
-    It is a windowed sinc, as ``scipy.signal.firwin`` designs it.
 
     Returns:
         Coefficients at 44.1 kHz, (133,).
@@ -83,9 +76,7 @@ def lowpass_filter() -> NDArray[np.float64]:
     >>> lowpass_filter().shape
     (133,)
     """
-    half = int(_LOWPASS_HALF_SECONDS * MSBG_RATE)
-    cutoff = _LOWPASS_HZ / (MSBG_RATE / 2.0)
-    time = np.arange(2 * half + 1) - float(half)
-    taps = cutoff * np.sinc(cutoff * time) * kaiser(len(time), 8.0)
-    gain_at_0_hz = taps.sum()
-    return taps / gain_at_0_hz
+    taps: NDArray[np.float64] = scipy.signal.firwin(
+        133, 18000.0, window=("kaiser", 8.0), fs=MSBG_RATE
+    )
+    return taps

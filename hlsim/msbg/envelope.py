@@ -11,9 +11,10 @@ Envelopes vary so slowly that they are computed once per *step* of 24 samples on
 """
 
 from functools import lru_cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -32,13 +33,6 @@ HALF_RATE_STEP = 24.5
 
 With this step, the FFT lengths that 22.05 kHz shares with 16 kHz have fewer factors of 7.
 """
-
-# Analogue prototype of the low-pass with its cut-off at 1 rad/s: scipy.signal.ellipap(2, 0.25, 35)
-_PROTOTYPE_ZEROS = np.array([10.769854436276223j, -10.769854436276223j])
-_PROTOTYPE_POLES = np.array(
-    [-0.8899906387998329 - 1.1535893623216336j, -0.8899906387998329 + 1.1535893623216336j]
-)
-_PROTOTYPE_GAIN = 0.017782794100389257
 
 _RUNNING_MEANS = 3
 """Number of running means over one step, applied one after the other.
@@ -69,22 +63,20 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
     >>> detect(torch.tensor([3.0 + 4.0j]), harmonics=False)
     tensor([5.])
     """
-    if signals.requires_grad and torch.is_grad_enabled():
-        return cast(Tensor, _Detect.apply(signals, harmonics)[0])
-    return _detect(signals, harmonics)[0]
+    if harmonics:
+        rectified: Tensor = _ModulusWithHarmonics.apply(signals)[0]
+        return rectified
+    # torch's modulus of complex numbers takes four times as long.
+    return power(signals).add_(POWER_FLOOR).sqrt_()
 
 
-def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
-    """Compute the result of ``detect``.
+def _modulus_with_harmonics(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the result of ``detect`` with harmonics, and what its gradient needs.
 
     Returns:
-        The result; with harmonics also the modulus and the squared cosine of the phase, which the
-        gradient needs.
+        The result, the modulus, and the squared cosine of the phase.
     """
     squared_modulus = power(signals).add_(POWER_FLOOR)
-    if not harmonics:
-        # torch's modulus of complex numbers takes four times as long.
-        return (squared_modulus.sqrt_(),)
     squared_cosine = signals.real.square() / squared_modulus
     modulus = squared_modulus.sqrt()
     # The sum of the constant and both cosines, as a polynomial in the squared cosine of the phase
@@ -92,33 +84,28 @@ def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
     return modulus * shape, modulus, squared_cosine
 
 
-class _Detect(torch.autograd.Function):
-    """``_detect`` with a gradient that takes half as many steps as torch's."""
+class _ModulusWithHarmonics(torch.autograd.Function):
+    """``_modulus_with_harmonics`` with a gradient that takes half as many steps as torch's."""
 
     @staticmethod
-    def forward(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
-        return _detect(signals, harmonics)
+    def forward(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _modulus_with_harmonics(signals)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, bool], output: tuple[Tensor, ...]) -> None:
-        signals, ctx.harmonics = inputs
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, ...]) -> None:
         ctx.mark_non_differentiable(*output[1:])
-        ctx.save_for_backward(signals, *output)
+        ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
-        signals, *outputs = ctx.saved_tensors
-        if not ctx.harmonics:
-            (modulus,) = outputs
-            return signals * (gradient / modulus), None
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> Tensor:
+        signals, modulus, squared_cosine = ctx.saved_tensors
         if torch.is_grad_enabled():
             # This gradient is itself differentiated, so it must depend on the signals.
-            outputs = list(_detect(signals, True))
-        _, modulus, squared_cosine = outputs
+            modulus, squared_cosine = _modulus_with_harmonics(signals)[1:]
         scaled = gradient / modulus
         real_factor = scaled * ((squared_cosine * (16 / 5) - 20 / 3) * squared_cosine + 5)
         imag_factor = scaled * ((squared_cosine * (16 / 5) - 12 / 5) * squared_cosine + 1 / 5)
-        return torch.complex(signals.real * real_factor, signals.imag * imag_factor), None
+        return torch.complex(signals.real * real_factor, signals.imag * imag_factor)
 
 
 def partial_means(rectified: Tensor, weights: Tensor) -> Tensor:
@@ -231,7 +218,7 @@ def envelope_lowpass(
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Design the low-pass that smooths the envelope of each channel of a filter bank.
 
-    It is a recursive filter of second order. Its cut-off frequency is 75 Hz, or three quarters of
+    It is an elliptic filter of second order. Its cut-off frequency is 75 Hz, or three quarters of
     the channel's equivalent rectangular bandwidth if this is lower.
 
     Returns:
@@ -242,36 +229,8 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
     36
     """
     widths = erb(np.array(bank.centre_frequencies))
-    return [_elliptic_lowpass(0.75 * min(100.0, width) / (MSBG_RATE / 2.0)) for width in widths]
-
-
-def _elliptic_lowpass(cutoff: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Design an elliptic low-pass of second order with 0.25 dB ripple and 35 dB attenuation.
-
-    The result equals that of ``scipy.signal.ellip(2, 0.25, 35, cutoff)``. Importing this function
-    would take half a second.
-
-    Args:
-        cutoff: Cut-off frequency relative to the Nyquist frequency.
-
-    Returns:
-        Numerator and denominator, three coefficients each.
-    """
-    # The analogue prototype is scaled to the cut-off frequency. The bilinear transform with a
-    # sample rate of 2 makes it digital.
-    scale = 4.0 * np.tan(np.pi * cutoff / 2.0)
-    zeros = scale * _PROTOTYPE_ZEROS
-    poles = scale * _PROTOTYPE_POLES
-    gain = _PROTOTYPE_GAIN * np.real(np.prod(4.0 - zeros) / np.prod(4.0 - poles))
-    numerator = _polynomial_with_roots((4.0 + zeros) / (4.0 - zeros))
-    denominator = _polynomial_with_roots((4.0 + poles) / (4.0 - poles))
-    return gain * numerator, denominator
-
-
-def _polynomial_with_roots(roots: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Coefficients of (x - a) (x - b) for two complex conjugate roots. Shape: (2,) -> (3,)."""
-    first, second = roots
-    return np.convolve([1.0, -first], [1.0, -second]).real
+    cutoffs = 0.75 * np.minimum(100.0, widths)
+    return [scipy.signal.ellip(2, 0.25, 35.0, cutoff, fs=MSBG_RATE) for cutoff in cutoffs]
 
 
 @lru_cache(maxsize=8)

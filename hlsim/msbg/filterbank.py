@@ -32,8 +32,8 @@ class FilterBank:
 
     broadening: float
     centre_frequencies: tuple[float, ...]
-    advances: tuple[int, ...]
-    highpass_corners: tuple[int, ...]
+    advances: tuple[float, ...]
+    highpass_corners: tuple[float, ...]
     recombination_db: float
 
     @property
@@ -41,18 +41,9 @@ class FilterBank:
         """Number of band-pass filters."""
         return len(self.centre_frequencies)
 
-    @property
-    def first_highpass(self) -> int:
-        """Index of the first channel that has a high-pass."""
-        return self.channels - len(self.highpass_corners)
-
 
 def _parse_floats(text: str) -> tuple[float, ...]:
     return tuple(map(float, text.split()))
-
-
-def _parse_ints(text: str) -> tuple[int, ...]:
-    return tuple(map(int, text.split()))
 
 
 # The values are those of Stone and Moore's tables of 19 November 2013 in pyclarity 0.9.0
@@ -68,11 +59,11 @@ _NARROW = FilterBank(
         "5557.1453007 6301.67391436 7142.00704589 8090.47263733 9160.98496679 10369.24877505 "
         "11732.98965891 13272.21411103 15009.50302131 16970.34294536 19183.5"
     ),
-    advances=_parse_ints(
+    advances=_parse_floats(
         "485 442 396 349 311 272 239 210 186 162 143 126 111 98 87 77 69 61 54 47 42 37 33 29 26 "
         "23 20 18 16 14 12 11 10 9 8 7"
     ),
-    highpass_corners=_parse_ints(
+    highpass_corners=_parse_floats(
         "17 20 23 28 33 39 47 56 68 81 98 118 143 172 207 248 297 353 416 484 553 612"
     ),
     recombination_db=5.133590840990304,
@@ -86,10 +77,10 @@ _MIDDLE = FilterBank(
         "4313.0570293 5108.57094018 6043.41944195 7142.00704589 8433.01272356 9950.13858023 "
         "11732.98965891 13828.10784223 16290.1868429 19183.5"
     ),
-    advances=_parse_ints(
+    advances=_parse_floats(
         "379 339 289 253 216 184 156 132 111 95 80 68 58 49 42 36 30 26 22 19 16 13 11 10 8 7 6 5"
     ),
-    highpass_corners=_parse_ints("23 29 35 44 55 70 88 112 142 180 228 288 361 448 541 625"),
+    highpass_corners=_parse_floats("23 29 35 44 55 70 88 112 142 180 228 288 361 448 541 625"),
     recombination_db=4.967792069637238,
 )
 _WIDE = FilterBank(
@@ -100,8 +91,8 @@ _WIDE = FilterBank(
         "4313.0570293 5557.1453007 7142.00704589 9160.98496679 11732.98965891 15009.50302131 "
         "19183.5"
     ),
-    advances=_parse_ints("229 204 166 133 106 83 65 50 39 31 24 19 15 12 9 7 5 4 4"),
-    highpass_corners=_parse_ints("40 54 74 102 142 199 278 387 526 664"),
+    advances=_parse_floats("229 204 166 133 106 83 65 50 39 31 24 19 15 12 9 7 5 4 4"),
+    highpass_corners=_parse_floats("40 54 74 102 142 199 278 387 526 664"),
     recombination_db=4.240378918292534,
 )
 
@@ -138,7 +129,7 @@ def gammatone_response(
     >>> print(abs(response[14, 1299]).round(3))  # the channel of 1299 Hz
     1.0
     """
-    indices = range(bank.channels)[channels]
+    indices = np.arange(bank.channels)[channels]
     count = points // 2 + 1 if bins is None else bins
     centre_hz = np.array(bank.centre_frequencies)[indices, None]
     omega = 2.0 * np.pi * np.arange(count)[None] / points
@@ -157,13 +148,12 @@ def gammatone_response(
     response *= response
     response *= np.exp(1j * omega * np.array(bank.advances)[indices, None])
 
-    first = bank.first_highpass
-    upper = [row for row, channel in enumerate(indices) if channel >= first]
-    if upper:
-        corners = [bank.highpass_corners[indices[row] - first] for row in upper]
-        corner_hz = _CORNER_STEP_HZ * np.array(corners)[:, None]
-        gain_at_centre = np.abs(_bessel_highpass(corner_hz, centre_omega[upper]))
-        response[upper] *= _bessel_highpass(corner_hz, omega) / gain_at_centre
+    first_highpass = bank.channels - len(bank.highpass_corners)
+    has_highpass = indices >= first_highpass
+    corners = np.array(bank.highpass_corners)[indices[has_highpass] - first_highpass, None]
+    corner_hz = _CORNER_STEP_HZ * corners
+    gain_at_centre = np.abs(_bessel_highpass(corner_hz, centre_omega[has_highpass]))
+    response[has_highpass] *= _bessel_highpass(corner_hz, omega) / gain_at_centre
     return response
 
 

@@ -14,6 +14,7 @@ the last 50 ms by up to 1e-2 of the whole signal.
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
@@ -72,7 +73,7 @@ def _amplitude_weights(bank: FilterBank) -> Array:
     Returns:
         Weights, (channels, 2, 4096), with the last sample last.
     """
-    return np.stack([weights for weights, _ in _oscillations(bank)])
+    return _oscillations(bank)[0]
 
 
 def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
@@ -86,15 +87,16 @@ def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
         Oscillations, (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps after the end
         of the signal.
     """
-    count = LOOK_BACK // STEP
-    sampled = [oscillation[offset::STEP][:count] for _, oscillation in _oscillations(bank)]
-    return np.stack([oscillation[::-1] for oscillation in sampled])
+    sampled = _oscillations(bank)[1][:, offset::STEP]
+    return sampled[:, LOOK_BACK // STEP - 1 :: -1]
 
 
 @lru_cache(maxsize=4)
-def _oscillations(bank: FilterBank) -> list[tuple[Array, Array]]:
-    """Compute the result of ``_oscillation`` for the low-pass of each channel."""
-    return [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
+def _oscillations(bank: FilterBank) -> tuple[Array, Array]:
+    """Compute the results of ``_oscillation`` for the low-passes of all channels."""
+    results = [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
+    weights, oscillations = zip(*results, strict=True)
+    return np.stack(weights), np.stack(oscillations)
 
 
 def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
@@ -113,35 +115,25 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
     """
     transition = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
     input_vector = numerator[1:] - denominator[1:] * numerator[0]
-    state_of_constant = np.linalg.solve(np.eye(2) - transition, input_vector)
-
-    def filter_padding(state: Array, newest: Array) -> Array:
-        """Compute the state of the backward pass at the end of the signal.
-
-        Args:
-            state: State of the forward pass at the end of the signal.
-            newest: Last nine samples of the signal, the last one first.
-        """
-        outputs = []
-        for sample in 2.0 * newest[0] - newest[1:]:
-            outputs.append(state[0] + numerator[0] * sample)
-            state = transition @ state + input_vector * sample
-        state = state_of_constant * outputs[-1]
-        for output in reversed(outputs):
-            state = transition @ state + input_vector * output
-        return state
+    # At the end of the signal, ``filtfilt`` adds samples to the forward pass, and the backward pass
+    # begins behind them. Its state where it reaches the signal depends linearly on the state of the
+    # forward pass and on the last nine samples, the last one first.
+    units = np.eye(2 + 1 + _PADDING)
+    state, newest = units[:2], units[2:]
+    padding = 2.0 * newest[0] - newest[1:]
+    outputs, _ = scipy.signal.lfilter(numerator, denominator, padding, axis=0, zi=state)
+    state_of_constant = scipy.signal.lfilter_zi(numerator, denominator)[:, None]
+    _, backward_state = scipy.signal.lfilter(
+        numerator, denominator, outputs[::-1], axis=0, zi=state_of_constant * outputs[-1]
+    )
 
     # If silence follows, the forward pass goes through the states z, transition z, ... The backward
     # pass then ends in the state S z, where S = input_vector [1 0] + transition S transition.
     silence = np.linalg.solve(
         np.eye(4) - np.kron(transition, transition.T), np.outer(input_vector, [1.0, 0.0]).ravel()
     )
-    no_samples = np.zeros(_PADDING + 1)
-    padding = np.stack([filter_padding(unit, no_samples) for unit in np.eye(2)], 1)
-    from_state = padding - silence.reshape(2, 2)
-    no_state = np.zeros(2)
-    units = np.eye(_PADDING + 1)
-    from_newest = np.stack([filter_padding(no_state, unit) for unit in units], 1)
+    from_state = backward_state[:, :2] - silence.reshape(2, 2)
+    from_newest = backward_state[:, 2:]
 
     samples_behind = AHEAD * STEP
     powers = np.empty((samples_behind + LOOK_BACK, 2, 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from functools import partial
 from typing import NamedTuple
@@ -23,21 +24,27 @@ from hlsim.audiogram.thresholds import (
     AudiogramLike,
     ears_on_other_grids,
     has_listeners,
+    interpolation_weights,
     resolve_thresholds,
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.fft import rfft
-from hlsim.msbg.cochlea import cochlea_fft_length, simulate_cochlea, simulate_cochlea_at_full_rate
+from hlsim.msbg.cochlea import (
+    cochlea_fft_length,
+    common_period,
+    simulate_cochlea,
+    simulate_delayed_cochlea,
+)
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.msbg.filterbank import BANKS, FilterBank
-from hlsim.msbg.multirate import multirate_bank, total_response
+from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.multirate import total_response
 from hlsim.msbg.overlapping_blocks import in_blocks
-from hlsim.msbg.recruitment import expansion_ratios, threshold_weights
-from hlsim.msbg.resampling import from_cochlea, from_spectrum, resample_to_model_rate, to_cochlea
+from hlsim.msbg.recruitment import expansion_ratios
+from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix
-from hlsim.torchtools import compute_once, constant_like, not_compiled
+from hlsim.torchtools import constant_like, flatten_items, not_compiled
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz, without smearing, by which ``aligned`` advances the output.
@@ -48,15 +55,10 @@ that back, less at high frequencies and with more loss: without a loss 186 at 20
 """
 
 _POWER_FLOOR = 1e-30
+"""Power by which powers are divided at least."""
 
 _HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which aligned signals run at 22.05 kHz inside the model."""
-
-_END_SAMPLES = 4096
-"""Samples at the end of an unaligned output for which all channels run at 44.1 kHz."""
-
-_END_LEAD_SAMPLES = 7296
-"""Samples before them on which they depend."""
 
 _CPU_SAMPLES = 384_000
 """Largest number of samples that are processed at once on a CPU, or with ``checkpoint``."""
@@ -108,6 +110,8 @@ class MSBG(nn.Module):
             with one channel. (It scales two channels by one gain.)
 
     Attributes:
+        thresholds: Thresholds of the constructor's ears at ``FREQUENCIES`` in dB HL, (..., 8), or
+            None. They are constants; to train an ear, pass it with each call.
         checkpoint: Whether activations are computed again in the backward pass, a few items or one
             block at a time, instead of stored. False by default.
 
@@ -125,8 +129,7 @@ class MSBG(nn.Module):
 
     emulates_msbg = True
 
-    _levels: Tensor | None
-    _two_ears: bool
+    thresholds: Tensor | None
 
     def __init__(
         self,
@@ -144,17 +147,10 @@ class MSBG(nn.Module):
         self.rescale_active = rescale_active
         self.checkpoint = False
         levels = store_thresholds(audiogram)
-        is_trained = levels is not None and levels.requires_grad
-        self.register_buffer("_levels", None if is_trained else levels, persistent=False)
-        # A moved buffer would be another tensor than the one that is trained.
-        self._trained = (levels if is_trained else None,)
+        stored = None if levels is None else levels.detach()
+        self.register_buffer("thresholds", stored, persistent=False)
         self._two_ears = has_listeners(audiogram)
         self._other_grids = ears_on_other_grids(audiogram)
-
-    @property
-    def thresholds(self) -> Tensor | None:
-        """Thresholds of the constructor's ear or ears at ``FREQUENCIES`` in dB HL, (..., 8)."""
-        return self._levels if self._trained[0] is None else self._trained[0]
 
     @not_compiled  # it depends on the values of the ears, and numpy designs its filters
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
@@ -172,13 +168,10 @@ class MSBG(nn.Module):
                 standard audiogram ``"N7"``), or the shapes do not fit.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
-        grids = self._other_grids
-        if audiogram is not None:
-            grids = ears_on_other_grids(audiogram)
-        ears = audiogram
-        if audiogram is None:
-            ears = self._trained[0]  # validated with each call, as training may leave the range
-        thresholds = resolve_thresholds(self._levels, ears, waveform, two_ears=self._two_ears)
+        grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)
+        thresholds = resolve_thresholds(
+            self.thresholds, audiogram, waveform, two_ears=self._two_ears
+        )
         with torch.autocast(waveform.device.type, enabled=False):
             return self._simulate(waveform, thresholds, grids)
 
@@ -218,55 +211,49 @@ class MSBG(nn.Module):
         """
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
-        signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
-        ears = thresholds.to(signals).expand(*batch, -1).reshape(-1, thresholds.shape[-1])
         gain = gain_to_pascals(self.full_scale_spl)
-        if gain != 1.0:
-            signals = signals * gain
+        signals = flatten_items(waveform, batch, dtype) * gain
+        ears = flatten_items(thresholds, batch, dtype)
         if self.rescale_active:
-            signals = signals * active_rescaling(resample_to_model_rate(signals, self.sample_rate))
+            signals = signals * active_rescaling(signals, self.sample_rate)
+
+        # The severity decides which filters the host launches, so the host needs the thresholds.
+        levels_on_host = flatten_items(on_host(thresholds), batch, dtype)
+        if grids:
+            ear_of_item = torch.arange(len(grids)).reshape(thresholds.shape[:-1]).expand(batch)
+            grids = [grids[ear] for ear in ear_of_item.flatten().tolist()]
+        groups = _group_items(levels_on_host, ears.requires_grad, grids)
+        order = torch.tensor([*itertools.chain(*groups.values())])
+        if len(groups) > 1:
+            index = order.to(signals.device, non_blocking=True)
+            signals, ears = signals[index], ears[index]
 
         needs_small_portions = self.checkpoint or signals.device.type == "cpu"
         samples_at_once = _CPU_SAMPLES if needs_small_portions else _DEVICE_SAMPLES
         items_at_once = max(1, samples_at_once // signals.shape[-1])
-        # The severity decides which filters the host launches, so the host needs the thresholds.
-        levels_on_host = on_host(thresholds).to(dtype).expand(*batch, -1).reshape(ears.shape)
-        if grids:
-            ear_of_item = torch.arange(len(grids)).reshape(thresholds.shape[:-1]).expand(batch)
-            grids = [grids[ear] for ear in ear_of_item.flatten().tolist()]
+        counts = [len(members) for members in groups.values()]
         outputs: list[Tensor] = []
-        order: list[int] = []
-        for group, members in _group_items(levels_on_host, ears.requires_grad, grids).items():
+        for (group, members), group_signals, group_ears in zip(
+            groups.items(), signals.split(counts), ears.split(counts), strict=True
+        ):
+            levels = group_ears
+            if group.frequencies != FREQUENCIES:
+                ears_of_group = [grids[item] for item in members]
+                measured = [ear.levels for ear in ears_of_group if ear is not None]
+                levels = torch.tensor(measured, dtype=torch.float64).to(ears, non_blocking=True)
             process = partial(self._simulate_group, group=group)
-            for start in range(0, len(members), items_at_once):
-                items = members[start : start + items_at_once]
-                rows = _as_index(items, signals.device)
-                levels = ears[rows]
-                if group.frequencies != FREQUENCIES:
-                    ears_of_group = [grids[item] for item in items]
-                    measured = [ear.levels for ear in ears_of_group if ear is not None]
-                    levels = torch.tensor(measured, dtype=torch.float64).to(ears, non_blocking=True)
+            for portion in zip(
+                group_signals.split(items_at_once), levels.split(items_at_once), strict=True
+            ):
                 output = in_blocks(
-                    process,
-                    signals[rows],
-                    levels,
-                    self.sample_rate,
-                    checkpoints_short=self.checkpoint,
+                    process, *portion, self.sample_rate, checkpoints_short=self.checkpoint
                 )
                 outputs.append(output)
-                order += items
         longest = max(output.shape[-1] for output in outputs)
-        if len(outputs) == 1:
-            # A copy, because a view would keep the whole result of the last transform.
-            perceived = outputs[0].clone(memory_format=torch.contiguous_format)
-        else:
-            padded = [functional.pad(out, (0, longest - out.shape[-1])) for out in outputs]
-            perceived = torch.cat(padded)
-        if order != list(range(len(order))):
-            inverse = torch.tensor(order).argsort()
-            perceived = perceived[_to_device(inverse, perceived.device)]
-        if gain != 1.0:
-            perceived = perceived / gain
+        padded = [functional.pad(output, (0, longest - output.shape[-1])) for output in outputs]
+        perceived = torch.cat(padded) / gain
+        if len(groups) > 1:
+            perceived = perceived[order.argsort().to(perceived.device, non_blocking=True)]
         return perceived.reshape(*batch, longest).to(waveform.dtype)
 
     def _simulate_group(
@@ -282,11 +269,12 @@ class MSBG(nn.Module):
 
         Shape: (items, time), (items, frequencies) -> (items, time).
         """
-        samples, rate = signals.shape[-1], self.sample_rate
-        severity = group.severity
-        bank, smears = BANKS[severity], severity in BROADENING
+        rate = self.sample_rate
+        samples = signals.shape[-1]
+        bank = BANKS[group.severity]
+        smears = group.severity in BROADENING
         rate_divisor = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
-        delay = self.delay(severity) if self.aligned else 0
+        delay = self.delay(group.severity) if self.aligned else 0
         highest = rate / 2 if rate_divisor == 2 else MSBG_RATE / 2
         # A frame that smearing leaves nearly empty depends on the last bits, so unaligned output,
         # of which every sample counts, takes double precision.
@@ -295,28 +283,34 @@ class MSBG(nn.Module):
         length = math.ceil((model_samples + delay) / rate_divisor)
         cochlear = to_cochlea(precise, rate, length, rate_divisor)
         if smears:
-            matrix = constant_like(cochlear, smearing_matrix, severity, rate_divisor, highest)
+            matrix = constant_like(cochlear, smearing_matrix, group.severity, rate_divisor, highest)
             cochlear = smear(cochlear, matrix, rate_divisor)
         cochlear = cochlear.to(signals.dtype)
-        weights = constant_like(signals, threshold_weights, bank, group.frequencies)
+        weights = constant_like(
+            signals, interpolation_weights, bank.centre_frequencies, group.frequencies
+        )
         ratios = expansion_ratios(ears, weights)
         gain = 10.0 ** (-bank.recombination_db / 20.0)
         length = cochlear.shape[-1]
         if not self.aligned:
-            cochlear = _simulate_unaligned(cochlear, ratios, bank, smears, is_last)
+            cochlear = simulate_delayed_cochlea(cochlear, ratios, bank, smears, is_last)
             return from_cochlea(cochlear, rate, round(length * rate / MSBG_RATE), gain=gain)
 
         points = cochlea_fft_length(length * rate_divisor, rate, rate_divisor)
-        spectrum = rfft(cochlear, points // rate_divisor)
         if group.no_loss:
-            spectrum = spectrum * constant_like(
-                cochlear, total_response, bank, points, rate_divisor
-            )
+            response = constant_like(cochlear, total_response, bank, points, rate_divisor)
+            spectrum = rfft(cochlear, points // rate_divisor) * response
         else:
-            key = bank, points, rate_divisor, highest, cochlear.dtype, cochlear.device
-            channels = compute_once(multirate_bank, *key)
-            spectrum = simulate_cochlea(spectrum, ratios, channels, not smears)
-        if smears:
+            spectrum = simulate_cochlea(
+                cochlear,
+                ratios,
+                bank,
+                points,
+                rate_divisor=rate_divisor,
+                highest=highest,
+                corrects_kinks=not smears,
+            )
+        if smears and common_period(rate, rate_divisor):
             return from_spectrum(
                 spectrum, points, rate_divisor, rate, samples, gain=gain, delay=delay
             )
@@ -328,67 +322,38 @@ class MSBG(nn.Module):
         )
 
 
-def _simulate_unaligned(
-    signals: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, is_last: bool
-) -> Tensor:
-    """Compute the output of the cochlea with its delay, and with the end that pyclarity computes.
-
-    Args:
-        signals: Input of the cochlea at 44.1 kHz.
-        ratios: Expansion ratios of the channels.
-        bank: Filter bank.
-        smears: Whether the signals have been smeared.
-        is_last: Whether the signals end here, and are not cut from longer ones.
-
-    Shape: (items, time), (items, channels) -> (items, time).
-    """
-    length = signals.shape[-1]
-    # With a slight loss and without smearing, nothing masks what lower rates change where the
-    # envelope is near 0.
-    if is_last and (length <= _END_SAMPLES + _END_LEAD_SAMPLES or not smears):
-        return simulate_cochlea_at_full_rate(signals, ratios, bank)
-    points = cochlea_fft_length(length, MSBG_RATE)
-    key = bank, points, 1, MSBG_RATE / 2, signals.dtype, signals.device
-    channels = compute_once(multirate_bank, *key)
-    spectrum = simulate_cochlea(rfft(signals, points), ratios, channels, not smears)
-    output = torch.fft.irfft(spectrum, points)[..., :length]
-    if not is_last:
-        return output
-    end_input = signals[..., -_END_SAMPLES - _END_LEAD_SAMPLES :]
-    end = simulate_cochlea_at_full_rate(end_input, ratios, bank)
-    return torch.cat((output[..., :-_END_SAMPLES], end[..., -_END_SAMPLES:]), -1)
-
-
-def active_rescaling(signals: Tensor) -> Tensor:
+def active_rescaling(signals: Tensor, rate: int) -> Tensor:
     """Compute the ratio of the overall RMS of signals to that of their active frames of 10 ms.
 
-    Active frames are at most about 12 dB softer than the signal as a whole, as in pyclarity's
-    ``measure_rms``. Without any, the ratio is 1.
+    Active frames are at most 12 dB softer than the signal as a whole, and not below 40 dB SPL, as
+    in pyclarity's ``measure_rms``. Without any, the ratio is 1.
 
     Shape: (..., time) -> (..., 1).
 
     Args:
-        signals: Signals at 44.1 kHz in pascals.
+        signals: Signals in pascals.
+        rate: Sample rate in Hz.
 
     >>> pause, sound = torch.zeros(44100), torch.ones(44100)
-    >>> print(active_rescaling(torch.cat((sound, pause))).square().round(decimals=2))
+    >>> print(active_rescaling(torch.cat((sound, pause)), 44100).square().round(decimals=2))
     tensor([0.5000])
     """
+    samples = signals.shape[-1]
+    points = round(samples * MSBG_RATE / rate)
+    if points != samples:
+        signals = torch.fft.irfft(rfft(signals), points) * (points / samples)
     frame = round(0.01 * MSBG_RATE)
     to_reference = 10.0 ** ((PASCAL_SPL - 120.0) / 10.0)  # to powers in pyclarity's full scale
-    overall = signals.square().mean(-1) * to_reference
-    threshold_db = (10.0 * overall.clamp_min(_POWER_FLOOR).log10() - 12.0).clamp_min(-80.0)
-    whole_frames = signals[..., : signals.shape[-1] // frame * frame]
-    powers = whole_frames.unflatten(-1, (-1, frame)).square().mean(-1)
-    powers = powers * to_reference
-    floor = 10.0 ** ((threshold_db - 30.0) / 10.0)
-    active = 10.0 * (powers + floor.unsqueeze(-1)).log10() >= threshold_db.unsqueeze(-1)
-    count = active.sum(-1)
-    power = (powers * active).sum(-1) / count.clamp_min(1)
-    is_defined = (count > 0) & (power > 0)
-    quotient = overall / power.clamp_min(_POWER_FLOOR)
-    ratio = torch.where(is_defined, quotient, torch.ones_like(overall))
-    return ratio.sqrt().unsqueeze(-1)
+    overall = signals.square().mean(-1, keepdim=True) * to_reference
+    whole_frames = signals[..., : points // frame * frame]
+    powers = whole_frames.unflatten(-1, (-1, frame)).square().mean(-1) * to_reference
+    threshold = (overall * 10.0**-1.2).clamp_min(1e-8)
+    # pyclarity adds a thousandth of the threshold to the powers.
+    is_active = powers >= 0.999 * threshold
+    active_frames = is_active.sum(-1, keepdim=True).clamp_min(1)
+    power = (powers * is_active).sum(-1, keepdim=True) / active_frames
+    ratio = torch.where(power > 0.0, overall / power.clamp_min(_POWER_FLOOR), 1.0)
+    return ratio.sqrt()
 
 
 def _group_items(
@@ -424,14 +389,3 @@ def _group_items(
             group = _Group(grid.severity, not any(grid.levels), grid.frequencies)
         groups.setdefault(group, []).append(item)
     return groups
-
-
-def _as_index(items: list[int], device: torch.device) -> slice | Tensor:
-    """Return an index of ascending items: a slice if they are neighbours, which copies nothing."""
-    if items[-1] - items[0] == len(items) - 1:
-        return slice(items[0], items[-1] + 1)
-    return _to_device(torch.tensor(items), device)
-
-
-def _to_device(index: Tensor, device: torch.device) -> Tensor:
-    return index.to(device, non_blocking=device.type != "cpu")

@@ -21,7 +21,7 @@ are computed as one channel, their sum.
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -55,9 +55,6 @@ _MERGED_RATIO = 1.3
 At larger ratios they are softer, so that errors matter less.
 """
 
-_SAMPLES_PER_BAND = 2_000_000
-"""Largest number of samples of a rate band on a CPU, few enough for its cache."""
-
 _SLOW_SAMPLES = 3
 """Samples per step of channels at about 5.5 kHz."""
 
@@ -72,26 +69,6 @@ Detector = Literal["itself", "modulus", "harmonics"]
 analytic signal, or this modulus with two harmonics."""
 
 
-class RateAssignment(NamedTuple):
-    """Sample rate at which neighbouring channels of a filter bank are computed.
-
-    Attributes:
-        channels: Indices of the channels in the filter bank.
-        samples: Number of samples for each value of the envelope, of which there are about 1800 per
-            second.
-        detector: Signal from which envelopes are computed: ``"itself"``, the rectified channel;
-            ``"modulus"``, the modulus of its analytic signal; or ``"harmonics"``, this modulus with
-            two harmonics.
-
-    >>> RateAssignment(slice(0, 4), samples=6, detector="itself").detector
-    'itself'
-    """
-
-    channels: slice
-    samples: int
-    detector: Detector
-
-
 @dataclass(frozen=True)
 class RateBand:
     """Neighbouring channels of a filter bank that are computed at one sample rate.
@@ -99,7 +76,9 @@ class RateBand:
     Attributes:
         channels: Indices of the channels in the filter bank.
         points: FFT length at this sample rate.
-        detector: Signal from which envelopes are computed, as in ``RateAssignment``.
+        detector: Signal from which envelopes are computed: ``"itself"``, the rectified channel;
+            ``"modulus"``, the modulus of its analytic signal; or ``"harmonics"``, this modulus with
+            two harmonics.
         response: Frequency responses of the channels, (channels, points // 2 + 1), or of their
             analytic signals, (channels, points).
         mean_weights: Weights for ``hlsim.msbg.envelope.partial_means``, (3, samples per step).
@@ -147,46 +126,6 @@ class MultirateBank:
         return self.lowpass.nbytes + sum(band.response.nbytes for band in self.bands)
 
 
-def assign_rates(
-    bank: FilterBank, rate_divisor: int, highest: float = MSBG_RATE / 2
-) -> list[RateAssignment]:
-    """Choose the sample rate at which each channel of a filter bank is computed.
-
-    Neighbouring channels with the same choice form one group. Channels far above ``highest`` are
-    left out; the last channel of the result stands for them.
-
-    Args:
-        bank: Filter bank.
-        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: Highest frequency in Hz that the output needs, at most 11025 for signals at 22.05
-            kHz.
-
-    Returns:
-        Choice for each group of channels, the lowest channels first.
-
-    >>> from hlsim.msbg.filterbank import BANKS
-    >>> for band in assign_rates(BANKS["moderate"], rate_divisor=2, highest=8000.0):
-    ...     print(band.channels.start, band.channels.stop, band.samples, band.detector)
-    0 6 6 itself
-    6 15 3 modulus
-    15 27 5 modulus
-    """
-    centre_hz = np.array(bank.centre_frequencies)
-    bandwidths_above = _BANDWIDTHS_ABOVE_CENTRE * bank.broadening
-    is_wide = bank.broadening > _MAX_BROADENING_WITHOUT_HARMONICS
-    kinds = [
-        _rate_and_detector(hz, hz + bandwidths_above * float(width), is_wide, rate_divisor, highest)
-        for hz, width in zip(bank.centre_frequencies, erb(centre_hz), strict=True)
-    ]
-    kinds = kinds[: _count_channels(bank, highest)]
-    changes = [channel for channel in range(1, len(kinds)) if kinds[channel] != kinds[channel - 1]]
-    bounds = [0, *changes, len(kinds)]
-    return [
-        RateAssignment(slice(start, stop), *kinds[start])
-        for start, stop in itertools.pairwise(bounds)
-    ]
-
-
 def _rate_and_detector(
     centre: float, top: float, is_wide: bool, rate_divisor: int, highest: float
 ) -> tuple[int, Detector]:
@@ -196,7 +135,7 @@ def _rate_and_detector(
         centre: Centre frequency in Hz.
         top: Frequency in Hz up to which the channel is kept.
         is_wide: Whether harmonics of the channel reach down to 0 Hz.
-        rate_divisor, highest: Arguments of ``assign_rates``.
+        rate_divisor, highest: Arguments of ``multirate_bank``.
     """
     steps_per_second = MSBG_RATE / _envelope_step(rate_divisor)
     if centre < _RECTIFIED_BELOW_HZ:
@@ -208,6 +147,29 @@ def _rate_and_detector(
     if top <= _FAST_SAMPLES * steps_per_second and not is_wide:
         return _FAST_SAMPLES, "modulus"
     return STEP, "itself"
+
+
+def _assign_rates(
+    bank: FilterBank, count: int, rate_divisor: int, highest: float
+) -> list[tuple[slice, int, Detector]]:
+    """Choose the sample rate and the detector of the lowest ``count`` channels of a filter bank.
+
+    Returns:
+        For each group of neighbouring channels with the same choice: their indices, the number of
+        samples per step, and the detector.
+    """
+    centre_hz = np.array(bank.centre_frequencies)
+    top_hz = centre_hz + _BANDWIDTHS_ABOVE_CENTRE * bank.broadening * erb(centre_hz)
+    is_wide = bank.broadening > _MAX_BROADENING_WITHOUT_HARMONICS
+    choices = [
+        _rate_and_detector(centre, top, is_wide, rate_divisor, highest)
+        for centre, top in zip(centre_hz[:count], top_hz[:count], strict=True)
+    ]
+    groups = []
+    for choice, members in itertools.groupby(range(count), choices.__getitem__):
+        channels = list(members)
+        groups.append((slice(channels[0], channels[-1] + 1), *choice))
+    return groups
 
 
 def multirate_bank(
@@ -238,11 +200,12 @@ def multirate_bank(
     step = _envelope_step(rate_divisor)
     steps = round(points / step)
     steps_per_window = next((n for n in _WINDOW_STEPS if steps % n == 0), _WINDOW_STEPS[0])
-    count = _count_channels(bank, highest)
+    # All channels far above the highest frequency make one.
+    channels_below = sum(hz <= _MERGED_ABOVE * highest for hz in bank.centre_frequencies)
+    count = min(bank.channels, channels_below + 1)
     bands = []
     lowpasses = []
-    assignments = _split_for_cache(assign_rates(bank, rate_divisor, highest), steps, device)
-    for channels, samples, detector in assignments:
+    for channels, samples, detector in _assign_rates(bank, count, rate_divisor, highest):
         is_analytic = detector != "itself"
         band_points = steps * samples
         bins_of_band = band_points if is_analytic else band_points // 2 + 1
@@ -283,12 +246,6 @@ def _envelope_step(rate_divisor: int) -> float:
     return STEP if rate_divisor == 1 else HALF_RATE_STEP
 
 
-def _count_channels(bank: FilterBank, highest: float) -> int:
-    """Count the channels, where all channels far above the highest frequency make one."""
-    limit = _MERGED_ABOVE * highest
-    return min(bank.channels, 1 + sum(hz <= limit for hz in bank.centre_frequencies))
-
-
 def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
     """Compute the factor on the envelope of merged channels that gives them the gain of their sum.
 
@@ -319,30 +276,6 @@ def total_response(bank: FilterBank, points: int, rate_divisor: int) -> NDArray[
     """
     signal_points = points // rate_divisor
     total = gammatone_response(bank, points, bins=signal_points // 2 + 1).sum(0)
-    if rate_divisor > 1 and signal_points % 2 == 0:
+    if rate_divisor > 1:
         total[-1] = 0.0
     return total
-
-
-def _split_for_cache(
-    assignments: list[RateAssignment], steps: int, device: torch.device
-) -> list[RateAssignment]:
-    """Split bands on a CPU into smaller ones whose samples fit into its cache.
-
-    Args:
-        assignments: Result of ``assign_rates``.
-        steps: Number of steps of the envelopes.
-        device: Device of the signals.
-    """
-    if device.type != "cpu":
-        return assignments
-    smaller = []
-    for channels, samples, detector in assignments:
-        count = channels.stop - channels.start
-        values_per_sample = 1 if detector == "itself" else 2
-        values = count * values_per_sample * steps * samples
-        pieces = min(count, math.ceil(values / _SAMPLES_PER_BAND))
-        bounds = [channels.start + count * piece // pieces for piece in range(pieces + 1)]
-        for start, stop in itertools.pairwise(bounds):
-            smaller.append(RateAssignment(slice(start, stop), samples, detector))
-    return smaller

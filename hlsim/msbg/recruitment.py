@@ -12,7 +12,6 @@ Source: Moore and Glasberg (1993), Journal of the Acoustical Society of America 
 """
 
 from functools import lru_cache
-from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,11 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.envelope import STEP
-from hlsim.msbg.filterbank import FilterBank
 from hlsim.torchtools import constant_like
 
 CATCH_UP_SPL = 105.0
@@ -61,8 +57,8 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
 
     Args:
         thresholds: Audiograms in dB HL.
-        weights: Weights from ``threshold_weights``, which interpolate thresholds to the centre
-            frequencies of the channels.
+        weights: Weights from ``hlsim.audiogram.thresholds.interpolation_weights``, which
+            interpolate thresholds to the centre frequencies of the channels.
 
     >>> expansion_ratios(torch.full((8,), 35.0), torch.full((8, 1), 0.125))
     tensor([1.5000])
@@ -71,27 +67,6 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     # 105 dB HL, the ratio depends on every bit of the thresholds.
     channel_thresholds = (thresholds.unsqueeze(-1) * weights).sum(-2)
     return CATCH_UP_SPL / (CATCH_UP_SPL - channel_thresholds)
-
-
-def threshold_weights(
-    bank: FilterBank, frequencies: tuple[float, ...] = FREQUENCIES
-) -> NDArray[np.float64]:
-    """Compute weights that interpolate an audiogram to the centre frequencies of the channels.
-
-    The interpolation is linear in Hz, and flat beyond the lowest and the highest frequency.
-
-    Args:
-        bank: Filter bank to which the channels belong.
-        frequencies: Frequencies of the audiogram in Hz.
-
-    Returns:
-        Weights, (frequencies, channels).
-
-    >>> from hlsim.msbg.filterbank import BANKS
-    >>> threshold_weights(BANKS["severe"]).shape
-    (8, 19)
-    """
-    return interpolation_weights(bank.centre_frequencies, frequencies)
 
 
 def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
@@ -175,8 +150,6 @@ def apply_gains(
     if slight is not None:
         envelopes, ratios = slight
         sample_gains = _correct_kinks(sample_gains, envelopes, ratios, kernel)
-    if torch.is_grad_enabled() and (channels.requires_grad or sample_gains.requires_grad):
-        return cast(Tensor, _SumOfProducts.apply(channels, sample_gains))
     return _sum_of_products(channels, sample_gains)
 
 
@@ -215,28 +188,6 @@ def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
     for channel, factor in remaining:
         total.addcmul_(channel, factor)
     return total
-
-
-class _SumOfProducts(torch.autograd.Function):
-    """``_sum_of_products`` with a gradient, which torch cannot derive from in-place steps."""
-
-    @staticmethod
-    def forward(channels: Tensor, factors: Tensor) -> Tensor:
-        return _sum_of_products(channels, factors)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        channels, factors = ctx.saved_tensors
-        channels_needed, factors_needed = ctx.needs_input_grad
-        expanded = gradient.unsqueeze(-2)
-        return (
-            expanded * factors if channels_needed else None,
-            expanded * channels if factors_needed else None,
-        )
 
 
 def _pad_periodically(values: Tensor) -> Tensor:

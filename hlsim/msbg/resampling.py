@@ -10,7 +10,6 @@ this frequency, which the spectrum at the higher rate has twice.
 """
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,7 +18,6 @@ from torch import Tensor
 
 from hlsim.dsp.fft import fade_out_weights, fft_length, rfft
 from hlsim.dsp.fir import BLOCK_POINTS, filter_in_blocks
-from hlsim.msbg.cochlea import common_period
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant_like
 
@@ -46,27 +44,12 @@ def to_cochlea(signals: Tensor, rate: int, length: int, rate_divisor: int) -> Te
     up, down = _rate_ratio(rate, rate_divisor)
     tail = math.ceil(_FIR_TAIL * down / up / rate_divisor)
     samples = max(signals.shape[-1], math.ceil(length * down / up)) + tail
-    return _resample_inward(signals, rate, rate_divisor, samples, _inward_response)[..., :length]
-
-
-def resample_to_model_rate(signals: Tensor, rate: int) -> Tensor:
-    """Resample signals to 44.1 kHz, without any filter of the ear.
-
-    Shape: (items, time) -> (items, ceil(time * 44100 / rate)).
-
-    Args:
-        signals: Signals to resample.
-        rate: Sample rate of the signals in Hz.
-
-    >>> resample_to_model_rate(torch.randn(2, 1600), rate=16000).shape
-    torch.Size([2, 4410])
-    """
-    if rate == MSBG_RATE:
-        return signals
-    samples = signals.shape[-1]
-    up, down = _rate_ratio(rate, 1)
-    resampled = _resample_inward(signals, rate, 1, samples, _resampling_response)
-    return resampled[..., : math.ceil(samples * up / down)]
+    outer_points, inner_points = _fft_lengths(samples, up, down)
+    bins = min(outer_points, inner_points) // 2 + 1
+    points = inner_points * rate_divisor
+    response = constant_like(signals, _inward_response, points, bins, up / down, rate)
+    spectrum = rfft(signals, outer_points)[..., :bins] * response
+    return torch.fft.irfft(spectrum, inner_points)[..., :length]
 
 
 def from_spectrum(
@@ -88,7 +71,8 @@ def from_spectrum(
 
     Args:
         spectrum: Spectra of signals that are followed by silence.
-        points: FFT length of the spectrum, in samples at 44.1 kHz.
+        points: FFT length of the spectrum, in samples at 44.1 kHz. It spans a whole number of
+            samples of the output (``hlsim.msbg.cochlea.common_period``).
         rate_divisor: 1 for spectra of signals at 44.1 kHz, 2 for signals at 22.05 kHz.
         rate: Sample rate of the output in Hz.
         samples: Number of samples of the output.
@@ -100,11 +84,6 @@ def from_spectrum(
     torch.Size([1, 16000])
     """
     inner_points = points // rate_divisor
-    if not common_period(rate, rate_divisor):
-        waveform = torch.fft.irfft(spectrum, inner_points)
-        return from_cochlea(
-            waveform, rate, samples, gain=gain, rate_divisor=rate_divisor, delay=delay
-        )
     outer_points = points * rate // MSBG_RATE
     bins = min(inner_points, outer_points) // 2 + 1
     total_gain = gain * outer_points / inner_points
@@ -141,38 +120,10 @@ def from_cochlea(
     """
     up, down = _rate_ratio(rate, rate_divisor)
     outer_samples = math.ceil((waveform.shape[-1] + _FIR_TAIL) * down / up)
-    outer_points, inner_points = _fft_lengths(outer_samples, up, down)
-    bins = min(outer_points, inner_points) // 2 + 1
+    _, inner_points = _fft_lengths(outer_samples, up, down)
+    spectrum = rfft(waveform, inner_points)
     points = inner_points * rate_divisor
-    total_gain = gain * down / up
-    response = constant_like(waveform, _outward_response, points, delay, bins, total_gain, rate)
-    spectrum = rfft(waveform, inner_points)[..., :bins] * response
-    return torch.fft.irfft(spectrum, outer_points)[..., :samples]
-
-
-def _resample_inward(
-    signals: Tensor,
-    rate: int,
-    rate_divisor: int,
-    samples: int,
-    response_function: Callable[..., NDArray[np.inexact]],
-) -> Tensor:
-    """Resample signals to the inner rate, and filter them with a frequency response.
-
-    Args:
-        signals: Signals at the outer rate, (items, time).
-        rate: Outer rate in Hz.
-        rate_divisor: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
-        samples: Smallest length of the Fourier transform at the outer rate.
-        response_function: ``_inward_response`` or ``_resampling_response``.
-    """
-    up, down = _rate_ratio(rate, rate_divisor)
-    outer_points, inner_points = _fft_lengths(samples, up, down)
-    bins = min(outer_points, inner_points) // 2 + 1
-    points = inner_points * rate_divisor
-    response = constant_like(signals, response_function, points, bins, up / down, rate)
-    spectrum = rfft(signals, outer_points)[..., :bins] * response
-    return torch.fft.irfft(spectrum, inner_points)
+    return from_spectrum(spectrum, points, rate_divisor, rate, samples, gain=gain, delay=delay)
 
 
 def _inward_block_response() -> NDArray[np.complex128]:
@@ -190,11 +141,6 @@ def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[
         rate: Sample rate in Hz from which signals are resampled.
     """
     return gain * np.fft.rfft(ear_filter(), points)[:bins] * _band_end(points, bins, rate)
-
-
-def _resampling_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.float64]:
-    """Compute the response of resampling alone, with a gain, (bins,)."""
-    return gain * _band_end(points, bins, rate)
 
 
 def _outward_response(

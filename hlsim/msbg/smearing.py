@@ -55,9 +55,6 @@ _MAX_POWER_RATIO = 1e30
 _DIVISION_EPS = 1e-36
 """Power in Pa^2 that keeps divisors away from 0."""
 
-_FRAMES_PER_CHUNK = 1200
-"""Number of frames that are smeared at once on a CPU, few enough for its cache."""
-
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
     """Compute the auditory filters of an ear: how much of each frequency each filter passes.
@@ -184,27 +181,10 @@ def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
     count = math.ceil(waveform.shape[-1] / hop)
     window = constant_like(waveform, _window, rate_divisor)
     frames = _cut_frames(waveform, count, hop, window)
-    frames_per_chunk = count
-    if waveform.device.type == "cpu":
-        # Each step of the computation should find the result of the last one in the cache.
-        items = waveform[..., 0].numel()
-        frames_per_chunk = max(1, _FRAMES_PER_CHUNK * rate_divisor // items)
-    chunks = frames.split(frames_per_chunk, -2)
-    smeared = [_smear_frames(chunk, window, matrix) for chunk in chunks]
-    all_frames = smeared[0] if len(smeared) == 1 else torch.cat(smeared, -2)
-    return _overlap_add(all_frames, hop)
-
-
-def _smear_frames(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
-    """Smear the spectra of frames that were cut with a window, and apply the window once more.
-
-    Shape: (..., frames, 2 n), (2 n,), (bins, bins) -> (..., frames, n).
-    """
-    bins = len(matrix)
-    samples = len(window)
-    spectrum, _ = smear_spectrum(rfft(frames)[..., :bins], matrix)
-    half = samples // 2
-    return torch.fft.irfft(spectrum, samples)[..., :half] * window[:half]
+    spectrum, _ = smear_spectrum(rfft(frames)[..., : len(matrix)], matrix)
+    half = len(window) // 2
+    smeared_frames = torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
+    return _overlap_add(smeared_frames, hop)
 
 
 def smear_spectrum(

@@ -26,13 +26,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
+from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
-from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
+from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
 from hlsim.msbg.smearing import BROADENING, roex_filters, smear_spectrum, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
@@ -352,7 +353,8 @@ def _threshold_weights() -> NDArray[np.float64]:
 
     Returns: Weights of shape (severities, 8, channels).
     """
-    weights = [threshold_weights(BANKS[severity]) for severity in SEVERITIES]
+    banks = [BANKS[severity] for severity in SEVERITIES]
+    weights = [interpolation_weights(bank.centre_frequencies) for bank in banks]
     return np.stack([_pad_channels(bank_weights.T).T for bank_weights in weights])
 
 

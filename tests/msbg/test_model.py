@@ -20,7 +20,6 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.msbg import MSBG
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
 from hlsim.msbg.overlapping_blocks import block_bounds
-from hlsim.msbg.resampling import resample_to_model_rate
 from hlsim.msbg.smearing import HOP
 from hlsim.training.ears import draw_thresholds
 from tests.pyclarity import STRIDE, PyclarityOutputs, msbg
@@ -216,7 +215,7 @@ def test_rescaling_does_not_change_silence_and_very_short_clips() -> None:
     # Below 40 dB SPL, no frame counts as active, and pyclarity returns NaN.
     soft_noise = set_level(torch.randn(1000), 20.0)
     for signals in (torch.zeros(2, 3, 1000), soft_noise, torch.ones(2, 10)):
-        assert bool(active_rescaling(signals).eq(1.0).all())
+        assert bool(active_rescaling(signals, RATE).eq(1.0).all())
 
 
 def ears_of_all_severities(count: int) -> Tensor:
@@ -336,22 +335,11 @@ def test_the_model_has_no_parameters_and_copies_are_equal(speech: Speech) -> Non
     assert "sample_rate=44100" in repr(model)
 
 
-def test_the_model_follows_a_trained_audiogram() -> None:
+def test_an_audiogram_can_be_trained() -> None:
     ear = torch.nn.Parameter(torch.full((8,), 40.0))
-    model = MSBG(ear, sample_rate=16000).double()
-    assert model.thresholds is ear and not list(model.parameters())
-    wave = 0.03 * torch.randn(2000, dtype=torch.float64)
-    before = model(wave)
-    before.square().sum().backward()
+    model = MSBG(sample_rate=16000)
+    model(0.03 * torch.randn(2000), ear).square().sum().backward()
     assert ear.grad is not None and bool(ear.grad.any())
-    with torch.no_grad():
-        ear += 10.0
-    assert not torch.equal(model(wave), before)
-    assert copy.deepcopy(model).thresholds is not ear
-    with torch.no_grad():
-        ear += 60.0
-    with pytest.raises(ValueError):
-        model(wave)
 
 
 BAD_CALLS: list[tuple[Any, Any]] = [
@@ -397,17 +385,6 @@ def test_the_number_of_threads_changes_only_rounding(rate: int, items: int) -> N
     expected = model(wave)
     # On several threads, MKL transforms a single long row in another order.
     assert relative_error(output.numpy(), expected.numpy()) <= (5e-6 if items == 1 else 0.0)
-
-
-@pytest.mark.parametrize("rate", [16000, 16001, 22050, 48000])
-def test_resampling_preserves_all_but_the_last_80_hz(rate: int) -> None:
-    spectrum = torch.fft.rfft(torch.randn(rate, dtype=torch.float64))
-    # The signal lasts one second, so that the frequencies are 1 Hz apart.
-    spectrum[min(rate, 44100) // 2 - 100 :] = 0.0
-    # It is silent at its ends, because it is periodic for scipy.
-    signal = torch.fft.irfft(spectrum, rate) * torch.hann_window(rate, dtype=torch.float64)
-    expected = scipy.signal.resample(signal.numpy(), 44100)
-    assert relative_error(resample_to_model_rate(signal, rate).numpy(), expected) < 1e-5
 
 
 BLOCK_BOUNDS = "hlsim.msbg.overlapping_blocks.block_bounds"

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import gain_to_pascals
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
@@ -21,7 +22,6 @@ from hlsim.msbg.recruitment import (
     expansion_ratios,
     interpolate,
     interpolation_kernel,
-    threshold_weights,
 )
 from hlsim.training.ears import draw_thresholds
 
@@ -40,7 +40,9 @@ TO_PASCALS = gain_to_pascals(120.0)
 def test_expansion_ratios_equal_pyclaritys(name: str) -> None:
     bank = BANKS[name]
     ears = draw_thresholds(20, torch.Generator().manual_seed(0)).double()
-    ours = expansion_ratios(ears.reshape(4, 5, 8), torch.from_numpy(threshold_weights(bank)))
+    ours = expansion_ratios(
+        ears.reshape(4, 5, 8), torch.from_numpy(interpolation_weights(bank.centre_frequencies))
+    )
     assert ours.shape == (4, 5, bank.channels)
     for levels, ratios in zip(ears, ours.reshape(20, -1), strict=True):
         ear = clarity_audiogram.Audiogram(levels=levels.numpy(), frequencies=np.array(FREQUENCIES))
@@ -63,7 +65,7 @@ class RoundedProducts(TorchFunctionMode):
 
 def test_expansion_ratios_are_exact_where_matrix_products_are_rounded() -> None:
     ears = torch.linspace(93.3, 99.9, 80).reshape(10, 8)
-    weights = torch.from_numpy(threshold_weights(BANKS["severe"])).float()
+    weights = torch.from_numpy(interpolation_weights(BANKS["severe"].centre_frequencies)).float()
     with RoundedProducts():
         ours = expansion_ratios(ears, weights)
     expected = expansion_ratios(ears.double(), weights.double())
@@ -80,7 +82,9 @@ def test_recruitment_equals_pyclaritys(
     bandwidths = erb(np.array(bank.centre_frequencies))
     envelopes = np.maximum(cochlea.compute_envelope(channels, bandwidths, MSBG_RATE), 1e-7)
     levels = torch.linspace(20.0, 70.0, 8, dtype=torch.float64)
-    ratios = expansion_ratios(levels, torch.from_numpy(threshold_weights(bank)))
+    ratios = expansion_ratios(
+        levels, torch.from_numpy(interpolation_weights(bank.centre_frequencies))
+    )
     catch_up = np.full(bank.channels, 105.0)
     expected = cochlea.recruitment(
         channels.copy(), envelopes.copy(), 120.0, ratios.numpy(), catch_up
