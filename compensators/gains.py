@@ -50,7 +50,7 @@ class MeasuredAid(nn.Module):
         """
         check_number("level", level, 0.0, 120.0)
         weight = next(self.parameters(), torch.empty(0))
-        thresholds = as_thresholds(audiogram, consumer="an aid").to(weight)
+        thresholds = as_thresholds(audiogram).to(weight)
         ears = thresholds.reshape(-1, len(FREQUENCIES))
         noise = constant_like(ears, _speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
         # The first second, in which gains settle, is left out.

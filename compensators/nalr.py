@@ -1,7 +1,5 @@
 """NAL-R, a prescription of gains for an audiogram that do not depend on the level."""
 
-from typing import Any
-
 import numpy as np
 import scipy
 import torch
@@ -24,8 +22,6 @@ from hlsim.torchtools import constant_like
 
 BIAS_DB = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
 """Constant of NAL-R's formula at each of its frequencies."""
-
-THRESHOLD_OPTIONS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "consumer": "NAL-R"}
 
 
 class NALR(nn.Module):
@@ -73,7 +69,7 @@ class NALR(nn.Module):
         if order not in range(2, 1024, 2):
             raise ValueError(f"expected an even order from 2 to 1022, got {order!r}")
         self.order = order
-        thresholds = store_thresholds(audiogram, **THRESHOLD_OPTIONS)
+        thresholds = store_thresholds(audiogram, highest=HIGHEST_LEVEL)
         self.register_buffer("thresholds", thresholds, persistent=False)
         self._two_ears = has_listeners(audiogram)
 
@@ -93,7 +89,7 @@ class NALR(nn.Module):
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         thresholds = resolve_thresholds(
-            self.thresholds, audiogram, waveform, two_ears=self._two_ears, **THRESHOLD_OPTIONS
+            self.thresholds, audiogram, waveform, two_ears=self._two_ears, highest=HIGHEST_LEVEL
         )
         with torch.autocast(waveform.device.type, enabled=False):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
@@ -123,7 +119,7 @@ class NALR(nn.Module):
         """
         thresholds = self.thresholds
         if audiogram is not None:
-            thresholds = as_thresholds(audiogram, **THRESHOLD_OPTIONS)
+            thresholds = as_thresholds(audiogram, highest=HIGHEST_LEVEL)
         if thresholds is None:
             raise ValueError("no audiogram; pass one to gains, or to NALR when building it")
         return nalr_gains_db(thresholds)

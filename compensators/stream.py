@@ -52,7 +52,7 @@ class Stream:
                 f"expected an aid with sample_rate={RATE} for a stream, got {aid.sample_rate}; "
                 f"use such an aid, and resample the signal to {RATE} Hz"
             )
-        as_thresholds(audiogram, consumer=type(aid).__name__)  # the first chunk may come later
+        as_thresholds(audiogram)  # the first chunk may come later
         self._aid = aid
         self._audiogram = audiogram
         self._state: dict[str, Tensor] = {}  # empty before the first chunk

@@ -256,7 +256,7 @@ class Wearable(MeasuredAid):
         Raises:
             ValueError: An ear is not valid, or shapes do not fit.
         """
-        thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
+        thresholds = resolve_thresholds(None, audiogram, waveform)
         if self.linked:
             check_two_channels(waveform)
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])

@@ -27,7 +27,6 @@ def as_thresholds(
     audiogram: AudiogramLike,
     *,
     highest: float = HIGHEST_SIMULATED,
-    consumer: str = "a simulator",
     allow_missing: bool = False,
 ) -> Tensor:
     """Convert any description of one or more ears into a tensor of thresholds in dB HL.
@@ -43,7 +42,6 @@ def as_thresholds(
         audiogram: One or more ears: an ``Audiogram``, a name such as ``"N3"``, a ``Listener``, a
             sequence of these, a tensor or an array.
         highest: Highest level allowed, in dB HL.
-        consumer: Name of the model or metric that needs the thresholds, for messages.
         allow_missing: Whether listeners with one ear are accepted. The thresholds of the other ear
             are NaN.
 
@@ -62,12 +60,12 @@ def as_thresholds(
         audiogram = torch.tensor(audiogram.astype(np.float32))
     listed = _list_ears(audiogram)
     if listed is None:
-        return _check_tensor(audiogram, highest, consumer)
+        return _check_tensor(audiogram, highest)
     ears, shape = listed
     rows = []
     for index, ear in enumerate(ears):
         if ear is not None:
-            check_range(ear.thresholds, highest, consumer)
+            check_range(ear.thresholds, highest)
         elif not allow_missing:
             channel = 1 - index % 2
             raise ValueError(
@@ -126,7 +124,7 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
     grids = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
     for ear in grids:
         if ear is not None:
-            check_range(ear.levels, HIGHEST_SIMULATED, "MSBG", ear.frequencies)
+            check_range(ear.levels, HIGHEST_SIMULATED, ear.frequencies)
     return grids if any(grids) else []
 
 
@@ -138,7 +136,7 @@ def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor 
 
     Args:
         audiogram: One or more ears; None gives None.
-        options: ``highest``, ``consumer`` and ``allow_missing`` of ``as_thresholds``.
+        options: ``highest`` and ``allow_missing`` of ``as_thresholds``.
 
     >>> store_thresholds("N3").shape
     torch.Size([8])
@@ -170,7 +168,7 @@ def resolve_thresholds(
         audiogram: Ears that were passed with the call, or None.
         waveform: Signals, (..., time).
         two_ears: Whether the stored thresholds are those of listeners.
-        options: ``highest``, ``consumer`` and ``allow_missing`` of ``as_thresholds``.
+        options: ``highest`` and ``allow_missing`` of ``as_thresholds``.
 
     Returns:
         Thresholds in dB HL that broadcast with the leading dimensions of the waveform, (..., 8).
@@ -192,7 +190,9 @@ def resolve_thresholds(
     assert thresholds is not None
     if two_ears if audiogram is None else has_listeners(audiogram):
         check_two_channels(waveform)
-    thresholds = unsqueeze_mono(thresholds, waveform.shape)
+    is_mono = waveform.ndim == 3 and waveform.shape[1] == 1
+    if is_mono and thresholds.shape[:-1] == waveform.shape[:1]:
+        thresholds = thresholds.unsqueeze(1)
     try:
         broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
     except RuntimeError:
@@ -201,22 +201,6 @@ def resolve_thresholds(
             f"{tuple(waveform.shape)}; pass one audiogram, or leading dimensions that broadcast"
         ) from None
     return on_device(thresholds, waveform.device)
-
-
-def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
-    """Add a channel dimension to thresholds if signals have one channel and each item has one ear.
-
-    Shape: (batch, 8) -> (batch, 1, 8) for signals of shape (batch, 1, time), else unchanged.
-
-    Args:
-        thresholds: Thresholds in dB HL.
-        shape: Shape of the signals.
-
-    >>> unsqueeze_mono(torch.zeros(2, 8), torch.Size([2, 1, 16000])).shape
-    torch.Size([2, 1, 8])
-    """
-    mono = len(shape) == 3 and shape[1] == 1
-    return thresholds.unsqueeze(1) if mono and thresholds.shape[:-1] == shape[:1] else thresholds
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:
@@ -282,7 +266,7 @@ def interpolation_weights(
     return np.stack([np.interp(frequencies, grid, row) for row in np.eye(len(grid))])
 
 
-def _check_tensor(levels: Any, highest: float, consumer: str) -> Tensor:
+def _check_tensor(levels: Any, highest: float) -> Tensor:
     """Validate a tensor of thresholds, as ``as_thresholds`` describes."""
     if not isinstance(levels, Tensor):
         raise ValueError(
@@ -305,5 +289,5 @@ def _check_tensor(levels: Any, highest: float, consumer: str) -> Tensor:
         return torch.where(in_range.all(-1, keepdim=True), levels, math.nan)
     in_range = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
     if not bool(in_range.all()):
-        check_range(known[~in_range][0].tolist(), highest, consumer)
+        check_range(known[~in_range][0].tolist(), highest)
     return levels

@@ -76,7 +76,7 @@ class Audiogram:
             )
         is_measured = ~np.isnan(levels)
         levels, frequencies = levels[is_measured], frequencies[is_measured]
-        check_range(levels, HIGHEST_LEVEL, "an audiogram", frequencies)
+        check_range(levels, HIGHEST_LEVEL, frequencies)
         ascending = len(levels) > 0 and frequencies[0] > 0 and (np.diff(frequencies) > 0).all()
         overlaps = (
             ascending
@@ -355,7 +355,6 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
 def check_range(
     levels: Iterable[float],
     highest: float,
-    consumer: str,
     frequencies: Iterable[float] = FREQUENCIES,
 ) -> None:
     """Validate that thresholds lie between -10 dB HL and a highest level.
@@ -363,20 +362,19 @@ def check_range(
     Args:
         levels: Thresholds in dB HL.
         highest: Highest level that is valid, in dB HL.
-        consumer: Name of the model or metric that needs the thresholds, for the message.
         frequencies: Frequency of each threshold in Hz, for the message.
 
     Raises:
         ValueError: A level is below -10 or above ``highest``, or NaN.
 
-    >>> check_range([20.0] * 8, 100.0, "MSBG")
+    >>> check_range([20.0] * 8, 100.0)
     """
     for level, frequency in zip(levels, frequencies, strict=True):
         if LOWEST_LEVEL <= level <= highest:
             continue
         raise ValueError(
-            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}, "
-            f"got {level:g} at {frequency:g} Hz; pass a level in this range"
+            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL, got {level:g} at "
+            f"{frequency:g} Hz; pass a level in this range"
         )
 
 

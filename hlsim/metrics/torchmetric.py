@@ -368,9 +368,7 @@ def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
 
     Shape: (items, sides, 8) dB HL.
     """
-    levels = as_thresholds(
-        audiogram, highest=HIGHEST_LEVEL, consumer="a score", allow_missing=sides == 2
-    )
+    levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL, allow_missing=sides == 2)
     one_for_all = (2, len(FREQUENCIES)) if sides == 2 else (len(FREQUENCIES),)
     fits = levels.shape in (one_for_all, (items, *one_for_all))
     if not fits or (sides == 1 and has_listeners(audiogram)):

@@ -1,5 +1,6 @@
 """Neuro-MSBG, a neural network that emulates MSBG, and loading of trained ones."""
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -145,46 +146,11 @@ class NeuroMSBG(EarNetwork):
             return self.stft.synthesise(output_spectrum, samples)
         powers = power(spectrum)
         prior_factor = self.prior(powers, ears, severity) if self.prior is not None else None
-        correction = self._correction(spectrum, powers, ears, severity, prior_factor)
-        if prior_factor is not None:
-            correction = prior_factor * correction
-        return self.stft.synthesise(spectrum * correction, samples)
-
-    def _correction(
-        self,
-        spectrum: Tensor,
-        powers: Tensor,
-        ears: Tensor,
-        severity: Tensor,
-        prior_factor: Tensor | None,
-    ) -> Tensor:
-        """Predict the factor on the spectrogram, in addition to that of the prior.
-
-        Shape: (items, frames, frequencies), the same, (items, 8), (items,), (items, frames,
-            frequencies) -> complex (items, frames, frequencies), or real without a predicted phase.
-        """
         features = self._features(spectrum, powers, ears, prior_factor)
-        size = (spectrum.shape[-2], spectrum.shape[-1])
-        device = spectrum.device.type
-        autocast_dtype = self.autocast_dtype or torch.bfloat16
-        with torch.autocast(device, autocast_dtype, enabled=self.autocast_dtype is not None):
-            encoded = self.encoder(features.contiguous(memory_format=torch.channels_last))
-            hidden = encoded.permute(0, 2, 3, 1)
-            if self.severity is not None:
-                hidden = hidden + self.severity(severity)[:, None, None]
-            for block in self.blocks:
-                hidden = block(hidden)
-            hidden = hidden.permute(0, 3, 1, 2)
-            maps = self.mask_decoder(hidden, size).to(ears.dtype)
-            log_mask = maps[:, -1]
-            if self.prior is not None:
-                # Errors of the prior's envelope are in proportion to the recruitment of the ear.
-                ratios = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz))
-                log_mask = maps[:, 0] * (ratios - 1.0).unsqueeze(1) + log_mask
-            log_mask = log_mask.clamp(MIN_LOG_MASK, MAX_LOG_MASK)
-            if self.phase_decoder is None:
-                return log_mask.exp()
-            return phase_factor(self.phase_decoder(hidden, size), log_mask)
+        factor = self._correction(features, ears, severity)
+        if prior_factor is not None:
+            factor = prior_factor * factor
+        return self.stft.synthesise(spectrum * factor, samples)
 
     def _features(
         self, spectrum: Tensor, powers: Tensor, ears: Tensor, prior_factor: Tensor | None
@@ -208,6 +174,34 @@ class NeuroMSBG(EarNetwork):
         levels = (ears / 100.0)[:, None, None].expand(*features.shape[:3], -1)
         return torch.cat((features, levels), -1)
 
+    def _correction(self, features: Tensor, ears: Tensor, severity: Tensor) -> Tensor:
+        """Predict the factor on the spectrogram, in addition to that of the prior.
+
+        Shape: (items, 2 to 4, frames, rows), (items, 8), (items,) -> complex (items, frames,
+            frequencies), or real without a predicted phase.
+        """
+        size = features.shape[2], self.stft.frequencies
+        device = features.device.type
+        autocast_dtype = self.autocast_dtype or torch.bfloat16
+        with torch.autocast(device, autocast_dtype, enabled=self.autocast_dtype is not None):
+            encoded = self.encoder(features.contiguous(memory_format=torch.channels_last))
+            hidden = encoded.permute(0, 2, 3, 1)
+            if self.severity is not None:
+                hidden = hidden + self.severity(severity)[:, None, None]
+            for block in self.blocks:
+                hidden = block(hidden)
+            hidden = hidden.permute(0, 3, 1, 2)
+            maps = self.mask_decoder(hidden, size).to(ears.dtype)
+            log_mask = maps[:, -1]
+            if self.prior is not None:
+                # Errors of the prior's envelope are in proportion to the recruitment of the ear.
+                ratios = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz))
+                log_mask = maps[:, 0] * (ratios - 1.0).unsqueeze(1) + log_mask
+            log_mask = log_mask.clamp(MIN_LOG_MASK, MAX_LOG_MASK)
+            if self.phase_decoder is None:
+                return log_mask.exp()
+            return phase_factor(self.phase_decoder(hidden, size), log_mask)
+
 
 def load_pretrained(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
@@ -229,11 +223,8 @@ def load_pretrained(
     >>> load_pretrained("neuro-msbg-light")(torch.randn(2, 16000), "N3").shape
     torch.Size([2, 16000])
     """
-
-    def build(config: NeuroConfig) -> NeuroMSBG:
-        return NeuroMSBG(
-            config, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
-        )
-
+    build = partial(
+        NeuroMSBG, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
+    )
     model = read_checkpoint(name, {SIMULATOR: NeuroConfig.from_dict}, build)
     return model.eval().requires_grad_(False)

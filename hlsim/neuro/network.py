@@ -84,7 +84,7 @@ class EarNetwork(nn.Module):
                 f"expected the waveform on {weight.device}, the device of {type(self).__name__}, "
                 f"got {waveform.device}; move either with .to()"
             )
-        thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
+        thresholds = resolve_thresholds(None, audiogram, waveform)
         with torch.autocast(waveform.device.type, enabled=False):
             batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
             signals = flatten_items(waveform, batch, weight.dtype)

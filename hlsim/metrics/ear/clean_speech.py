@@ -229,9 +229,7 @@ class CleanSpeech:
             Thresholds. Shape: (items, 8) dB HL.
         """
         probe = torch.empty((*self.shape, 1), device=self.device)
-        ears = resolve_thresholds(
-            None, audiogram, probe, highest=HIGHEST_LEVEL, consumer=self._score_name
-        )
+        ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL)
         if broadcast_shape(self.shape, ears.shape[:-1]) != self.shape:
             raise ValueError(
                 f"expected one audiogram or one for each item, got shape {tuple(ears.shape)} "
