@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import DataLoader, Dataset
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
@@ -26,10 +28,25 @@ from hlsim.training.augment import (
 )
 from hlsim.training.clips import Clips, Source
 from hlsim.training.corpora.manifest import read_manifest
-from hlsim.training.data_module import MAX_DEVICES, Batch, BatchData
 from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 from hlsim.training.tones_and_clicks import draw_sounds
+
+Batch = dict[str, Tensor]
+"""Tensors by name.
+
+- ``clean``: clean speech in pascals with shape (items, time)
+- ``signal``: input of the network in pascals with shape (items, time)
+- ``thresholds``: ears in dB HL with shape (items, 8)
+- ``impaired``: output of the teacher in pascals with shape (items, time), computed on the device
+- ``noise_reduction``: strength of an aid's noise reduction, 0 or 1, with shape (items,)
+"""
+
+MAX_DEVICES = 64
+"""Number of batches per training step, from which each training device has one of its own."""
+
+Teacher = Callable[[Tensor, Tensor], Tensor]
+"""Function from signals and thresholds to the ``impaired`` signals."""
 
 _VALIDATION_SECONDS = 2.0
 """Duration of the clips for validation."""
@@ -235,9 +252,55 @@ def _babble(voices: Tensor) -> Tensor:
     return torch.stack(shifted).sum(0)
 
 
-def simulator_data(
-    data: TrainingData, recipe: SimulatorRecipe, teacher: Callable[[Tensor, Tensor], Tensor]
-) -> BatchData:
+class BatchData(L.LightningDataModule):
+    """Lightning's data module of both trainings: batches by index, and fixed validation batches.
+
+    The batch of device d at step s, both from 0, has the index 64 * s + d. A resumed training
+    continues with the batch after the last one. The Trainer requires
+    ``use_distributed_sampler=False``.
+
+    Args:
+        training: Data set that returns a batch for each index.
+        validation: Batches for validation.
+        teacher: Simulator that is called on the training device; None leaves batches as they are.
+        workers: Number of processes that draw batches, in addition to the one that trains.
+
+    >>> data = BatchData([], validation=[{"clean": Tensor([1.0])}])
+    >>> next(iter(data.val_dataloader()))
+    {'clean': tensor([1.])}
+    """
+
+    def __init__(
+        self,
+        training: Dataset[Batch],
+        validation: Sequence[Batch],
+        *,
+        teacher: Teacher | None = None,
+        workers: int = 0,
+    ) -> None:
+        super().__init__()
+        self.training = training
+        self.validation = validation
+        self.teacher = teacher
+        self.workers = workers
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        trainer: Any = self.trainer
+        first = MAX_DEVICES * trainer.global_step + trainer.global_rank
+        indices = itertools.count(first, MAX_DEVICES)
+        return DataLoader(self.training, batch_size=None, sampler=indices, num_workers=self.workers)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.validation, batch_size=None)  # type: ignore[arg-type]
+
+    @torch.no_grad()
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        if self.teacher is None:
+            return batch
+        return batch | {"impaired": self.teacher(batch["signal"], batch["thresholds"])}
+
+
+def simulator_data(data: TrainingData, recipe: SimulatorRecipe, teacher: Teacher) -> BatchData:
     """Make the Lightning data module with the batches for the training of a Neuro-MSBG.
 
     Clips for validation are not equalised, amplified or compressed.
@@ -245,7 +308,7 @@ def simulator_data(
     Args:
         data: Speech, noise and ears.
         recipe: Settings of the training.
-        teacher: Simulator whose output is learnt, a function of signals and thresholds.
+        teacher: Simulator whose output is learnt.
 
     Returns:
         Batches for training and validation, with the teacher.
@@ -303,7 +366,7 @@ def _make_data(
     data: TrainingData,
     training: _RandomBatches,
     validation: _RandomBatches,
-    teacher: Callable[[Tensor, Tensor], Tensor] | None = None,
+    teacher: Teacher | None = None,
 ) -> BatchData:
     """Draw the batches for validation, whose speech must not be used for training.
 

@@ -14,8 +14,7 @@ from compensators.loading import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
 from hlsim.checkpoint import read_record
 from hlsim.losses.hearing_loss import HearingLossLoss
-from hlsim.training.batches import TrainingData, compensator_data
-from hlsim.training.data_module import Batch
+from hlsim.training.batches import Batch, TrainingData, compensator_data
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe

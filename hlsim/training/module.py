@@ -13,7 +13,7 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from hlsim.training.data_module import Batch
+from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
 
 _WARM_UP_STEPS = 50

@@ -72,7 +72,6 @@ class TrainingRecipe:
         for name in self.ranges:
             low, high = getattr(self, name)
             self._require(name, low <= high, "the lowest value first")
-            object.__setattr__(self, name, (low, high))  # In YAML, it is a list.
         for name, weight in self.weights.items():
             expected = f"weights of {', '.join(self.criteria)}, not of {name}"
             self._require("weights", name in self.criteria, expected)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch import Tensor
 
 from hlsim.checkpoint import SIMULATOR
@@ -17,9 +17,7 @@ from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.batches import TrainingData, simulator_data
-from hlsim.training.callbacks import update_averages
-from hlsim.training.data_module import Batch
+from hlsim.training.batches import Batch, TrainingData, simulator_data
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.teacher import find_teacher
@@ -119,13 +117,12 @@ def train_simulator(
     about = {"data": data.identity()}
     if plugin is not None:
         about["teacher"] = str(plugin)
-    average = partial(update_averages, decay=recipe.average)
     return train_network(
         SimulatorTraining(recipe),
         simulator_data(data, recipe, plugin or MSBG(sample_rate=NEURO_RATE)),
         SIMULATOR,
         out=out,
         about=about,
-        callbacks=[WeightAveraging(use_buffers=False, multi_avg_fn=average)],
+        callbacks=[EMAWeightAveraging(use_buffers=False, decay=recipe.average)],
         **options,
     )

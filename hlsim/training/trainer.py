@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import math
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -16,10 +18,10 @@ import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from torch import Tensor
 
-from hlsim.checkpoint import read_record
-from hlsim.training.callbacks import BestCheckpoint
-from hlsim.training.data_module import BatchData
+from hlsim.checkpoint import read_record, save_checkpoint
+from hlsim.training.batches import BatchData
 from hlsim.training.module import TrainingModule
 from hlsim.version import __version__
 
@@ -27,6 +29,76 @@ _EXPECTED_WARNINGS = (
     "many workers|directory .* exists|not used|before the epoch ended|logging interval|LeafSpec"
 )
 """Pattern of Lightning's warnings about choices that hlsim makes on purpose."""
+
+
+class BestCheckpoint(L.Callback):
+    """Callback that saves the network with the highest validation score in a folder.
+
+    The first candidate is the network before the first step, the others are those whose states
+    Lightning saves. The callback must come after that of the average of the weights.
+
+    Args:
+        folder: Folder to write, which ``load_pretrained`` or ``load_compensator`` reads.
+        kind: Kind of the checkpoint, such as ``"hearing-aid"``.
+        record: Entries about the training for the checkpoint's ``config.json``.
+
+    Attributes:
+        best_score: Highest validation score so far.
+
+    >>> BestCheckpoint(Path("runs"), "hearing-aid", record={"seed": 0}).best_score
+    -inf
+    """
+
+    def __init__(self, folder: Path, kind: str, record: dict[str, Any]) -> None:
+        self.folder = folder
+        self.kind = kind
+        self.record = record
+        self.best_score = -math.inf
+
+    def on_sanity_check_end(self, trainer: L.Trainer, module: Any) -> None:
+        self.record["start_validation"] = module.validation
+        self._save_if_best(module, module.state_dict(), step=0, seconds=0.0)
+
+    def on_save_checkpoint(
+        self, trainer: L.Trainer, module: Any, checkpoint: dict[str, Any]
+    ) -> None:
+        seconds = checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"]
+        self._save_if_best(module, checkpoint["state_dict"], checkpoint["global_step"], seconds)
+        checkpoint |= {"best_score": self.best_score, "record": self.record}
+
+    def on_load_checkpoint(
+        self, trainer: L.Trainer, module: Any, checkpoint: dict[str, Any]
+    ) -> None:
+        self.best_score = checkpoint["best_score"]
+        self.record = checkpoint["record"]
+
+    def _save_if_best(
+        self, module: Any, weights: Mapping[str, Tensor], step: int, seconds: float
+    ) -> None:
+        """Save a network, unless an earlier one has a higher or equal validation score.
+
+        Args:
+            module: The ``TrainingModule`` after its validation.
+            weights: State dict of the module that was validated.
+            step: Number of the step.
+            seconds: Duration of the training up to the step.
+        """
+        score = module.validation["score"]
+        if score <= self.best_score:
+            return
+        self.best_score = score
+        network = copy.deepcopy(module.network)
+        network.load_state_dict(
+            {name.removeprefix("network."): tensor for name, tensor in weights.items()}
+        )
+        record = {
+            **self.record,
+            "steps": step,
+            "minutes": round(seconds / 60.0, 1),
+            "validation": module.validation,
+        }
+        if module.trainer.is_global_zero:
+            save_checkpoint(self.folder, self.kind, network, network.config.to_dict(), record)
 
 
 def train_network(

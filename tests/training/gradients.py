@@ -1,6 +1,6 @@
 """Check that several tests of training share."""
 
-from hlsim.training.data_module import Batch
+from hlsim.training.batches import Batch
 from hlsim.training.module import TrainingModule
 
 

@@ -13,9 +13,8 @@ from compensators import HearingAid, load_compensator
 from hlsim import Audiogram
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
-from hlsim.training.batches import TrainingData, compensator_data
+from hlsim.training.batches import Batch, TrainingData, compensator_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
-from hlsim.training.data_module import Batch
 from hlsim.training.recipes import CompensatorRecipe
 from tests.helpers import write_table
 from tests.training.gradients import check_gradients

@@ -45,24 +45,14 @@ def from_options(words: str) -> CompensatorRecipe:
 
 def test_python_yaml_and_the_command_line_agree(tmp_path: Path) -> None:
     pytest.importorskip("jsonargparse")
-    (tmp_path / "aid.yaml").write_text(AID_YAML)
-    assert make_recipe(CompensatorRecipe, tmp_path / "aid.yaml", []) == AID_RECIPE
-    assert from_options(AID_OPTIONS) == AID_RECIPE
-
-
-def test_the_command_line_comes_before_the_file(tmp_path: Path) -> None:
-    pytest.importorskip("jsonargparse")
-    (tmp_path / "aid.yaml").write_text(AID_YAML)
-    recipe = from_options(
-        f"--recipe.model.width 4 --recipe {tmp_path / 'aid.yaml'} --start hearing-aid "
-        "--recipe.seed -3"
-    )
+    file = tmp_path / "aid.yaml"
+    file.write_text(AID_YAML)
+    assert make_recipe(CompensatorRecipe, file, []) == from_options(AID_OPTIONS) == AID_RECIPE
+    assert from_options("") == CompensatorRecipe()
+    options = f"--recipe.model.width 4 --recipe {file} --start hearing-aid --recipe.seed -3"
+    recipe = from_options(options)  # Options come before the file.
     assert recipe.model == {"width": 4, "hidden": 16}
     assert (recipe.start, recipe.seed, recipe.babble) == ("hearing-aid", -3, 0.3)
-
-
-def test_without_options_a_recipe_has_its_defaults() -> None:
-    assert from_options("") == CompensatorRecipe()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.yaml")), ids=str)
@@ -106,29 +96,12 @@ def test_invalid_settings_are_rejected(recipe: Any, settings: dict[str, Any]) ->
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "- 1",
-        "epochs: 3",
-        "batch:",
-        "batch: two",
-        "levels: loud",
-        "weights: {bands: loud}",
-        "kind: vocoder",
-        "seconds: .nan",
-    ],
+    ["", "- 1", "epochs: 3", "batch: two", "levels: loud", "weights: {bands: loud}", "kind: radio"],
 )
-def test_invalid_files_are_rejected(tmp_path: Path, text: str) -> None:
+def test_invalid_files_and_arguments_are_rejected(tmp_path: Path, text: str) -> None:
     pytest.importorskip("jsonargparse")
     (tmp_path / "recipe.yaml").write_text(text)
     with pytest.raises(ValueError):
         make_recipe(CompensatorRecipe, tmp_path / "recipe.yaml", [])
-
-
-@pytest.mark.parametrize(
-    "argument", ["--recipe.batch=1.5", "--recipe.kind=vocoder", "--recipe.colour=red", "--foo=1"]
-)
-def test_unknown_arguments_are_rejected(argument: str) -> None:
-    pytest.importorskip("jsonargparse")
     with pytest.raises(ValueError):
-        make_recipe(CompensatorRecipe, None, [argument])
+        make_recipe(CompensatorRecipe, None, [f"--recipe.{text.replace(': ', '=') or '='}"])

@@ -13,8 +13,7 @@ from hlsim import MSBG
 from hlsim.audio import write_audio
 from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
-from hlsim.training.batches import TrainingData, simulator_data
-from hlsim.training.data_module import Batch
+from hlsim.training.batches import Batch, TrainingData, simulator_data
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
 from tests.helpers import write_ears
