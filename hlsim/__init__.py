@@ -53,37 +53,29 @@ __all__ = [
 ]
 
 # A name is imported when it is first used, so that the command line's help does not wait for torch.
-_MODULES = {
-    "MSBG": "hlsim.msbg",
-    "NALR": "compensators",
-    "WDRC": "compensators",
-    "Audiogram": "hlsim.audiogram",
-    "HASPILoss": "hlsim.losses.haspi_loss",
-    "HearingAid": "compensators",
-    "HearingLossLoss": "hlsim.losses.hearing_loss",
-    "Listener": "hlsim.audiogram.listener",
-    "MappingCompensator": "compensators",
-    "NeuroMSBG": "hlsim.neuro",
-    "compensate": "hlsim.shortcuts",
-    "estimate_delay": "hlsim.msbg",
-    "example_speech": "hlsim.shortcuts",
-    "info": "hlsim.shortcuts",
-    "list_pretrained": "hlsim.checkpoint",
-    "listen": "hlsim.shortcuts",
-    "load_audio": "hlsim.shortcuts",
-    "load_compensator": "compensators",
-    "load_pretrained": "hlsim.neuro",
-    "read_audiograms": "hlsim.audiogram.table",
-    "save_compensator": "compensators",
-    "simulate": "hlsim.shortcuts",
+_NAMES = {
+    "compensators": (
+        "NALR WDRC HearingAid MappingCompensator load_compensator save_compensator".split()
+    ),
+    "hlsim.audiogram": ["Audiogram"],
+    "hlsim.audiogram.listener": ["Listener"],
+    "hlsim.audiogram.table": ["read_audiograms"],
+    "hlsim.checkpoint": ["list_pretrained"],
+    "hlsim.losses.haspi_loss": ["HASPILoss"],
+    "hlsim.losses.hearing_loss": ["HearingLossLoss"],
+    "hlsim.msbg": ["MSBG", "estimate_delay"],
+    "hlsim.neuro": ["NeuroMSBG", "load_pretrained"],
+    "hlsim.shortcuts": "compensate example_speech info listen load_audio simulate".split(),
 }
+"""Public names by the module that defines them."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
-    return value
+    for module, names in _NAMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(module), name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

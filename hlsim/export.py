@@ -40,20 +40,20 @@ zeros, except ``gliding``, which equals ``sliders``.
 
 from __future__ import annotations
 
-import copy
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from compensators.filter_bank import HOP, RATE
 from compensators.limiter import soft_limit
-from compensators.wearable import Slider, Wearable
+from compensators.wearable import Wearable
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import gain_to_pascals
-from hlsim.checks import check_names
 from hlsim.extras import require
 from hlsim.files import atomic_path
 from hlsim.neuro import NeuroMSBG
@@ -61,9 +61,6 @@ from hlsim.neuro.config import NEURO_RATE
 
 TOLERANCE = 1e-4
 """Largest error of an ONNX file, relative to the peak of the output."""
-
-NOISE_RMS = 0.03
-"""RMS in pascals (64 dB SPL) of the noise with which ONNX files are checked."""
 
 EAR = torch.linspace(20.0, 90.0, len(FREQUENCIES))
 """Thresholds in dB HL with which ONNX files are checked."""
@@ -75,55 +72,13 @@ STATELESS_INPUTS = ("samples", "fitted", "sliders")
 """Names of the inputs of an aid's program that are not part of its state."""
 
 
-class _SimulatorCall(nn.Module):
-    """A simulator as a function of two tensors, which does not read their values."""
-
-    def __init__(self, simulator: NeuroMSBG) -> None:
-        super().__init__()
-        self.simulator = simulator
-        self.gain = gain_to_pascals(simulator.full_scale_spl)
-
-    def forward(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
-        return self.simulator._process(waveform * self.gain, thresholds) / self.gain
-
-
-class _FitCall(nn.Module):
-    """``Wearable.fit`` as a module."""
-
-    def __init__(self, aid: Wearable) -> None:
-        super().__init__()
-        self.aid = aid
-
-    def forward(self, thresholds: Tensor) -> Tensor:
-        return self.aid.fit(thresholds)
-
-
-class _HopCall(nn.Module):
-    """``Wearable.process_hops``, with the limit, as a module with named inputs and outputs."""
-
-    def __init__(self, aid: Wearable) -> None:
-        super().__init__()
-        self.aid = aid
-
-    def forward(self, **inputs: Tensor) -> dict[str, Tensor]:
-        gain = gain_to_pascals(self.aid.full_scale_spl)
-        samples = inputs["samples"] * gain
-        empty = inputs["samples"][:, :0]
-        sliders = inputs.get("sliders", empty)
-        state = {"gliding": empty} | inputs  # An aid without sliders has no such state.
-        output, _, next_state = self.aid.process_hops(samples, inputs["fitted"], sliders, state)
-        output = soft_limit(output, self.aid.limit_spl)
-        names = [name for name in inputs if name not in STATELESS_INPUTS]
-        return {"output": output / gain} | {f"next_{name}": next_state[name] for name in names}
-
-
 def export_program(
     simulator: nn.Module, *, seconds: float = 1.0, items: int = 1
 ) -> torch.export.ExportedProgram:
     """Convert a Neuro-MSBG to a ``torch.export`` program for signals of a fixed length.
 
-    ``program.module()`` is a function of a waveform (items, time) and of thresholds (items, 8) in
-    dB HL. It returns what the ears perceive, in the shape of the waveform.
+    ``program.module()`` is a function of ``waveform`` (items, time) and ``thresholds`` (items, 8)
+    in dB HL. It returns a dictionary with ``perceived`` (items, time), what the ears perceive.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
@@ -131,11 +86,12 @@ def export_program(
         items: Number of waveforms per call.
 
     Raises:
-        ValueError: The simulator is no Neuro-MSBG at 16 kHz, or there is no sample or no item.
+        ValueError: The simulator is no Neuro-MSBG at 16 kHz.
 
     >>> import hlsim
     >>> program = export_program(hlsim.load_pretrained("neuro-msbg-light"), seconds=0.1)
-    >>> perceived = program.module()(torch.zeros(1, 1600), torch.full((1, 8), 40.0))
+    >>> inputs = {"waveform": torch.zeros(1, 1600), "thresholds": torch.full((1, 8), 40.0)}
+    >>> perceived = program.module()(**inputs)["perceived"]
     """
     if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
         raise ValueError(
@@ -143,15 +99,12 @@ def export_program(
             f"{type(simulator).__name__}; the exact MSBG cannot be exported, because its filters "
             "depend on the audiogram's values"
         )
-    if not (seconds * NEURO_RATE >= 1 and items >= 1):
-        raise ValueError(
-            f"expected at least one sample and item, got {seconds} s and {items} items"
-        )
     weight = next(simulator.parameters())
-    time = round(seconds * NEURO_RATE)
-    example = (weight.new_zeros(items, time), weight.new_zeros(items, len(FREQUENCIES)))
-    with torch.no_grad():
-        return torch.export.export(_SimulatorCall(copy.deepcopy(simulator)).eval(), example)
+    inputs = {
+        "waveform": weight.new_zeros(items, round(seconds * NEURO_RATE)),
+        "thresholds": weight.new_zeros(items, len(FREQUENCIES)),
+    }
+    return _to_program(simulator, _simulate, inputs)
 
 
 def export_onnx(
@@ -169,47 +122,42 @@ def export_onnx(
         items: Number of waveforms per call.
 
     Raises:
-        ValueError: The simulator or the size is unsuitable, see ``export_program``; ONNX lacks an
-            operation; or the output of onnxruntime for noise at 64 dB SPL differs by more than
-            1e-4 of its peak.
+        ValueError: The simulator is unsuitable, see ``export_program``; ONNX lacks an operation; or
+            the output of onnxruntime for noise at 64 dB SPL differs by more than 1e-4 of its peak.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> import hlsim
     >>> simulator = hlsim.load_pretrained("neuro-msbg-light")
     >>> export_onnx(simulator, "simulator.onnx")  # doctest: +SKIP
     """
-    _require_onnx()
     program = export_program(simulator, seconds=seconds, items=items)
-    assert isinstance(simulator, NeuroMSBG)
     weight = next(simulator.parameters())
-    noise = _draw_noise(items, round(seconds * NEURO_RATE), full_scale_spl=simulator.full_scale_spl)
-    inputs = {"waveform": noise.to(weight), "thresholds": EAR.expand(items, -1).to(weight)}
-    with torch.no_grad():
-        perceived = _SimulatorCall(simulator)(*inputs.values())
-    _write_onnx(program, path, inputs, {"perceived": perceived})
+    inputs = {
+        "waveform": _draw_noise(simulator, items, round(seconds * NEURO_RATE)).to(weight),
+        "thresholds": EAR.expand(items, -1).to(weight),
+    }
+    _write_onnx(program, path, inputs)
 
 
 def first_inputs(
-    aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, hops: int = 1, **sliders: Slider
+    aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, hops: int = 1
 ) -> dict[str, Tensor]:
     """Return the inputs with which the first call of an aid's program is made.
 
-    Replace ``samples``, which are silence, by those of the signal.
+    Replace ``samples``, which are silence, by those of the signal. The sliders are those of
+    ``aid.SLIDERS``.
 
     Args:
         aid: Aid at 16 kHz.
         audiogram: One ear for all items, or one per item.
         items: Number of signals per call.
         hops: Number of hops of 64 samples per call.
-        sliders: Values of sliders from 0 to 1 by name, one for all items or one per item; by
-            default those of ``aid.SLIDERS``.
 
     Returns:
         Tensors by the names of inputs that the module's docstring lists.
 
     Raises:
-        ValueError: The aid's sample rate is not 16000 Hz, it has no such slider, or it rejects the
-            ear or a value.
+        ValueError: The aid's sample rate is not 16000 Hz, or it rejects the ear.
 
     >>> from compensators import WDRC
     >>> print(*first_inputs(WDRC(), "N3"))
@@ -217,18 +165,16 @@ def first_inputs(
     """
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
-    check_names(sliders, aid.SLIDERS, "sliders")
     weight = next(aid.parameters(), torch.empty(0))
-    values = [sliders.get(name, default) for name, default in aid.SLIDERS.items()]
     with torch.no_grad():
         samples = weight.new_zeros(items, hops * HOP)
         batch, fitted = aid.prepare(samples, audiogram)
-        settings = aid.stack_sliders(values, batch, fitted)
+        sliders = aid.stack_sliders([*aid.SLIDERS.values()], batch, fitted)
         inputs = {
             "samples": samples,
             "fitted": fitted,
-            "sliders": settings,
-            **aid.initial_state(settings),
+            "sliders": sliders,
+            **aid.initial_state(sliders),
         }
     # Copies, because torch.export would merge two inputs that are the same tensor.
     return {name: tensor.clone() for name, tensor in inputs.items() if tensor.numel()}
@@ -254,11 +200,7 @@ def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export
     >>> outputs["output"].shape
     torch.Size([1, 64])
     """
-    inputs = first_inputs(aid, torch.zeros(len(FREQUENCIES)), items=items, hops=hops)
-    with torch.no_grad(), warnings.catch_warnings():
-        # torch.export warns of the list of weights in nn.LSTM, which does no harm.
-        warnings.filterwarnings("ignore", r"The tensor attributes .*_flat_weights")
-        return torch.export.export(_HopCall(aid), (), inputs)
+    return _to_program(aid, _process_hops, first_inputs(aid, EAR, items=items, hops=hops))
 
 
 def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1) -> None:
@@ -280,22 +222,15 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
     >>> from compensators import WDRC
     >>> export_aid(WDRC(), "aid.onnx")  # doctest: +SKIP
     """
-    _require_onnx()
     program = hop_program(aid, items=items, hops=hops)
-    call = _HopCall(aid)
     inputs = first_inputs(aid, EAR, items=items, hops=hops)
-    if "sliders" in inputs:
-        # Sliders that move, so that their state is checked as well.
-        inputs["sliders"] = 0.2 * inputs["sliders"]
-    noise = _draw_noise(CHECKED_CALLS, items, hops * HOP, full_scale_spl=aid.full_scale_spl)
-    state_names = [name for name in inputs if name not in STATELESS_INPUTS]
-    with torch.no_grad():
-        for samples in noise.to(inputs["samples"]):
-            inputs["samples"] = samples
-            expected = call(**inputs)
-            last_inputs = inputs
-            inputs = inputs | {name: expected[f"next_{name}"] for name in state_names}
-    _write_onnx(program, path, last_inputs, expected)
+    state_names = inputs.keys() - STATELESS_INPUTS
+    noise = _draw_noise(aid, CHECKED_CALLS, items, hops * HOP).to(inputs["samples"])
+    for samples in noise[:-1]:
+        inputs["samples"] = samples
+        outputs = program.module()(**inputs)
+        inputs |= {name: outputs[f"next_{name}"] for name in state_names}
+    _write_onnx(program, path, inputs | {"samples": noise[-1]})
 
 
 def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
@@ -317,33 +252,69 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     >>> from compensators import WDRC
     >>> export_fit(WDRC(), "fit.onnx")  # doctest: +SKIP
     """
-    _require_onnx()
-    ears = EAR.repeat(items, 1)
-    call = _FitCall(aid)
-    with torch.no_grad():
-        program = torch.export.export(call, (ears,))
-        fitted = call(ears)
-    _write_onnx(program, path, {"thresholds": ears}, {"fitted": fitted})
+    inputs = {"thresholds": EAR.repeat(items, 1)}
+    _write_onnx(_to_program(aid, _fit, inputs), path, inputs)
 
 
-def _draw_noise(*shape: int, full_scale_spl: float) -> Tensor:
-    """Draw noise at 64 dB SPL with which ONNX files are checked."""
-    generator = torch.Generator().manual_seed(0)
-    return NOISE_RMS / gain_to_pascals(full_scale_spl) * torch.randn(*shape, generator=generator)
+class _Call(nn.Module):
+    """A function of a model and of named tensors as a module, which ``torch.export`` expects."""
+
+    def __init__(self, model: nn.Module, function: Callable[..., dict[str, Tensor]]) -> None:
+        super().__init__()
+        self.model = model
+        self.function = function
+
+    def forward(self, **inputs: Tensor) -> dict[str, Tensor]:
+        return self.function(self.model, **inputs)
 
 
-def _require_onnx() -> None:
-    for module in ("onnx", "onnxscript", "onnxruntime"):
-        require(module, "dev")
+def _simulate(simulator: NeuroMSBG, waveform: Tensor, thresholds: Tensor) -> dict[str, Tensor]:
+    """Call a simulator without its validation, which reads the values of tensors."""
+    gain = gain_to_pascals(simulator.full_scale_spl)
+    return {"perceived": simulator._process(waveform * gain, thresholds) / gain}
+
+
+def _fit(aid: Wearable, thresholds: Tensor) -> dict[str, Tensor]:
+    return {"fitted": aid.fit(thresholds)}
+
+
+def _process_hops(aid: Wearable, **inputs: Tensor) -> dict[str, Tensor]:
+    """Call ``Wearable.process_hops`` with the inputs of a program, and limit the output."""
+    gain = gain_to_pascals(aid.full_scale_spl)
+    empty = inputs["samples"][:, :0]
+    sliders = inputs.get("sliders", empty)
+    state = {"gliding": empty} | inputs  # An aid without sliders has no such state.
+    samples = inputs["samples"] * gain
+    output, _, next_state = aid.process_hops(samples, inputs["fitted"], sliders, state)
+    output = soft_limit(output, aid.limit_spl)
+    names = [name for name in inputs if name not in STATELESS_INPUTS]
+    return {"output": output / gain} | {f"next_{name}": next_state[name] for name in names}
+
+
+def _to_program(
+    model: nn.Module, function: Callable[..., dict[str, Tensor]], inputs: dict[str, Tensor]
+) -> torch.export.ExportedProgram:
+    """Export a function of a model for inputs of the same names and shapes."""
+    with torch.no_grad(), warnings.catch_warnings():
+        # torch.export warns of the list of weights in nn.LSTM, which does no harm.
+        warnings.filterwarnings("ignore", r"The tensor attributes .*_flat_weights")
+        return torch.export.export(_Call(model, function), (), inputs)
+
+
+def _draw_noise(model: Any, *shape: int) -> Tensor:
+    """Draw noise at 64 dB SPL with which the file of a model is checked."""
+    gain = gain_to_pascals(model.full_scale_spl)
+    return 0.03 / gain * torch.randn(*shape, generator=torch.Generator().manual_seed(0))
 
 
 def _write_onnx(
-    program: torch.export.ExportedProgram,
-    path: str | Path,
-    inputs: dict[str, Tensor],
-    expected: dict[str, Tensor],
+    program: torch.export.ExportedProgram, path: str | Path, inputs: dict[str, Tensor]
 ) -> None:
-    """Write a program, and raise ValueError if onnxruntime computes other outputs than expected."""
+    """Write a program, and raise ValueError if onnxruntime computes other outputs than torch."""
+    for module in ("onnx", "onnxscript", "onnxruntime"):
+        require(module, "dev")
+    with torch.no_grad():
+        expected = program.module()(**inputs)
     with atomic_path(path) as temporary:
         try:
             # The optimiser of onnxscript would turn log(x + 1e-12) into log(x), because it treats

@@ -9,14 +9,15 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.signal import correlate
 from torch import Tensor, nn
 
 MAX_DELAY_SECONDS = 2e-3
@@ -29,10 +30,8 @@ _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 def load_plugin(name: str, kind: str) -> Any:
     """Import a function, a PyTorch module or another object of your own code by its name.
 
-    A class is called without arguments, and the object is returned. Python searches for modules in
-    the working directory first, and a file can import modules beside it. This holds during the
-    import only, so a plug-in should import its modules at the top of the file, not inside
-    functions.
+    A class is called without arguments, and the object is returned. From then on, Python searches
+    for modules in the working directory or, for a file, in its folder first.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -53,12 +52,10 @@ def load_plugin(name: str, kind: str) -> Any:
     source, attribute = parts["source"], parts["attribute"]
     try:
         if source.endswith(".py"):
-            module = _import_file(Path(source))
+            module = _import_file(Path(source).resolve())
         else:
-            with _prepend_to_path(os.getcwd()):
-                # Otherwise Python may not find a module that was written a moment ago.
-                importlib.invalidate_caches()
-                module = importlib.import_module(source)
+            sys.path.insert(0, os.getcwd())
+            module = importlib.import_module(source)
         plugin = getattr(module, attribute)
         return plugin() if isinstance(plugin, type) else plugin
     except Exception as error:  # because code of a plug-in may raise anything
@@ -76,10 +73,8 @@ class WaveformPlugin:
         kind: Noun for the plug-in in error messages: ``"teacher"``, ``"enhancer"`` or ``"aid"``.
 
     Attributes:
-        function: The function or module that was loaded.
-        fingerprint: Attribute ``fingerprint`` of the function as text, which its author changes
-            when its outputs change, so that stored results are computed again. None if there is no
-            such attribute.
+        function: The function or module that was loaded. Its author changes its attribute
+            ``fingerprint`` when its outputs change, so that stored results are computed again.
 
     Raises:
         ValueError: The plug-in cannot be loaded or called.
@@ -97,12 +92,11 @@ class WaveformPlugin:
             raise ValueError(f"expected {kind} {name} to be callable, got type {type_name}")
         if isinstance(self.function, nn.Module):
             self.function.eval()
-        fingerprint = getattr(self.function, "fingerprint", None)
-        self.fingerprint = None if fingerprint is None else str(fingerprint)
         self._number = next(_load_numbers)
 
     def __str__(self) -> str:
-        return self.name if self.fingerprint is None else f"{self.name} ({self.fingerprint})"
+        fingerprint = getattr(self.function, "fingerprint", None)
+        return self.name if fingerprint is None else f"{self.name} ({fingerprint})"
 
     def __reduce__(self) -> Any:
         return _load_copy, (self.name, self.kind, self._number)
@@ -129,11 +123,8 @@ class WaveformPlugin:
         except Exception as error:  # because code of a plug-in may raise anything
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
         is_real = isinstance(output, Tensor) and not output.is_complex()
-        if is_real and self.kind == "aid" and output.ndim == waveform.ndim:
-            has_shape = output.shape[:-1] == waveform.shape[:-1]
-        else:
-            has_shape = is_real and output.shape == waveform.shape
-        if not has_shape:
+        end = -1 if self.kind == "aid" else None  # An aid may change the duration.
+        if not is_real or output.shape[:end] != waveform.shape[:end]:
             kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
             raise ValueError(
                 f"{self.kind} {self.name} returned {kind} of shape "
@@ -158,23 +149,16 @@ class WaveformPlugin:
             ValueError: The call fails, or the output is not time-aligned.
         """
         output = self(waveform, *arguments)
-        points = 2 * waveform.shape[-1]
-        input_spectrum = torch.fft.rfft(_first_channel(waveform), points)
-        output_spectrum = torch.fft.rfft(_first_channel(output), points)
-        correlation = torch.fft.irfft(output_spectrum * input_spectrum.conj(), points)
-        delay = int(correlation.abs().argmax())
-        if delay > points // 2:
-            delay -= points
+        channels = [
+            signal.reshape(-1, signal.shape[-1])[0].numpy() for signal in (output, waveform)
+        ]
+        correlation = np.abs(correlate(*channels, method="fft"))
+        delay = int(correlation.argmax()) - (waveform.shape[-1] - 1)
         if abs(delay) > MAX_DELAY_SECONDS * sample_rate:
             raise ValueError(
                 f"{self.kind} {self.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
                 "an output that is time-aligned with the input; shift the output in your code"
             )
-
-
-def _first_channel(waveform: Tensor) -> Tensor:
-    """Return the first channel in float32. Shape: (..., time) -> (time,)."""
-    return waveform.reshape(-1, waveform.shape[-1])[0].float()
 
 
 _load_numbers = itertools.count()
@@ -189,26 +173,15 @@ def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
 
 def _import_file(path: Path) -> ModuleType:
     """Import a file, which can import modules from its folder."""
+    sys.path.insert(0, str(path.parent))
     spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
     # Dataclasses and pickle look up their module by its name.
     sys.modules[spec.name] = module
-    with _prepend_to_path(str(path.resolve().parent)):
-        spec.loader.exec_module(module)
+    spec.loader.exec_module(module)
     return module
-
-
-@contextmanager
-def _prepend_to_path(folder: str) -> Iterator[None]:
-    """Search for modules in a folder first, and restore the search path afterwards."""
-    original_path = list(sys.path)
-    sys.path.insert(0, folder)
-    try:
-        yield
-    finally:
-        sys.path[:] = original_path
 
 
 def _describe(error: Exception) -> str:

@@ -16,7 +16,7 @@ from compensators import load_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, set_level
-from hlsim.checks import check_number, check_rate
+from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
 from hlsim.files import write_atomically
 from hlsim.losses.frozen_simulator import build_simulator
@@ -163,20 +163,16 @@ def listen(
     *,
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
-    peak_spl: float = 0.0,
     **signals: Tensor | NDArray[Any],
 ) -> Players:
     """Show a player in a notebook that switches between signals at the same position.
 
     All signals have the same gain, so that what is soft for the ear is soft here, and the volume
-    starts low. The spectrograms need the extra ``eval``; without it there are only sounds.
+    starts low. The player needs the extra ``eval``.
 
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
-        peak_spl: Peak level in dB SPL for which the gain leaves room, even if all signals are
-            softer. Players with the same value have the same gain, unless a signal has a higher
-            peak.
         signals: Signals by the label to show, ``(time,)``, or ``(2, time)`` in stereo.
 
     Returns:
@@ -189,13 +185,11 @@ def listen(
     Example:
         >>> import hlsim
         >>> speech = hlsim.example_speech()
-        >>> players = hlsim.listen(original=speech, unaided=hlsim.simulate(speech, "N4"))
-        >>> players.labels
-        ['original', 'unaided']
+        >>> hlsim.listen(original=speech, louder=10.0 * speech)
+        Players(original 65 dB SPL, louder 85 dB SPL)
     """
     if not signals:
         raise ValueError("no signal to play; pass signals by name, as in listen(original=speech)")
-    check_number("peak_spl", peak_spl, 0.0, 200.0)
     gain = gain_to_pascals(full_scale_spl)
     pascals = {}
     for label, signal in signals.items():
@@ -206,7 +200,7 @@ def listen(
                 "pass one item, such as x[0]"
             )
         pascals[label.replace("_", " ")] = tensor * gain
-    return Players(pascals, check_rate(sample_rate), peak_spl)
+    return Players(pascals, check_rate(sample_rate))
 
 
 class Players:
@@ -215,22 +209,15 @@ class Players:
     Args:
         signals: Signals in pascals by their labels, ``(time,)`` or ``(2, time)``.
         sample_rate: Sample rate in Hz of all signals.
-        peak_spl: Peak level in dB SPL for which the gain leaves room, see ``listen``.
 
     >>> Players({"original": example_speech()}, 16000)
     Players(original 65 dB SPL)
     """
 
-    def __init__(self, signals: dict[str, Tensor], sample_rate: int, peak_spl: float = 0.0) -> None:
+    def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:
         from hlsim.report.players import make_player
 
-        lowest_peak = gain_to_pascals(peak_spl)
-        self._player = make_player({"": signals}, sample_rate, lowest_peak=lowest_peak)
-
-    @property
-    def labels(self) -> list[str]:
-        """Labels of the signals, in the order in which they were passed."""
-        return [sound.label for sound in self._player.sounds]
+        self._player = make_player({"": signals}, sample_rate)
 
     def _repr_html_(self) -> str:
         return self._player.html()
@@ -251,7 +238,7 @@ class Players:
         """
         from hlsim.report.page import Page, Section
 
-        title = ", ".join(self.labels).capitalize()
+        title = ", ".join(sound.label for sound in self._player.sounds).capitalize()
         page = Page(title, "", [Section("Listen", player=self._player)])
         write_atomically(Path(path), page.html())
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from compensators import WDRC, HearingAid
+from compensators import WDRC
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.export import (
     export_aid,
@@ -65,27 +65,15 @@ def open_onnx(path: Path) -> tuple[Call, dict[str, list[int]]]:
 
 @pytest.mark.parametrize(
     ("name", "items", "samples"),
-    [("neuro-msbg", 2, 8000), ("neuro-msbg", 1, 17600), ("neuro-msbg-mamba", 2, 4000)],
+    [("neuro-msbg", 1, 17600), ("neuro-msbg-mamba", 2, 4000)],
 )
 def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: int) -> None:
     simulator = load_pretrained(name, full_scale_spl=100.0)
     # exported before the first call of this length, so that the export computes all constants
     program = export_program(simulator, seconds=samples / 16000, items=items).module()
-    inputs = 0.03 * torch.randn(items, samples), EARS[:items]
-    assert_close(program(*inputs), simulator(*inputs), 1e-4)
-
-
-def test_an_export_leaves_mode_and_precision_as_they_are() -> None:
-    simulator = NeuroMSBG(SMALL).double().train()
-    simulator.encoder.eval()
-    before = [module.training for module in simulator.modules()]
-    program = export_program(simulator, seconds=0.1, items=2).module()
-    assert [module.training for module in simulator.modules()] == before
-    inputs = 0.03 * torch.randn(2, 1600).double(), EARS.double()
-    torch.testing.assert_close(program(*inputs), simulator(*inputs))
-    aid = HearingAid().train()
-    hop_program(aid)
-    assert all(module.training for module in aid.modules())
+    waveform, ears = 0.03 * torch.randn(items, samples), EARS[:items]
+    perceived = program(waveform=waveform, thresholds=ears)["perceived"]
+    assert_close(perceived, simulator(waveform, ears), 1e-4)
 
 
 @wearables
@@ -102,14 +90,13 @@ def test_a_program_of_hops_gives_the_outputs_of_the_stream(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.0)])
-def test_onnx_gives_the_simulators_outputs(tmp_path: Path, items: int, seconds: float) -> None:
+def test_onnx_gives_the_simulators_outputs(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     simulator, path = load_pretrained("neuro-msbg"), tmp_path / "simulator.onnx"
-    export_onnx(simulator, path, seconds=seconds, items=items)
-    wave = 0.03 * torch.randn(items, round(16000 * seconds))
-    results = open_onnx(path)[0]({"waveform": wave, "thresholds": EARS[:items]})
-    assert_close(results["perceived"], simulator(wave, EARS[:items]), 1e-4)
+    export_onnx(simulator, path, seconds=0.5, items=2)
+    wave = 0.03 * torch.randn(2, 8000)
+    results = open_onnx(path)[0]({"waveform": wave, "thresholds": EARS})
+    assert_close(results["perceived"], simulator(wave, EARS), 1e-4)
 
 
 @pytest.mark.slow
@@ -161,11 +148,7 @@ def test_a_file_with_other_outputs_is_not_written(
 BAD_CALLS: list[Callable[[], object]] = [
     lambda: export_program(MSBG()),
     lambda: export_program(load_pretrained("neuro-msbg", sample_rate=44100)),
-    lambda: export_program(NeuroMSBG(SMALL), seconds=0.0),
-    lambda: export_program(NeuroMSBG(SMALL), seconds=float("nan")),
-    lambda: export_program(NeuroMSBG(SMALL), items=0),
     lambda: hop_program(varied_hearing_aid(sample_rate=44100)),
-    lambda: first_inputs(varied_hearing_aid(), EAR, volume=1.0),
 ]
 
 

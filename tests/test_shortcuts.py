@@ -53,7 +53,7 @@ def test_one_gain_calibrates_all_channels_of_a_file(tmp_path) -> None:
 def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
     pytest.importorskip("matplotlib")
     players = hlsim.listen(original=SPEECH, soft_copy=0.1 * SPEECH.numpy())
-    assert players.labels == ["original", "soft copy"]
+    assert repr(players).startswith("Players(original ") and ", soft copy " in repr(players)
     players.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert page.count("<audio controls") == page.count("<img") == 2
@@ -72,7 +72,6 @@ def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
         lambda: hlsim.load_audio("missing.wav"),
         lambda: hlsim.listen(),
         lambda: hlsim.listen(original=SPEECH, sample_rate="16000"),
-        lambda: hlsim.listen(original=SPEECH, peak_spl=math.nan),
         lambda: hlsim.listen(batch=torch.stack([SPEECH, SPEECH, SPEECH])),
     ],
 )
@@ -112,13 +111,6 @@ def test_samples_that_are_not_finite_are_rejected(process: Any, value: float) ->
     speech[100] = value
     with pytest.raises(ValueError, match="1 of 8000"):
         process(speech, "N3")
-
-
-def test_players_of_soft_and_loud_signals_can_have_one_gain() -> None:
-    soft, loud = (hlsim.listen(signal=gain * SPEECH, peak_spl=100.0)._player for gain in (0.1, 1.0))
-    assert soft.full_scale == loud.full_scale == pytest.approx(100.0 - 20 * math.log10(0.9))
-    difference = loud.sounds[0].loudness - soft.sounds[0].loudness
-    assert difference == pytest.approx(20.0, abs=0.01)
 
 
 def test_a_stereo_file_can_be_played_beside_a_mono_one(tmp_path) -> None:

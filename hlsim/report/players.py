@@ -115,12 +115,7 @@ def _item_section(
     return Section(title, [about], player=make_player({"": signals}, item.sample_rate))
 
 
-def make_player(
-    groups: Mapping[str, Mapping[str, Tensor]],
-    sample_rate: int,
-    *,
-    lowest_peak: float = 0.0,
-) -> Player:
+def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) -> Player:
     """Return a player that switches between sounds, with their spectrograms.
 
     All sounds of a group have one gain, so that their loudness can be compared. Groups may have
@@ -130,7 +125,6 @@ def make_player(
         groups: For each group, under its heading, which may be empty, the signals in pascals, each
             under the label of its button. Shape of each signal: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
-        lowest_peak: Peak in pascals for which the gain leaves room, even if all signals are softer.
 
     Raises:
         ValueError: All signals of a group are silent.
@@ -141,10 +135,10 @@ def make_player(
     >>> [f"{sound.label} {sound.level:.0f} dB SPL" for sound in player.sounds]
     ['tone 91 dB SPL', 'soft tone 71 dB SPL']
     """
-    first_peak = max(_peak(next(iter(groups.values()))), lowest_peak)
+    first_peak = _peak(next(iter(groups.values())))
     sounds = {}
     for heading, group in groups.items():
-        peak = max(_peak(group), lowest_peak)
+        peak = _peak(group)
         softer = 20.0 * math.log10(peak / first_peak)
         title = heading + (
             f", played {softer:.0f} dB softer than the first row" if softer > 0.5 else ""

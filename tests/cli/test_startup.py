@@ -37,7 +37,7 @@ except AttributeError as error:
 
 MODELS = """
 import sys, torch
-slow = {"sympy", "scipy.signal", "scipy.stats", "torch._dynamo"} - set(sys.modules)
+slow = {"sympy", "torch._dynamo"} - set(sys.modules)
 import compensators, hlsim
 for name in hlsim.__all__:
     getattr(hlsim, name)
