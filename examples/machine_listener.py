@@ -56,9 +56,9 @@ from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aids import AtLevelOf, Unaided
-from hlsim.evaluation.store import ScoreStore, content_hash
+from hlsim.evaluation.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
-from hlsim.files import read_table
+from hlsim.files import read_table, sha256
 from hlsim.plugins import load_plugin
 from hlsim.training.augment import mix
 from hlsim.training.clips import Clips
@@ -172,7 +172,7 @@ class Whisper:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self.fingerprint = content_hash(self.folder / "model.bin")
+        self.fingerprint = sha256(self.folder / "model.bin")
 
     def __reduce__(self) -> Any:
         return Whisper, (self.folder,)

@@ -120,8 +120,8 @@ def haspi_report(parser: Parser) -> None:
     text = "folder to which the manifest's paths are relative; by default the manifest's folder"
     option("--root", input_path, text)
     parser.audiogram(text="; the ear of all files, or of rows of the manifest without an ear")
-    text = "; also with a column file (for folders) or columns listener and ear (for a manifest)"
-    option("--audiograms", str, EARS_TABLE + text)
+    text = "file of the ears of a manifest's listeners, with columns listener, ear, hl_250, ..."
+    option("--audiograms", input_path, text)
     text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
     option("--measures", lambda names: names.split(","), text, ["haspi"])
     option("--baseline", str, "condition to compare all others with; by default all pairs")

@@ -18,8 +18,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.parallel import describe_error, one_thread
+from hlsim.evaluation.study import cut_output
 from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
-from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
@@ -84,8 +84,8 @@ def measure_aids(
     for (ear_name, ear), (name, aid) in product(ears.items(), aids.items()):
         try:
             values = measure(aid, ear, *arguments)
-        except ValueError as error:
-            raise ValueError(f"{name}, ear {ear_name}: {error}") from error
+        except Exception as error:  # The aid may be code of a user.
+            raise ValueError(f"{name}, ear {ear_name}: {describe_error(error)}") from error
         results.append({"aid": name, "ear": ear_name, **values})
     return results
 
@@ -107,9 +107,6 @@ def measure_gain_curve(
     Returns:
         ``gain_db``, gains in dB of shape (levels, 24), and its axes ``levels`` (dB SPL) and
         ``frequencies`` (centres of 24 bands of equal width on the ERB scale, in Hz).
-
-    Raises:
-        ValueError: The aid fails, or its output is not a waveform.
 
     >>> curve = measure_gain_curve(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
     >>> round(curve["gain_db"][0][0])
@@ -198,9 +195,6 @@ def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> d
         output at more than 20 Hz from the tone relative to that near it; both have the shape
         (levels, frequencies). ``levels`` (dB SPL) and ``frequencies`` (Hz) are the axes.
 
-    Raises:
-        ValueError: The aid fails.
-
     >>> measure_steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
     0.0
     """
@@ -225,9 +219,6 @@ def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, A
         ``look_ahead_ms``, by how many ms an output changes before its input; ``quiet_gain_db``, the
         gains in dB for white noise at 25 and at 40 dB SPL (``QUIET_LEVELS``); and ``cpu_ms``, the
         processor time in ms for one second of sound on one thread.
-
-    Raises:
-        ValueError: The aid fails.
 
     >>> measure_wearability(lambda x, _: x, NORMAL, torch.randn(48000))["look_ahead_ms"]
     0.0
@@ -293,6 +284,7 @@ def measure_look_ahead(
     return largest
 
 
+@torch.no_grad()
 def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
     """Return the outputs of an aid for several signals, which are processed one at a time.
 
@@ -302,29 +294,9 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
         ear: The audiogram.
 
     Returns: Outputs, cut to the length of the signals. Shape: (signals, time).
-
-    Raises:
-        ValueError: The aid fails, or its output is not a finite tensor of the input's shape.
     """
-    results: list[Tensor] = []
-    for signal in signals:
-        try:
-            with torch.no_grad():
-                output = aid(signal, ear)
-        except Exception as error:  # The aid may be code of a user.
-            raise ValueError(describe_error(error)) from error
-        is_waveform = isinstance(output, Tensor) and output.ndim == 1
-        if not (is_waveform and output.isfinite().all()):
-            kind = getattr(output, "shape", type(output).__name__)
-            problem = "NaN or infinite samples" if is_waveform else kind
-            raise ValueError(
-                f"expected a finite output of shape {tuple(signal.shape)} from the aid, got "
-                f"{problem}"
-            )
-        lengths = len(signal), len(output)
-        samples = common_length(lengths, NEURO_RATE, ("the input", "the output"))
-        results.append(output[:samples])
-    return torch.stack(results)
+    outputs = [cut_output(aid(signal, ear), signal, NEURO_RATE) for signal in signals]
+    return torch.stack(outputs)
 
 
 def _band_powers(signal: Tensor) -> Tensor:

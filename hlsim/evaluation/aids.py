@@ -186,7 +186,6 @@ class Enhanced(nn.Module):
         super().__init__()
         self.enhancer, self.aid, self.sample_rate = enhancer, aid, sample_rate
         self.gain = gain_to_pascals(full_scale_spl)
-        self.limit_spl = output_limit_spl(aid)
 
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
         """Enhance the waveform, and return the aid's output for the result, (..., time)."""
@@ -226,16 +225,3 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
             )
         enhancers[label] = enhancer
     return enhancers
-
-
-def output_limit_spl(aid: Any) -> float | None:
-    """Return the peak in dB SPL that a hearing aid promises not to exceed, or None.
-
-    The peak is the attribute ``limit_spl`` of the aid's ``config`` if it has one, or else of the
-    aid.
-
-    >>> output_limit_spl(Unaided()) is None
-    True
-    """
-    limit: float | None = getattr(getattr(aid, "config", aid), "limit_spl", None)
-    return limit

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -22,19 +22,16 @@ from torch import Tensor, nn
 
 from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
-from hlsim.audiogram.listener import EARS, Listener
+from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
-from hlsim.calibration import set_level
+from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
-from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.parallel import describe_error, one_thread, run_parallel
 from hlsim.evaluation.recordings import Recording, score_recordings
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.store import content_hash
-from hlsim.evaluation.study import DEAD_PROCESS, Condition
-from hlsim.files import write_atomically
+from hlsim.evaluation.study import Condition, cut_output
 from hlsim.metrics.pair import common_length
 
 FULL_SCALE_SPL = 100.0
@@ -52,9 +49,6 @@ _MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
 _REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
 """Ends of the names of references. The last one already has the target's level in the room."""
 
-_IN_ROOM_ENDING = "_target_CH1.wav"
-"""End of the names of files with the target in the room."""
-
 _CHANGES = 8
 """Number of positions at which the scene becomes another sound, to measure the look-ahead."""
 
@@ -62,39 +56,22 @@ _LOOK_AHEAD_SECONDS = 4.0
 """Length of the part of a scene on which the look-ahead is measured."""
 
 
-class _Scene(NamedTuple):
-    """Files of a scene.
-
-    Attributes:
-        mix: File with the signals of the front microphones.
-        reference: File with the target without its room.
-        in_room: File with the target in the room, whose level the reference gets; None if the
-            reference has this level.
-    """
-
-    mix: Path
-    reference: Path
-    in_room: Path | None
-
-
 class _Pair(NamedTuple):
     """A scene for a listener.
 
     Attributes:
+        mix: File with the signals of the front microphones.
+        reference: File with the target without its room.
         scene: Name of the scene.
-        files: Files of the scene.
         name: Name of the listener.
         listener: Both ears of the listener.
     """
 
+    mix: Path
+    reference: Path
     scene: str
-    files: _Scene
     name: str
     listener: Listener
-
-    def output_file(self, folder: Path) -> Path:
-        """Return the path of the aid's output in ``folder``, which holds those of one condition."""
-        return folder / f"{self.scene}_{self.name}_HA-output.wav"
 
 
 def evaluate_scenes(
@@ -116,7 +93,7 @@ def evaluate_scenes(
 
     The outputs are written to ``out/signals/CONDITION/SCENE_LISTENER_HA-output.wav`` (the
     challenges' names), the references to ``out/reference``, and the scores to
-    ``out/scores.jsonl``. An interrupted run can be continued. The score of a scene is that of the
+    ``out/scores.jsonl``, from which a repeated run reads them. The score of a scene is that of the
     better ear. The comparison of each aid with NAL-R by HASPI is planned, so that its p values
     are not adjusted for the number of comparisons.
 
@@ -154,121 +131,75 @@ def evaluate_scenes(
     """
     names = ["haspi", "hasqi", *measures]
     find_measures(names)
-    files_by_scene, folder = _read_scenes(Path(scenes)), Path(out)
-    pairs = _read_pairs(files_by_scene, listeners, scenes_listeners, stride)
-    first = pairs[0]
-    rate = read_audio(first.files.mix)[1]
-    conditions = _make_conditions(aids, enhancers, linked, rate, full_scale_spl)
-    folders = _signal_folders(conditions, folder / "signals")
-    look_ahead_ms = _measure_look_ahead(conditions, first)
-    _remove_outdated(conditions, folders, files_by_scene.values())
-    write = partial(_write_signals, rate=rate, conditions=conditions, folders=folders, out=folder)
+    pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)[::stride]
+    rate = read_audio(pairs[0].mix)[1]
+    levels = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
+    conditions = _make_conditions(aids, enhancers, linked, **levels)
+    look_ahead_ms = {c.name: _measure_look_ahead(c, pairs[0], rate) for c in conditions}
+    settings = {"full_scale_spl": full_scale_spl, "seed": seed}
+    write = partial(_write_signals, Path(out), conditions, rate, settings)
     parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
     recordings = []
-    for pair, written in run_parallel(write, pairs, **parallel):
-        problems = dict.fromkeys(folders, DEAD_PROCESS) if written is None else written
-        files = {name: pair.output_file(signals) for name, signals in folders.items()}
-        for ear in EARS:
-            recording = Recording(
-                pair.scene,
-                _reference_file(folder, pair.scene),
-                {name: path for name, path in files.items() if name not in problems},
-                getattr(pair.listener, ear),
-                listener=pair.name,
-                ear=ear,
-                full_scale_spl=full_scale_spl,
-                seed=seed,
-                problems=problems,
-            )
-            recordings.append(recording)
+    for _, ears in run_parallel(write, pairs, **parallel):
+        recordings += ears
     evaluation = score_recordings(
         recordings,
         [replace(condition, process=None) for condition in conditions],
         names,
         better_ear=True,
         planned=[("haspi", NAL_R, c.name) for c in conditions if c.kind == "aid"],
-        store=folder / "scores.jsonl",
+        store=Path(out) / "scores.jsonl",
         **running,
     )
     return replace(evaluation, details={"look_ahead_ms": look_ahead_ms})
 
 
-def _read_scenes(folder: Path) -> dict[str, _Scene]:
-    """Return the scenes of a folder, each under its name.
-
-    Raises:
-        ValueError: There is no scene, or a scene lacks its reference.
-    """
-    scenes = {}
-    for ending in _MIX_ENDINGS:
-        for mix in folder.glob(f"*{ending}"):
-            name = mix.name.removesuffix(ending)
-            candidates = [folder / f"{name}{end}" for end in _REFERENCE_ENDINGS]
-            reference = next(filter(Path.is_file, candidates), None)
-            if reference is None:
-                expected = " or ".join(path.name for path in candidates)
-                raise ValueError(f"{mix} has no reference; put {expected} beside it")
-            in_room = folder / f"{name}{_IN_ROOM_ENDING}"
-            has_level = reference == candidates[-1] or not in_room.is_file()
-            scenes[name] = _Scene(mix, reference, None if has_level else in_room)
-    if not scenes:
-        raise ValueError(
-            f"{folder}: expected a folder with files that end with {' or '.join(_MIX_ENDINGS)}"
-        )
-    return dict(sorted(scenes.items()))
-
-
 def _read_pairs(
-    scenes: Mapping[str, _Scene],
-    listeners: str | Path,
-    scenes_listeners: str | Path | None,
-    stride: int,
+    folder: Path, listeners: str | Path, scenes_listeners: str | Path | None
 ) -> list[_Pair]:
-    """Return every n-th pair of scene and listener, see ``evaluate_scenes``.
+    """Return all pairs of scene and listener, see ``evaluate_scenes``.
 
     Raises:
-        ValueError: A file is broken or names an unknown scene or listener, or a listener who is
-            used lacks an ear or has a name that no file can have.
+        ValueError: There is no scene, a scene lacks its reference, a file is broken or names an
+            unknown scene or listener, or a listener who is used lacks an ear.
     """
-    if stride < 1:
-        raise ValueError(f"expected a stride (--every) of 1 or more, got {stride}; change it")
+    mixes = {
+        mix.name.removesuffix(ending): mix
+        for ending in _MIX_ENDINGS
+        for mix in folder.glob(f"*{ending}")
+    }
     if scenes_listeners is None:
         people = read_listeners(listeners)
-        names = list(product(scenes, people))[::stride]
+        names = list(product(sorted(mixes), people))
     else:
-        names = _read_names(Path(scenes_listeners))[::stride]
+        names = _read_names(Path(scenes_listeners))
         people = read_listeners(listeners, {name for _, name in names})
+    pairs = []
     for scene, name in names:
-        if scene not in scenes:
-            raise ValueError(
-                f"{scenes_listeners}: there are no files of scene {scene!r}; correct its name, or "
-                "add its files to the folder of the scenes"
-            )
-        for ear in EARS:
-            if getattr(people[name], ear) is None:
-                raise ValueError(
-                    f"{listeners}: listener {name!r} has no {ear} ear; add its audiogram, or leave "
-                    "the listener out"
-                )
-        if Path(name).name != name:
-            raise ValueError(
-                f"{listeners}: expected a name that a file can have, got listener {name!r}; "
-                "rename the listener"
-            )
-    if not names:
+        if scene not in mixes:
+            raise ValueError(f"{scenes_listeners}: {folder} has no scene {scene!r}; correct one")
+        if len(people[name].ears()) < 2:
+            raise ValueError(f"{listeners}: listener {name!r} lacks an ear; add its audiogram")
+        candidates = [folder / f"{scene}{ending}" for ending in _REFERENCE_ENDINGS]
+        reference = next(filter(Path.is_file, candidates), None)
+        if reference is None:
+            expected = " or ".join(path.name for path in candidates)
+            raise ValueError(f"{mixes[scene]} has no reference; put {expected} beside it")
+        pairs.append(_Pair(mixes[scene], reference, scene, name, people[name]))
+    if not pairs:
         raise ValueError(
-            f"{scenes_listeners or listeners}: no scene has a listener; add one to the file"
+            f"{folder}, {scenes_listeners or listeners}: no scene has a listener; expected files "
+            f"that end with {' or '.join(_MIX_ENDINGS)}, and a listener for them"
         )
-    return [_Pair(scene, scenes[scene], name, people[name]) for scene, name in names]
+    return pairs
 
 
 def _read_names(path: Path) -> list[tuple[str, str]]:
     """Return the names of scenes and listeners in ``scenes_listeners.json``."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        names = [(scene, name) for scene, listeners in entries.items() for name in listeners]
-        return list(dict.fromkeys(names))
-    except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        return [(scene, name) for scene, listeners in entries.items() for name in listeners]
+    except (OSError, ValueError, AttributeError, TypeError) as error:
         raise ValueError(
             f"{path}: cannot be read ({error}); expected an object with a list of listeners for "
             "each scene"
@@ -276,20 +207,26 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
 
 
 def _make_conditions(
-    aids: Mapping[str, str],
-    enhancers: Sequence[str],
-    linked: bool,
-    rate: int,
-    full_scale_spl: float,
+    aids: Mapping[str, str], enhancers: Sequence[str], linked: bool, **levels: Any
 ) -> list[Condition]:
-    """Return no aid, NAL-R and all aids, each of them also after every enhancer."""
-    levels: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
+    """Return no aid, NAL-R and all aids, each of them also after every enhancer.
+
+    Args:
+        aids: Aids by their label, see ``evaluate_scenes``.
+        enhancers: Names of functions that reduce noise.
+        linked: Whether one level sets the gains of both ears.
+        levels: Arguments ``sample_rate`` and ``full_scale_spl`` of aids.
+
+    Raises:
+        ValueError: An aid cannot be loaded, or the signals of two conditions would have the same
+            folder.
+    """
     loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
     for label, name in aids.items():
         if label in (UNAIDED, NAL_R):
             raise ValueError(f"{label} is always evaluated; give the aid another label")
         if ":" in name and not Path(name).exists():
-            loaded[label] = PluginAid(name, rate)
+            loaded[label] = PluginAid(name, levels["sample_rate"])
         else:
             loaded[label] = load_compensator(name, **levels, linked=linked)
     plugins = load_enhancers(enhancers)
@@ -300,116 +237,78 @@ def _make_conditions(
             conditions.append(Condition(f"{prefix} + {label}", process, "enhanced", label))
         kind = "prescription" if label == NAL_R else "aid"
         conditions.append(Condition(label, aid, kind))
+    folders = [_folder_name(condition) for condition in conditions]
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise ValueError(f"two labels would have the same folder, {folder}; rename one of them")
     return conditions
 
 
-def _signal_folders(conditions: Sequence[Condition], root: Path) -> dict[str, Path]:
-    """Return the folder of each condition's signals.
-
-    Raises:
-        ValueError: Two conditions would have the same folder, or one no folder.
-    """
-    labels: dict[str, str] = {}
-    for condition in conditions:
-        name = re.sub(r"[^\w.+-]+", "-", condition.name).strip(".-")
-        if not name:
-            raise ValueError(
-                f"expected a letter or a digit in the label {condition.name!r}, because it names a "
-                "folder; rename it"
-            )
-        if name in labels:
-            raise ValueError(
-                f"the labels {labels[name]!r} and {condition.name!r} would have the same folder, "
-                f"{root / name}; rename one of them"
-            )
-        labels[name] = condition.name
-    return {label: root / name for name, label in labels.items()}
+def _folder_name(condition: Condition) -> str:
+    """Return the name of the folder for the signals of a condition."""
+    return re.sub(r"[^\w.+-]+", "-", condition.name)
 
 
 @torch.no_grad()
-def _measure_look_ahead(conditions: Sequence[Condition], pair: _Pair) -> dict[str, float | None]:
+def _measure_look_ahead(condition: Condition, pair: _Pair, rate: int) -> float | None:
     """Measure the look-ahead in ms on the beginning of a scene, or None for an aid that fails."""
-    scene, rate = read_audio(pair.files.mix)
-    scene = scene[:, : int(_LOOK_AHEAD_SECONDS * rate)]
-    generator = torch.Generator().manual_seed(0)
-    other = set_level(torch.randn(scene.shape, generator=generator), 65.0)
-    if scene.any():
-        other *= scene.square().mean().sqrt() / other.square().mean().sqrt()
-    else:
-        scene = set_level(torch.randn(scene.shape, generator=generator), 65.0)
+    assert condition.process is not None
+    scene = _read_channels(pair.mix, rate)[:, : int(_LOOK_AHEAD_SECONDS * rate)]
+    noise = torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
+    other = set_level(noise, level_spl(scene.flatten()))
     time = scene.shape[-1]
     positions = range(time // 4, time, max(1, time // (_CHANGES + 3)))[:_CHANGES]
-    look_ahead_ms: dict[str, float | None] = {}
-    for condition in conditions:
-        assert condition.process is not None
-        try:
-            process = condition.process
-            samples = measure_look_ahead(process, pair.listener, scene, other, positions)
-            look_ahead_ms[condition.name] = 1000.0 * samples / rate
-        except ValueError:
-            look_ahead_ms[condition.name] = None
-    return look_ahead_ms
-
-
-def _reference_file(out: Path, scene: str) -> Path:
-    return out / "reference" / f"{scene}.wav"
-
-
-def _remove_outdated(
-    conditions: Sequence[Condition], folders: Mapping[str, Path], scenes: Iterable[_Scene]
-) -> None:
-    """Remove the signals of a condition whose processing or scenes have changed.
-
-    Args:
-        conditions: Conditions.
-        folders: Folder of the signals, by condition, where a file contains their fingerprint.
-        scenes: All scenes.
-    """
-    mixes = [content_hash(scene.mix) for scene in scenes]
-    for condition in conditions:
-        folder = folders[condition.name]
-        note, state = folder / "fingerprint.txt", value_hash([condition.fingerprint, mixes])
-        is_known = condition.fingerprint is not None and note.is_file()
-        if not is_known or note.read_text() != state:
-            for path in folder.glob("*_HA-output.wav"):
-                path.unlink()
-            write_atomically(note, state)
+    try:
+        samples = measure_look_ahead(condition.process, pair.listener, scene, other, positions)
+    except ValueError:
+        return None
+    return 1000.0 * samples / rate
 
 
 @one_thread()
 @torch.no_grad()
 def _write_signals(
-    pair: _Pair,
-    rate: int,
-    conditions: Sequence[Condition],
-    folders: Mapping[str, Path],
     out: Path,
-) -> dict[str, str]:
-    """Write the reference and the missing outputs of a scene for a listener.
+    conditions: Sequence[Condition],
+    rate: int,
+    settings: Mapping[str, Any],
+    pair: _Pair,
+) -> list[Recording]:
+    """Write the reference and the outputs of a scene for a listener.
 
-    Returns:
-        For each condition without an output, the reason.
+    Args:
+        out: Folder of the results.
+        conditions: Conditions with their aids.
+        rate: Sample rate in Hz.
+        settings: Further arguments of the recordings.
+        pair: The scene and the listener.
+
+    Returns: One recording per ear.
+
+    Raises:
+        ValueError: A file of the scene is broken, or has another rate or length.
     """
-    problems: dict[str, str] = {}
-    try:
-        mix, reference = _read_scene(pair.files, rate)
-        write_audio(_reference_file(out, pair.scene), reference, rate)
-    except ValueError as error:
-        return dict.fromkeys(folders, str(error))
+    mix, reference = _read_scene(pair, rate)
+    reference_file = out / "reference" / f"{pair.scene}.wav"
+    write_audio(reference_file, reference, rate)
+    outputs: dict[str, Path | ValueError] = {}
     for condition in conditions:
-        path = pair.output_file(folders[condition.name])
+        assert condition.process is not None
+        folder = out / "signals" / _folder_name(condition)
+        path = folder / f"{pair.scene}_{pair.name}_HA-output.wav"
         try:
-            if not path.is_file() and condition.process is not None:
-                output = condition.process(mix, pair.listener)
-                lengths = mix.shape[-1], output.shape[-1]
-                samples = common_length(lengths, rate, ("the input", "the output"))
-                write_audio(path, output[:, :samples], rate)
+            output = condition.process(mix, pair.listener)
+            write_audio(path, cut_output(output, mix, rate), rate)
+            outputs[condition.name] = path
         except Exception as error:  # A failure must not end the study.
-            problems[condition.name] = describe_error(error)
-    return problems
+            outputs[condition.name] = ValueError(describe_error(error))
+    return [
+        Recording(pair.scene, reference_file, outputs, ear, pair.name, side, **settings)
+        for side, ear in pair.listener.ears().items()
+    ]
 
 
-def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:
+def _read_scene(pair: _Pair, rate: int) -> tuple[Tensor, Tensor]:
     """Read the microphones' signals, and the reference at the level of the target in the room.
 
     Returns: Both signals, for the left and the right ear. Shape: (2, time) each.
@@ -417,38 +316,27 @@ def _read_scene(scene: _Scene, rate: int) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: A file is broken, or has another rate or length.
     """
-    mix = _read_channels(scene.mix, rate, [2])
-    reference = _read_channels(scene.reference, rate)
-    if scene.in_room is None:
-        return mix, reference.expand(2, -1)
-    in_room = _read_channels(scene.in_room, rate)
-    names = str(scene.reference), str(scene.in_room)
+    mix, reference = _read_channels(pair.mix, rate), _read_channels(pair.reference, rate)
+    in_room_file = pair.mix.with_name(f"{pair.scene}_target_CH1.wav")
+    if pair.reference.name.endswith(_REFERENCE_ENDINGS[-1]) or not in_room_file.is_file():
+        return mix, reference
+    in_room = _read_channels(in_room_file, rate)
+    names = str(pair.reference), str(in_room_file)
     samples = common_length((reference.shape[-1], in_room.shape[-1]), rate, names)
-    reference = reference[:, :samples].expand(2, -1)
-    power, wanted = (
-        signal[:, :samples].double().square().mean(-1, keepdim=True)
-        for signal in (reference, in_room)
-    )
-    for ear, is_sounding in zip(EARS, power.any(-1).tolist(), strict=True):
-        if not is_sounding:
-            raise ValueError(
-                f"{scene.reference}: the {ear} channel is silent, so it cannot get the level of "
-                f"{scene.in_room}; write the target to it"
-            )
-    return mix, reference * (wanted / power).sqrt()
+    reference, in_room = reference[:, :samples].double(), in_room[:, :samples].double()
+    return mix, set_level(reference, level_spl(in_room))
 
 
-def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:
-    """Read a file with one of some numbers of channels. Shape: (channels, time)."""
+def _read_channels(path: Path, rate: int) -> Tensor:
+    """Read the channels for the left and the right ear; one channel is for both. Shape: (2, time).
+
+    Raises:
+        ValueError: The file has another sample rate or more channels.
+    """
     waveform, file_rate = read_audio(path)
-    if file_rate != rate:
+    if file_rate != rate or len(waveform) > 2:
         raise ValueError(
-            f"{path}: expected the sample rate of the first scene, {rate} Hz, got {file_rate} Hz; "
-            "resample the file"
+            f"{path}: expected one or two channels at the rate of the first scene, {rate} Hz, got "
+            f"{len(waveform)} at {file_rate} Hz; replace the file"
         )
-    if len(waveform) not in numbers:
-        raise ValueError(
-            f"{path}: expected {' or '.join(map(str, numbers))} channels, for a left and a right "
-            f"ear, got {len(waveform)}; replace the file"
-        )
-    return waveform
+    return waveform.expand(2, -1)

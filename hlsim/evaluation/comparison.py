@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.measures import MEASURES, column_title
+from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.statistics import PairedComparison, holm, paired_comparison
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class Comparison:
         before, after: Names of the two conditions. A change is the score of the second minus that
             of the first.
         overall: Statistics over all items, with p values that are not adjusted.
-        level_before_mean, level_after_mean: Mean output levels of the same items in dB SPL; NaN if
-            they are not known.
+        level_change: Change of the mean output level of the same items in dB; NaN if levels are
+            not known.
         by_severity: The same statistics for the items of each degree of hearing loss that occurs,
             under its name, such as ``"mild"``.
         unit: Column of the table that several items share, such as ``"listener"``.
@@ -61,8 +61,7 @@ class Comparison:
     before: str
     after: str
     overall: PairedComparison
-    level_before_mean: float
-    level_after_mean: float
+    level_change: float
     by_severity: Mapping[str, PairedComparison]
     unit: str
     unit_means: PairedComparison | None
@@ -76,16 +75,6 @@ class Comparison:
     def title(self) -> str:
         """Name of the measure in tables."""
         return column_title(self.measure)
-
-    @property
-    def level_change(self) -> float:
-        """Change of the mean output level in dB; NaN if levels are not known."""
-        return self.level_after_mean - self.level_before_mean
-
-    @property
-    def equal_level(self) -> bool:
-        """Whether the mean output levels differ by less than 1 dB, too little to matter."""
-        return abs(self.level_change) < _LEVEL_TOLERANCE_DB
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes, and ``verdict`` and ``limits`` as text, for ``report.json``."""
@@ -105,7 +94,7 @@ class Comparison:
         significant = self._significant_tests()
         if not any(significant):
             verb = "cannot be distinguished from"
-        elif self.equal_level:
+        elif abs(self.level_change) < _LEVEL_TOLERANCE_DB:
             verb = "is" if all(significant) else "may be"
             verb += " better than" if rises else " worse than"
         else:
@@ -123,7 +112,14 @@ class Comparison:
 
     def limits(self) -> str:
         """Return sentences on output levels, dependent items and other limits of the verdict."""
-        sentences = [self._describe_level(), self._describe_units()]
+        sentences = []
+        change, delta = self.level_change, self.overall.delta
+        if not math.isnan(change):
+            sentences.append(f"The mean level changed by {change:+.1f} dB.")
+        may_be_gain = change * delta > 0 and abs(change) >= _LEVEL_TOLERANCE_DB
+        if self.measure == "haspi" and may_be_gain and any(self._significant_tests()):
+            sentences.append("HASPI rewards gain, which alone may explain the change.")
+        sentences.append(self._describe_units())
         if self.left_out:
             sentences.append(f"{_count_items(self.left_out)} without both scores are left out.")
         sentences.append(
@@ -154,24 +150,6 @@ class Comparison:
         if self.p_w is not None and (self.p_w < _ALPHA or lowest_p < _ALPHA):
             decisions.append(self.p_w < _ALPHA)
         return decisions
-
-    def _describe_level(self) -> str:
-        measure, delta = MEASURES.get(self.measure), self.overall.delta
-        if measure is None or not measure.knows_hearing:
-            return f"{self.title} rates the output itself and does not know the hearing loss."
-        change = self.level_change
-        if not any(self._significant_tests()):
-            return f"The mean level changed by {change:+.1f} dB."
-        if self.equal_level:
-            return f"The mean level changed by only {change:+.1f} dB, so gain does not explain it."
-        louder = change > 0
-        text = f"The level {'rose' if louder else 'fell'} by {abs(change):.1f} dB"
-        if not measure.rewards_gain:
-            return f"{text}, which changes {self.title} too: how much is not known."
-        if delta and (delta > 0) != louder:
-            return f"{text}, so gain does not explain a {'rise' if delta > 0 else 'fall'}."
-        alone = "more" if louder else "less"
-        return f"{text}, and {self.title} rewards gain: {alone} gain alone may explain the change."
 
     def _describe_units(self) -> str:
         means = self.unit_means
@@ -222,10 +200,9 @@ def compare(
         pairs = [(baseline, other) for other in conditions if other != baseline]
     comparisons = []
     for measure in measures:
-        if measure in table:
-            candidates = [_compare_pair(table, measure, *pair, unit) for pair in pairs]
-            defined = [comparison for comparison in candidates if comparison is not None]
-            comparisons += _adjust(defined, planned)
+        candidates = [_compare_pair(table, measure, *pair, unit) for pair in pairs]
+        defined = [comparison for comparison in candidates if comparison is not None]
+        comparisons += _adjust(defined, planned)
     return comparisons
 
 
@@ -233,16 +210,15 @@ def _adjust(
     comparisons: Sequence[Comparison], planned: Collection[PlannedComparison]
 ) -> list[Comparison]:
     """Mark the planned comparisons of a measure, and adjust the p values of all others."""
-    if len(comparisons) > 1:
-        is_planned = [(c.measure, c.before, c.after) in planned for c in comparisons]
-        comparisons = [replace(c, planned=p) for c, p in zip(comparisons, is_planned, strict=True)]
-    family = [c for c in comparisons if not c.planned]
-    adjusted_p = zip(holm(c.p_t for c in family), holm(c.p_w for c in family), strict=True)
-    adjusted = {
-        (c.before, c.after): replace(c, p_t=p_t, p_w=p_w, family=len(family))
-        for c, (p_t, p_w) in zip(family, adjusted_p, strict=True)
-    }
-    return [adjusted.get((c.before, c.after), c) for c in comparisons]
+    if len(comparisons) == 1:
+        return list(comparisons)
+    pairs = {(c.measure, c.before, c.after): c for c in comparisons}
+    family = [pair for pair in pairs if pair not in planned]
+    p_t, p_w = (holm(getattr(pairs[pair], name) for pair in family) for name in ("p_t", "p_w"))
+    adjusted = {pair: replace(c, planned=True) for pair, c in pairs.items()}
+    for pair, t, w in zip(family, p_t, p_w, strict=True):
+        adjusted[pair] = replace(pairs[pair], p_t=t, p_w=w, family=len(family))
+    return list(adjusted.values())
 
 
 def _compare_pair(
@@ -257,9 +233,10 @@ def _compare_pair(
         return None
     first_rows, second_rows = first_rows[has_both], second_rows[has_both]
     first, second = (rows[measure].to_numpy(float) for rows in (first_rows, second_rows))
-    levels = [math.nan, math.nan]
+    level_change = math.nan
     if "level" in table:
         levels = [math.fsum(rows["level"]) / len(rows) for rows in (first_rows, second_rows)]
+        level_change = levels[1] - levels[0]
     by_severity = {}
     for name in SEVERITIES:
         chosen = first_rows.get("severity", np.array([])) == name
@@ -272,8 +249,7 @@ def _compare_pair(
         before=before,
         after=after,
         overall=overall,
-        level_before_mean=levels[0],
-        level_after_mean=levels[1],
+        level_change=level_change,
         by_severity=by_severity,
         unit=unit,
         unit_means=_compare_units(units, first, second),

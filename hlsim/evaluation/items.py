@@ -15,7 +15,7 @@ from compensators.nalr import NALR
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
-from hlsim.checks import check_names
+from hlsim.checks import check_names, check_number
 from hlsim.evaluation.study import Item
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import compress, mix
@@ -33,10 +33,6 @@ _SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 """Bisgaard's audiograms that are part of every comparison of hearing aids."""
-
-TREATMENTS = ("as-is", "louder", "nal-r", "compressed", "compensated")
-"""Names of ways to process the input of a simulator: not at all, by 20 dB of gain, by NAL-R for the
-ear, by compression of 3:1, or by a compensator."""
 
 
 def draw_simulator_items(
@@ -208,9 +204,7 @@ def apply_treatments(
     }
     if compensator is not None:
         functions["compensated"] = compensator
-    elif "compensated" in treatments:
-        raise ValueError("expected a compensator for the input compensated, got none; pass one")
-    check_names(treatments, functions, "inputs")
+    check_names(treatments, functions, "inputs (compensated needs a compensator)")
     treated = []
     for item, treatment in product(items, treatments):
         with torch.no_grad():
@@ -231,6 +225,7 @@ def _draw_clips(
 
     Shape of speech and noise: (time,).
     """
+    check_number("items", items, 1)
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
     noises = None
     if noise is not None:

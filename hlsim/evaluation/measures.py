@@ -36,25 +36,6 @@ NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
 
 
-def _ear_measure(name: str, score: Callable[..., Tensor], rewards_gain: bool = False) -> Measure:
-    """Return the measure of a score that depends on the ear.
-
-    Args:
-        name: ``"haspi"``, ``"hasqi"`` or ``"haaqi"``.
-        score: Function of ``hlsim.metrics`` that computes it.
-        rewards_gain: Whether a higher level alone increases the score.
-    """
-    return Measure(
-        name,
-        partial(_score_for_ear, name, score),
-        title=name.upper(),
-        packages=["numpy"],  # which draws the noise
-        knows_hearing=True,
-        rewards_gain=rewards_gain,
-        score_range=(0.0, 1.0),
-    )
-
-
 def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: Tensor) -> Values:
     """Compute a score with pyclarity's noise, and with its rounding of the rate to whole kHz.
 
@@ -75,33 +56,15 @@ def _score_signal(
     return {name: value}
 
 
-STOI = Measure(
-    "stoi",
-    partial(_score_signal, "stoi", fidelity.stoi),
-    title="STOI",
-    packages=["pystoi", "numpy", "scipy"],
-    score_range=(0.0, 1.0),
-)
-
-PESQ = Measure(
-    "pesq",
-    partial(_score_signal, "pesq", fidelity.pesq_wb),
-    title="PESQ",
-    packages=["pesq", "numpy"],
-    score_range=(1.0, 4.64),
-)
-
+# NumPy draws the noise of the scores for an ear.
 MEASURES = {
-    "haspi": _ear_measure("haspi", haspi, rewards_gain=True),
-    "hasqi": _ear_measure("hasqi", hasqi),
-    "haaqi": _ear_measure("haaqi", haaqi),
-    "stoi": STOI,
-    "pesq": PESQ,
+    "haspi": Measure("haspi", partial(_score_for_ear, "haspi", haspi), ["numpy"]),
+    "hasqi": Measure("hasqi", partial(_score_for_ear, "hasqi", hasqi), ["numpy"]),
+    "haaqi": Measure("haaqi", partial(_score_for_ear, "haaqi", haaqi), ["numpy"]),
+    "stoi": Measure("stoi", partial(_score_signal, "stoi", fidelity.stoi), ["pystoi", "scipy"]),
+    "pesq": Measure("pesq", partial(_score_signal, "pesq", fidelity.pesq_wb), ["pesq"]),
 }
 """The scores of ``--measures``, each under its name. Higher is better for all of them."""
-
-_PACKAGES = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
-"""Optional package of a measure, and the extra of hlsim that installs it."""
 
 
 def find_measures(names: Iterable[str]) -> list[Measure]:
@@ -112,10 +75,10 @@ def find_measures(names: Iterable[str]) -> list[Measure]:
 
     Raises:
         ValueError: There is no such measure, or no name at all.
-        MissingExtraError: The package of a measure is not installed.
+        MissingExtraError: pesq is not installed.
 
-    >>> [measure.title for measure in find_measures(["haspi", "hasqi", "haspi"])]
-    ['HASPI', 'HASQI']
+    >>> [measure.name for measure in find_measures(["haspi", "hasqi", "haspi"])]
+    ['haspi', 'hasqi']
     """
     unique = list(dict.fromkeys(names))
     unknown = [name for name in unique if name not in MEASURES and ":" not in name]
@@ -125,8 +88,8 @@ def find_measures(names: Iterable[str]) -> list[Measure]:
             f"expected measures among {', '.join(MEASURES)} or package.module:name, {problem}; "
             "pass one or more of these"
         )
-    for name in _PACKAGES.keys() & unique:
-        require(*_PACKAGES[name])
+    if "pesq" in unique:
+        require("pesq", "pesq")
     return [MEASURES[name] if name in MEASURES else load_measure(name) for name in unique]
 
 
@@ -176,7 +139,7 @@ def column_title(column: str) -> str:
     ('HASPI', 'crest factor')
     """
     if column in MEASURES:
-        return MEASURES[column].title
+        return column.upper()
     return "SNR (dB)" if column == "snr" else column
 
 
@@ -185,14 +148,11 @@ def _measure_levels(item: Item, output: Tensor) -> Values:
         "level": float(level_spl(output, item.full_scale_spl)),
         "clean_level": float(level_spl(item.clean, item.full_scale_spl)),
         "full_scale_spl": item.full_scale_spl,
-        "seconds": item.clean.shape[-1] / item.sample_rate,
-        "sample_rate": item.sample_rate,
-        "seed": item.seed,
     }
 
 
 LEVELS = Measure("levels", _measure_levels)
-"""RMS levels of output and clean speech in dB SPL, and the settings of the item."""
+"""RMS levels of output and clean speech in dB SPL, and the level of RMS 1.0."""
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
@@ -220,35 +180,27 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
     perceived = perceive(output, item.ear, rate)
     peak = 20.0 * output.abs().max().clamp_min(1e-10).log10()
     level = float(level_spl(perceived))
-    normal_level = float(level_spl(normal_input))
-    normal_clean_level = float(level_spl(reference))
     return {
         "peak": float(peak) + PASCAL_SPL,
-        "perceived_level": level,
-        "normal_level": normal_level,
-        "normal_clean_level": normal_clean_level,
-        "loudness_error": level - normal_level,
-        "loudness_error_clean": level - normal_clean_level,
+        "loudness_error": level - float(level_spl(normal_input)),
+        "loudness_error_clean": level - float(level_spl(reference)),
         "band_error": _band_error_db(perceived, reference, rate),
         "loss_msbg": float(band_level_loss(perceived, reference, rate)),
     }
 
 
 PERCEPTION = Measure("perception", _measure_perception, packages=["hlsim"])
-"""Levels and band levels of an output as perceived through the exact MSBG, in dB SPL or dB.
+"""Errors of an output as perceived through the exact MSBG, in dB, and its peak in dB SPL.
 
-``peak`` is the largest sample of the output, and ``perceived_level`` the level after MSBG.
-``normal_level`` and ``normal_clean_level`` are the levels of the input (with its noise) and of the
-clean speech for a normal ear; ``loudness_error`` and ``loudness_error_clean`` are the differences
-from them. ``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by the
-median difference of levels in 24 bands, and by ``HearingLossLoss(criterion="bands")``.
+``loudness_error`` and ``loudness_error_clean`` are the perceived level minus that of the input
+(with its noise) and of the clean speech for a normal ear. ``band_error`` and ``loss_msbg`` compare
+with the clean speech for a normal ear, by the median difference of levels in 24 bands, and by
+``HearingLossLoss(criterion="bands")``.
 """
 
 OTHER_COLUMNS = (
-    *("level", "clean_level", "full_scale_spl", "seconds", "sample_rate", "seed"),
-    *("peak", "perceived_level", "normal_level", "normal_clean_level", "band_error"),
-    *("loss_msbg", "loss_neuro", "loudness_error", "loudness_error_clean"),
-    *("beyond_limit", "gap", "source"),
+    *("level", "clean_level", "full_scale_spl", "peak", "loudness_error", "loudness_error_clean"),
+    *("band_error", "loss_msbg", "loss_neuro", "gap", "source"),
 )
 """Columns that the measures of hlsim return beside scores."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 
@@ -53,15 +53,12 @@ def one_thread() -> Iterator[None]:
 
 def run_parallel(
     function: Callable[[Task], Result],
-    tasks: Iterable[Task],
+    tasks: Sequence[Task],
     *,
     jobs: int | None = None,
     dask: str | None = None,
-) -> Iterator[tuple[Task, Result | None]]:
+) -> Iterator[tuple[Task, Result]]:
     """Call a function for each task, and yield the tasks with their results, in the same order.
-
-    If a process ends (after a crash in compiled code, or because memory ran out), the tasks that
-    were running are repeated one by one. The task that ends its process again yields None.
 
     Args:
         function: Function of a task, which can be pickled. An exception that it raises ends the
@@ -72,55 +69,31 @@ def run_parallel(
             able to import hlsim and to read the same files.
 
     Raises:
-        ValueError: ``jobs`` is less than 1, or no scheduler answers.
+        ValueError: No scheduler answers, or a process has ended, after a crash in compiled code or
+            because memory ran out.
         MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not
             installed.
 
     >>> list(run_parallel(abs, [-1, 2], jobs=1))
     [(-1, 1), (2, 2)]
     """
-    if jobs is not None and jobs < 1:
-        raise ValueError(f"expected jobs to be 1 or more, or None for all cores, got {jobs}")
-    if dask is None and jobs == 1:
-        for task in tasks:
-            yield task, function(task)
-        return
     joblib = require("joblib", "eval")
-    tasks = list(tasks)
     with ExitStack() as stack:
         settings: dict[str, Any] = {"backend": "loky", "inner_max_num_threads": 1}
         if dask is not None:
             settings = {"backend": "dask", "client": stack.enter_context(_connect(dask))}
+            jobs = None
         stack.enter_context(joblib.parallel_config(**settings))
-        pool = joblib.Parallel(
-            n_jobs=jobs if jobs and dask is None else -1,
-            return_as="generator",
-            # A batch of several tasks would be lost as a whole if its process ends.
-            batch_size=1,
-        )
-        finished = 0
-        while finished < len(tasks):
-            numbers = iter(range(finished, len(tasks)))  # which joblib reads to start tasks
-            try:
-                for result in pool(joblib.delayed(function)(tasks[number]) for number in numbers):
-                    yield tasks[finished], result
-                    finished += 1
-            except Exception as error:
-                _check_process_ended(error)
-            for task in tasks[finished : next(numbers, len(tasks))]:
-                repeated: Result | None = None
-                try:
-                    (repeated,) = pool([joblib.delayed(function)(task)])
-                except Exception as error:
-                    _check_process_ended(error)
-                yield task, repeated
-                finished += 1
-
-
-def _check_process_ended(error: Exception) -> None:
-    """Raise an error again unless it reports the end of a process."""
-    if type(error).__name__ not in DEAD_PROCESS_ERRORS:
-        raise error
+        pool = joblib.Parallel(n_jobs=jobs or -1, return_as="generator")
+        try:
+            yield from zip(tasks, pool(map(joblib.delayed(function), tasks)), strict=True)
+        except Exception as error:
+            if type(error).__name__ not in DEAD_PROCESS_ERRORS:
+                raise
+            raise ValueError(
+                "a process ended, after a crash in compiled code or because memory ran out; run "
+                "again with fewer jobs (--jobs), which continues with what is stored"
+            ) from error
 
 
 def _connect(scheduler: str) -> Any:

@@ -9,54 +9,45 @@ The files are in folders, or in a manifest, a CSV file with one row for each out
 A manifest needs the columns ``condition``, ``clean`` and ``processed``; paths are relative to the
 root. It may have ``listener``, ``ear`` (left or right), ``item`` and ``snr`` (dB). Rows with the
 same listener, ear, clean file, item and SNR form one item. Its audiogram is in columns ``hl_250``
-and so on, in a column ``audiogram`` by its standard name, or in a second CSV file by ``listener``
-and ``ear``.
+and so on, in a column ``audiogram`` by its standard name, or in a second file by ``listener`` and
+``ear``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from hlsim.audio import EXTENSIONS, find_audio, read_audio
+from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram.listener import EAR_NAMES, EARS
+from hlsim.audiogram.listener import EAR_NAMES, EARS, Listener
+from hlsim.audiogram.table import read_listeners
 from hlsim.audiogram.value import convert_at
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.comparison import PlannedComparison, compare
 from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.store import content_hash
 from hlsim.evaluation.study import Condition, Item
-from hlsim.files import read_table
+from hlsim.files import read_table, sha256
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 _REQUIRED_COLUMNS = ("condition", "clean", "processed")
-"""Columns that a manifest must have."""
-
-_LEVEL_COLUMNS = ("spl", "full_scale_spl")
-"""Columns that a manifest must not have, because levels are options."""
+"""Columns that every row of a manifest must fill."""
 
 _UTTERANCE_COLUMNS = ["listener", "utterance", "snr"]
 """Columns of the table that both ears of an utterance share."""
 
-_EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level")
+_EAR_FACTS = ["source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level"]
 """Columns of the table that describe the item of one ear."""
-
-_Row = Mapping[str, str]
-"""Values of a row of a CSV file, by column."""
-
-_Ears = Mapping[tuple[str, str], tuple[str, _Row]]
-"""Rows of a CSV file of ears, with the place of each in the file, by name and ear."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +57,8 @@ class Recording:
     Args:
         utterance: Name of the utterance, the same for both ears of a listener.
         clean: File of clean speech.
-        outputs: File of the output under each condition, by the name of the condition.
+        outputs: File of the output under each condition, by the name of the condition, or the error
+            because of which there is none.
         audiogram: The ear.
         listener: Name of the listener; empty if unknown.
         ear: ``"left"``, ``"right"`` or empty, which selects the channel of a file with two
@@ -77,7 +69,6 @@ class Recording:
             ``full_scale_spl``.
         seed: Seed of the study. The seed of an item depends on this seed and on the contents of its
             clean file.
-        problems: Reason why there is no output under a condition, by the name of the condition.
 
     >>> ear = Audiogram.standard("N3")
     >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
@@ -86,7 +77,7 @@ class Recording:
 
     utterance: str
     clean: Path
-    outputs: Mapping[str, Path]
+    outputs: Mapping[str, Path | ValueError]
     audiogram: Audiogram
     listener: str = ""
     ear: str = ""
@@ -94,7 +85,6 @@ class Recording:
     full_scale_spl: float = 94.0
     spl: float | None = None
     seed: int = 0
-    problems: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -115,7 +105,7 @@ class Recording:
 
     def digest(self, condition: str) -> str:
         """Return a hash of both files, the ear, the level and the seed, which decide all scores."""
-        files = [content_hash(self.clean), content_hash(self._output_file(condition))]
+        files = [sha256(self.clean), sha256(self._output_file(condition))]
         level = [self.full_scale_spl if self.spl is None else None, self.spl]
         return value_hash([files, level, self.ear, self.audiogram.thresholds, self.seed])
 
@@ -123,15 +113,12 @@ class Recording:
         """Read the clean speech. Outputs are read when they are measured.
 
         Raises:
-            ValueError: The file cannot be read, or there is no output under any condition.
+            ValueError: The file cannot be read.
         """
-        if self.problems and not self.outputs:
-            raise ValueError(next(iter(self.problems.values())))
         clean, rate = self._read_channel(self.clean)
         full_scale = self.full_scale_spl
         if self.spl is not None:
             full_scale = check_full_scale(self.spl - float(dbfs(clean)))
-        names = [*self.outputs, *self.problems]
         return Item(
             self.name,
             clean,
@@ -139,18 +126,23 @@ class Recording:
             self.audiogram,
             sample_rate=rate,
             full_scale_spl=full_scale,
-            seed=(self.seed + int(content_hash(self.clean)[:8], 16)) % 2**32,
+            seed=(self.seed + int(sha256(self.clean)[:8], 16)) % 2**32,
             facts=self.facts,
-            recorded={name: partial(self._read_output, name, rate) for name in names},
+            recorded=partial(self._read_output, rate),
         )
 
     def _output_file(self, condition: str) -> Path:
-        if condition not in self.outputs:
-            missing = f"{self.name}: no file is named for condition {condition}; add it to outputs"
-            raise ValueError(self.problems.get(condition, missing))
-        return self.outputs[condition]
+        file = self.outputs.get(condition)
+        if file is None:
+            raise ValueError(
+                f"no output of {self.name} is recorded under {condition}; add its file, for "
+                "example by a row of the manifest"
+            )
+        if isinstance(file, ValueError):
+            raise file
+        return file
 
-    def _read_output(self, condition: str, rate: int) -> Tensor:
+    def _read_output(self, rate: int, condition: str) -> Tensor:
         path = self._output_file(condition)
         output, output_rate = self._read_channel(path)
         if output_rate != rate:
@@ -164,18 +156,12 @@ class Recording:
         """Read the ear's channel, in float64 with shape (time,), and the sample rate in Hz."""
         waveform, rate = read_audio(path)
         channels = len(waveform)
-        if channels > 2:
+        if channels > 2 or (channels == 2 and not self.ear):
             raise ValueError(
-                f"{path}: expected one channel, or two for a left and a right ear, got {channels}; "
-                "write the channel of each ear to a file"
+                f"{path}: expected one channel, or two if the ear is named left or right (column "
+                f"ear of a manifest), got {channels}; write the ear's channel to a file"
             )
-        if channels == 2 and not self.ear:
-            raise ValueError(
-                f"{path}: expected one channel, because the ear of {self.name} has no name, got 2; "
-                "name the ear left or right (column ear of a manifest), or pass mono files"
-            )
-        channel = waveform[EARS.index(self.ear) if channels == 2 else 0]
-        return channel.double(), rate
+        return waveform[EARS.index(self.ear) if channels == 2 else 0].double(), rate
 
 
 def _join_name(*parts: str | float) -> str:
@@ -210,9 +196,8 @@ def haspi_report(
         clean: Folder of clean speech.
         before, after: Folders of the speech before and after a treatment, such as an aid, with
             files of the same names. Without ``before``, there are scores and no comparison.
-        audiogram: The ear of all files.
-        audiograms: CSV file of ears instead, with columns ``hl_250``, ``hl_500``, ... in dB HL and
-            the column ``file`` (for folders) or ``listener`` and ``ear`` (for a manifest).
+        audiogram: The ear of all files, or of those rows of the manifest that have no ear.
+        audiograms: File of the ears of a manifest's listeners, see ``read_listeners``.
         manifest: CSV file instead of the folders, with one row per output file and the columns
             ``condition``, ``clean`` and ``processed``, and optionally ``listener``, ``ear``,
             ``item``, ``snr`` (dB), and ``hl_250``, ... or ``audiogram``.
@@ -249,15 +234,15 @@ def haspi_report(
     settings: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl, "seed": seed}
     if manifest and not any((clean, before, after)):
         recordings = _read_manifest(manifest, root, audiogram, audiograms, **settings)
-    elif clean and after and not manifest:
-        folders = {"before": before, "after": after}
-        recordings = _read_folders(clean, folders, audiogram, audiograms, **settings)
+    elif clean and after and audiogram and not (manifest or audiograms):
+        folders = {
+            name: folder for name, folder in (("before", before), ("after", after)) if folder
+        }
+        recordings = _read_folders(clean, folders, audiogram, **settings)
     else:
-        sources = {"clean": clean, "before": before, "after": after, "manifest": manifest}
-        passed = ", ".join(name for name, source in sources.items() if source)
         raise ValueError(
-            "expected either the folders clean and after (and before), or a manifest, got "
-            f"{passed or 'none of them'}; pass one of the two"
+            "expected either a manifest, or the folders clean and after (and before) with their "
+            "audiogram; pass one of the two"
         )
     names = list(dict.fromkeys(name for r in recordings for name in r.outputs))
     if baseline is not None:
@@ -302,7 +287,7 @@ def score_recordings(
             and ``progress`` of ``run_study``.
 
     Returns:
-        The evaluation; with ``better_ear``, its group ``ears`` has the scores of each ear.
+        The evaluation. With ``better_ear``, its table has one row per utterance and condition.
 
     Raises:
         ValueError: Nothing could be scored, or ``better_ear`` is set and an utterance lacks an ear.
@@ -323,8 +308,7 @@ def score_recordings(
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
     scores = evaluation.scores
     if better_ear:
-        ears = {"ears": evaluation}
-        evaluation = replace(evaluation, table=_better_ears(evaluation.table, scores), groups=ears)
+        evaluation = replace(evaluation, table=_better_ears(evaluation.table, scores))
     planned = planned or [(scores[0], evaluation.names[0], evaluation.names[-1])]
     comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
     return replace(evaluation, comparisons=comparisons)
@@ -336,11 +320,10 @@ def _check_both_ears(recordings: Iterable[Recording]) -> None:
     for r in recordings:
         ears.setdefault(_join_name(r.listener, r.utterance, r.snr), []).append(r.ear)
     for name, names in ears.items():
-        if sorted(names) != sorted(EARS):
+        if sorted(names) != [*EARS]:
             raise ValueError(
                 f"expected one left and one right ear of {name} for the better ear, got "
-                f"{', '.join(ear or 'an ear without a name' for ear in names)}; add the missing "
-                "rows, or leave out better_ear (--better-ear)"
+                f"{names}; add the missing rows, or leave out better_ear (--better-ear)"
             )
 
 
@@ -365,63 +348,50 @@ def _better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     # The left ear counts if both ears have the same score.
     order = table.sort_values([measures[0], "ear"], ascending=[False, True], kind="stable")
     best = order.drop_duplicates(row).set_index(row).loc[rows]
-    best = best.assign(**table.groupby(row)[list(measures)].max())
-    last = best.xs(table["condition"].iloc[-1], level="condition")
-    best = best.reset_index()
-    for fact in set(_EAR_FACTS) & set(best):
-        best[fact] = best["item"].map(last[fact])
+    best = best.assign(**table.groupby(row)[list(measures)].max()).reset_index()
+    best[_EAR_FACTS] = best.groupby("item")[_EAR_FACTS].transform("last")
     utterances = best[_UTTERANCE_COLUMNS].itertuples(index=False)
     return best.assign(name=[_join_name(*utterance) for utterance in utterances])
 
 
 def _read_folders(
-    clean: str | Path,
-    folders: Mapping[str, str | Path | None],
-    audiogram: Audiogram | None = None,
-    audiograms: str | Path | None = None,
-    **settings: Any,
+    clean: str | Path, folders: Mapping[str, str | Path], audiogram: Audiogram, **settings: Any
 ) -> list[Recording]:
     """Return one recording per file of a folder of clean speech.
 
     Args:
         clean: Folder of clean speech.
-        folders: Folder of the outputs by condition; None leaves the condition out. The files of all
-            folders have the same names, whatever their extension.
+        folders: Folder of the outputs by condition. The files of all folders have the same names,
+            whatever their extension.
         audiogram: The ear of all files.
-        audiograms: CSV file of ears instead, with the columns ``file`` (name below the folder, with
-            or without extension) and ``hl_250``, ``hl_500``, .... Rows of other files are ignored.
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: The names differ, or a file has no audiogram.
+        ValueError: The names differ.
     """
-    if (audiogram is None) == (audiograms is None):
-        number = "neither" if audiogram is None else "both"
-        raise ValueError(
-            "expected either audiogram, the ear of all files, or audiograms, a CSV file of ears, "
-            f"got {number}; pass one of the two"
-        )
     speech = _files_by_name(clean)
-    outputs = {name: _files_by_name(folder) for name, folder in folders.items() if folder}
+    outputs = {condition: _files_by_name(folder) for condition, folder in folders.items()}
     for condition, files in outputs.items():
         different_names = sorted(files.keys() ^ speech.keys())
         if different_names:
-            name = different_names[0]
-            owner = clean if name in speech else folders[condition]
             raise ValueError(
                 f"{clean} and {folders[condition]}: expected files with the same names, but only "
-                f"{owner} has {name} ({len(different_names)} differences); rename, add or remove "
-                "files"
+                f"one of them has {different_names[0]} ({len(different_names)} differences); "
+                "rename, add or remove files"
             )
-    ears = {} if audiograms is None else _read_ears(audiograms, "file")
-    recordings = []
-    for name, path in speech.items():
-        ear = _find_ear(ears, name) or audiogram
-        if ear is None:
-            raise ValueError(f"{audiograms}: there is no audiogram of file {name!r}; add a row")
-        files = {condition: files[name] for condition, files in outputs.items()}
-        recordings.append(Recording(name, path, files, ear, **settings))
-    return recordings
+    return [
+        Recording(
+            name, path, {c: files[name] for c, files in outputs.items()}, audiogram, **settings
+        )
+        for name, path in speech.items()
+    ]
+
+
+def _files_by_name(folder: str | Path) -> dict[str, Path]:
+    """Return the audio files of a folder by their path below it, without extension."""
+    return {
+        path.relative_to(folder).with_suffix("").as_posix(): path for path in find_audio(folder)
+    }
 
 
 def _read_manifest(
@@ -436,36 +406,28 @@ def _read_manifest(
     Args:
         path: CSV file with one row per output and the columns that the top of this module
             describes: ``condition``, ``clean`` and ``processed``, and others if they are known.
-        root: Folder to which the paths are relative and which contains them; by default that of
-            the manifest.
+        root: Folder to which the paths are relative; by default that of the manifest.
         audiogram: The ear of rows without an audiogram.
-        audiograms: CSV file of ears with the columns ``listener``, ``ear`` (if left and right
-            differ) and ``hl_250``, ``hl_500``, ....
+        audiograms: File of listeners, see ``read_listeners``.
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
         ValueError: A row is not valid; the message names its line.
     """
-    folder = Path(Path(path).parent if root is None else root).resolve()
+    folder = Path(path).parent if root is None else Path(root)
     rows = read_table(path, "the manifest")
-    columns = rows[0][1].keys()
-    for column in _REQUIRED_COLUMNS:
-        if column not in columns:
-            raise ValueError(
-                f"{path}: there is no column {column}; expected the columns "
-                f"{', '.join(_REQUIRED_COLUMNS)}, add it to the first line and to all rows"
-            )
-    for column in _LEVEL_COLUMNS:
-        if column in columns:
-            raise ValueError(
-                f"{path}: expected no column {column}, because all files have one level; remove "
-                f"it, and pass the option --{column.replace('_', '-')} ({column} in Python)"
-            )
-    ears = {} if audiograms is None else _read_ears(audiograms, "listener")
+    if "spl" in rows[0][1]:
+        raise ValueError(
+            f"{path}: expected no column spl, because all files have one level; remove it, and "
+            "pass the option --spl (spl in Python)"
+        )
+    listeners: dict[str, Listener] = {}
+    if audiograms is not None:
+        listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})
     recordings: dict[tuple[str, Path], Recording] = {}
     for line, row in rows:
         place = f"{path}, line {line}"
-        recording = convert_at(place, _read_row, row, folder, ears, audiogram, settings)
+        recording = convert_at(place, _read_row, row, folder, listeners, audiogram, settings)
         key = recording.name, recording.clean
         if key in recordings:
             recording = convert_at(place, _merge, recordings[key], recording)
@@ -474,9 +436,9 @@ def _read_manifest(
 
 
 def _read_row(
-    row: _Row,
+    row: Mapping[str, str],
     root: Path,
-    ears: _Ears,
+    listeners: Mapping[str, Listener],
     audiogram: Audiogram | None,
     settings: Mapping[str, Any],
 ) -> Recording:
@@ -484,27 +446,28 @@ def _read_row(
 
     Args:
         row: The row.
-        root: Folder that contains all files.
-        ears: Rows of the CSV file of ears.
-        audiogram: The ear if neither the row nor the CSV file has an audiogram.
+        root: Folder to which the paths are relative.
+        listeners: Listeners by their name.
+        audiogram: The ear if neither the row nor ``listeners`` has an audiogram.
         settings: Further arguments of the recording.
     """
-    condition, listener, ear = row["condition"], row.get("listener", ""), _ear_name(row)
+    for column in _REQUIRED_COLUMNS:
+        if not row.get(column):
+            raise ValueError(f"expected a value in the column {column}, got none; fill it in")
+    listener, text = row.get("listener", ""), row.get("ear", "")
+    ear = EAR_NAMES.get(text.lower(), "")
+    if text and not ear:
+        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
     thresholds = {name: text for name, text in row.items() if name.lower().startswith("hl")}
     if any(thresholds.values()):
         audiogram = Audiogram.from_row(thresholds)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
-    else:
-        audiogram = _find_ear(ears, listener, ear) or audiogram
-    if not condition:
-        raise ValueError(
-            "expected the name of a condition, such as unaided, in the column condition, got an "
-            "empty value; fill it in"
-        )
+    elif listener in listeners:
+        audiogram = getattr(listeners[listener], ear, None) or audiogram
     if audiogram is None:
         raise ValueError(
-            f"there is no audiogram of listener {listener!r}, ear {ear!r}; add columns hl_250, "
+            f"there is no audiogram of listener {listener!r}, ear {text!r}; add columns hl_250, "
             "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
             "ear"
         )
@@ -517,8 +480,8 @@ def _read_row(
         ) from None
     return Recording(
         utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
-        clean=_path_below(root, row["clean"]),
-        outputs={condition: _path_below(root, row["processed"])},
+        clean=root / row["clean"],
+        outputs={row["condition"]: root / row["processed"]},
         audiogram=audiogram,
         listener=listener,
         ear=ear,
@@ -540,75 +503,3 @@ def _merge(recording: Recording, other: Recording) -> Recording:
             f"{recording.audiogram}, got {other.audiogram}; write one audiogram in all its rows"
         )
     return replace(recording, outputs={**recording.outputs, **other.outputs})
-
-
-def _path_below(root: Path, name: str) -> Path:
-    """Return a path below a folder, with links followed.
-
-    Raises:
-        ValueError: The path leads out of the folder.
-    """
-    path = (root / name).resolve()
-    if not name or not path.is_relative_to(root):
-        raise ValueError(
-            f"expected the path of a file below {root}, got {name!r}; move the file there, or pass "
-            "the folder that contains all files as root"
-        )
-    return path
-
-
-def _ear_name(row: _Row) -> str:
-    """Return ``"left"``, ``"right"`` or, if the row names no ear, an empty text."""
-    text = row.get("ear", "").lower()
-    if text and text not in EAR_NAMES:
-        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
-    return EAR_NAMES.get(text, "")
-
-
-def _read_ears(path: str | Path, column: str) -> _Ears:
-    """Read the rows of a CSV file of ears. Audiograms are validated when they are used.
-
-    Args:
-        path: The file.
-        column: Column with the name of the ear, ``"listener"`` or ``"file"``.
-    """
-    ears: dict[tuple[str, str], tuple[str, _Row]] = {}
-    for line, row in read_table(path, "audiograms"):
-        place = f"{path}, line {line}"
-        name = row.get(column, "")
-        if column == "file":
-            name = _without_extension(PurePath(name))
-        key = name, convert_at(place, _ear_name, row)
-        if not row.get(column):
-            raise ValueError(f"{place}: expected a name in the column {column}, got none; add it")
-        if key in ears:
-            raise ValueError(
-                f"{place}: expected one row per ear, but {ears[key][0]} has the same ear of "
-                f"{column} {name}; remove one of them"
-            )
-        ears[key] = place, row
-    return ears
-
-
-def _find_ear(ears: _Ears, name: str, ear: str = "") -> Audiogram | None:
-    """Return the audiogram of a listener or file in a CSV file of ears, or None."""
-    entry = ears.get((name, ear)) or ears.get((name, ""))
-    return convert_at(entry[0], Audiogram.from_row, entry[1]) if entry else None
-
-
-def _without_extension(path: PurePath) -> str:
-    """Return a path in POSIX form without the extension of an audio file."""
-    return (path.with_suffix("") if path.suffix.lower() in EXTENSIONS else path).as_posix()
-
-
-def _files_by_name(folder: str | Path) -> dict[str, Path]:
-    """Return the audio files of a folder by their path below it, without extension."""
-    files: dict[str, Path] = {}
-    for path in find_audio(folder):
-        name = _without_extension(path.relative_to(folder))
-        if name in files:
-            raise ValueError(
-                f"{files[name]} and {path} differ in their extension only; keep one of them"
-            )
-        files[name] = path
-    return files

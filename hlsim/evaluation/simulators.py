@@ -14,23 +14,19 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from hlsim.checks import check_number
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
 from hlsim.evaluation.measures import load_measure, perceive
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item, Measure, Values
-from hlsim.extras import is_installed, require
+from hlsim.extras import is_installed
 from hlsim.metrics import fidelity
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.teacher import PluginTeacher, find_teacher
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-_SHORTEST_SECONDS = 0.02
-"""Shortest item in seconds, which is one window of the spectrograms."""
 
 
 def evaluate_simulators(
@@ -85,8 +81,7 @@ def evaluate_simulators(
 
     Raises:
         ValueError: Data or settings are not valid, or no item has a value.
-        MissingExtraError: pandas or pystoi is not installed. Without pesq, that measure is left
-            out.
+        MissingExtraError: pandas is not installed. Without pesq, that measure is left out.
 
     >>> from hlsim import MSBG
     >>> from hlsim.shortcuts import EXAMPLE_FILE
@@ -97,16 +92,7 @@ def evaluate_simulators(
     >>> evaluation.table["snr"].tolist()  # the teacher itself
     [200.0]
     """
-    require("pandas", "eval")
-    require("pystoi", "eval")
-    check_number("items", items, 1)
-    check_number("seconds", seconds, _SHORTEST_SECONDS)
-    for name, values in {"simulators": simulators, "levels": levels, "inputs": inputs}.items():
-        if not values:
-            raise ValueError(f"expected one or more {name}, got none; pass at least one")
-    for name in inputs:
-        if list(inputs).count(name) > 1:
-            raise ValueError(f"expected different inputs, got {name} twice; pass it once")
+    inputs = list(dict.fromkeys(inputs))
     settings: dict[str, Any] = {
         "items": items,
         "seconds": seconds,
@@ -119,7 +105,7 @@ def evaluate_simulators(
         [Condition(name, module, "simulator") for name, module in simulators.items()],
         [_fidelity_to(teacher), *map(load_measure, measures)],
         store=store,
-        settings={"teacher": teacher, **settings, "inputs": list(inputs)},
+        settings={"teacher": teacher, **settings, "inputs": inputs},
         **running,
     )
     groups: dict[str, Evaluation] = {}
@@ -210,8 +196,7 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
 def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
     """Return an item to be played on the page, and the teacher's output for it.
 
-    The item has the first treatment and, if there are such items, a moderate loss and loud, clean
-    speech, of which the ear misses much and still perceives much.
+    The item has the first treatment and, of the items with this treatment, the highest level.
 
     Args:
         evaluation: Evaluation of ``evaluate_simulators``.
@@ -228,10 +213,6 @@ def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
     >>> item.name, expected.shape
     ('item 0', torch.Size([16000]))
     """
-    rows = evaluation.table.dropna(subset="snr")
-    rows = rows[rows["treatment"] == rows["treatment"].iloc[0]]
-    rows = rows.assign(is_not_moderate=rows["severity"] != "moderate")
-    columns = ["is_not_moderate", "input_level", "speech"]
-    order = rows.sort_values(columns, ascending=[True, False, True])
-    item = evaluation.items[order["item"].iloc[0]].load()
+    rows = next(iter(evaluation.groups.values())).table.dropna(subset="snr")
+    item = evaluation.items[rows["item"][rows["input_level"].idxmax()]].load()
     return item, _teacher_output(find_teacher(evaluation.settings["teacher"]), item)

@@ -11,8 +11,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hlsim.files import sha256
-
 
 class ScoreStore:
     """Stored scores, by a hash of everything that decides a score.
@@ -22,9 +20,6 @@ class ScoreStore:
 
     Args:
         path: File of scores, which is created with the first one. None keeps them in memory.
-
-    Raises:
-        ValueError: The file cannot be read.
 
     >>> store = ScoreStore()
     >>> store.append("abc", {"values": {"haspi": 0.5}})
@@ -37,14 +32,7 @@ class ScoreStore:
         self.records: dict[str, dict[str, Any]] = {}
         if self.path is None or not self.path.exists():
             return
-        try:
-            lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")
-        except OSError as error:
-            raise ValueError(
-                f"{path}: cannot read stored scores ({error}); pass the file that an earlier run "
-                "wrote, or the path of a new one"
-            ) from error
-        for line in lines:
+        for line in self.path.read_text(encoding="utf-8", errors="replace").split("\n"):
             # A line that is cut short, or is not a record, is ignored.
             with suppress(ValueError, KeyError, TypeError, AttributeError):
                 record = json.loads(line)
@@ -62,30 +50,11 @@ class ScoreStore:
             record: Entries of the line, such as ``values``, the measured values by column.
 
         Raises:
-            ValueError: The file cannot be written, or JSON cannot represent the record.
+            ValueError: JSON cannot represent the record.
         """
         line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False)
         if self.path is not None:
-            try:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                with open(self.path, "a", encoding="utf-8") as file:
-                    # The line before this one may be cut short.
-                    file.write(f"\n{line}")
-            except OSError as error:
-                raise ValueError(f"{self.path}: cannot store scores ({error})") from error
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "a", encoding="utf-8") as file:
+                file.write(f"\n{line}")  # The line before this one may be cut short.
         self.records[key] = dict(record)
-
-
-def content_hash(path: str | Path) -> str:
-    """Compute the SHA-256 of a file's contents, in hexadecimal.
-
-    Raises:
-        ValueError: The file cannot be read.
-
-    >>> len(content_hash(__file__))
-    64
-    """
-    try:
-        return sha256(Path(path))
-    except OSError as error:
-        raise ValueError(f"{path}: {str(error.strerror).lower()}") from error

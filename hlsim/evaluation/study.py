@@ -28,16 +28,12 @@ from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 Values = Mapping[str, float | str]
 """Values that a measure returns for one output, by the column of the table."""
-
-DEAD_PROCESS = "its process ended (after a crash in compiled code, or because memory ran out)"
-"""Failure of all scores of an item whose process ended."""
 
 
 class Source(Protocol):
@@ -75,8 +71,7 @@ class Item:
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
         seed: Seed of the random numbers that a measure draws.
         facts: Further columns of the table that describe the item, such as ``listener`` or ``snr``.
-        recorded: For each condition whose output was recorded, under its name, a function that
-            reads the output.
+        recorded: Function that reads the output that was recorded under the name of a condition.
 
     >>> clean = torch.ones(8)
     >>> Item("item 1", clean, clean, Audiogram.standard("N3")).sample_rate
@@ -91,7 +86,7 @@ class Item:
     full_scale_spl: float = PASCAL_SPL
     seed: int = 0
     facts: Mapping[str, Any] = field(default_factory=dict)
-    recorded: Mapping[str, Callable[[], Tensor]] = field(default_factory=dict)
+    recorded: Callable[[str], Tensor] | None = None
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def load(self) -> Item:
@@ -143,58 +138,40 @@ class Condition:
         return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
-        """Process an item, or read its recorded output.
-
-        Raises:
-            ValueError: No output is recorded.
-        """
-        if self.process is not None:
-            return self.process(item.signal, item.ear)
-        if self.name not in item.recorded:
-            raise ValueError(
-                f"no output of {item.name} is recorded under {self.name}; add its file, for "
-                "example by a row of the manifest"
-            )
-        return item.recorded[self.name]()
+        """Process an item, or read its recorded output."""
+        if self.process is None:
+            assert item.recorded is not None
+            return item.recorded(self.name)
+        return self.process(item.signal, item.ear)
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A function that scores the output of a condition, and its properties.
+    """A function that scores the output of a condition, and what decides its values.
 
     Args:
         name: Name in options and files. If the measure has one value, it is also its column.
         compute: Function ``(item, output) -> values by column``, for an ``Item`` and an output with
             shape (time,). The function raises ValueError if there are no values.
-        title: Name in tables and plots.
         packages: Packages whose versions decide the values.
-        revision: Number to be increased when a change of hlsim changes a value.
-        settings: Fingerprint of further settings that decide the values, such as a network; None
-            if it is unknown.
-        knows_hearing: Whether the values depend on the audiogram and the level.
-        rewards_gain: Whether a higher level alone increases the score.
-        score_range: Lowest and highest score, for the axes of plots.
+        settings: Fingerprint of all else that decides the values, such as a network or a version
+            of the function; None if it is unknown.
 
-    >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).revision
-    1
+    >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).name
+    'peak'
     """
 
     name: str
     compute: Callable[[Item, Tensor], Values]
-    title: str = ""
     packages: Sequence[str] = ()
-    revision: int = 1
     settings: str | None = ""
-    knows_hearing: bool = False
-    rewards_gain: bool = False
-    score_range: tuple[float, float] | None = None
 
     @cached_property
     def fingerprint(self) -> str | None:
         """Fingerprint of everything that decides the values. If it is None, none is stored."""
         if self.settings is None:
             return None
-        return value_hash([self.revision, installed_versions(self.packages), self.settings])
+        return value_hash([installed_versions(self.packages), self.settings])
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
@@ -204,13 +181,11 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     {'no-such-package': 'not installed'}
     """
     versions = {}
-    for package in dict.fromkeys(packages):
+    for package in packages:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
-        if package == "hlsim":  # which may run from its sources
-            versions[package] = __version__
     return versions
 
 
@@ -254,8 +229,9 @@ def run_study(
         measure has its values.
 
     Raises:
-        ValueError: ``jobs`` is less than 1, no scheduler answers, the store cannot be written, or
-            two measures return the same column.
+        ValueError: No scheduler answers, a process has ended, or two measures return the same
+            column.
+        OSError: The store cannot be written.
         MissingExtraError: A package is not installed.
 
     >>> signal = torch.ones(1600)
@@ -267,9 +243,18 @@ def run_study(
     >>> table["peak"].tolist()
     [1.0]
     """
-    store = ScoreStore() if store is None else store
+    pandas = require("pandas", "eval")
+    store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
-    _warn_of_unknown_fingerprints([*conditions, *measures])
+    parts: list[Condition | Measure] = [*conditions, *measures]
+    unknown = [part.name for part in parts if part.fingerprint is None]
+    if unknown:
+        warnings.warn(
+            f"scores with {', '.join(unknown)} are not stored and will be computed again by the "
+            "next run; to store them, add an attribute fingerprint, such as a version, to the "
+            "object that computes them",
+            stacklevel=2,
+        )
     results: dict[tuple[int, str, str], Values | str] = {}
     tasks = []
     for number, source in enumerate(items):
@@ -288,21 +273,21 @@ def run_study(
     total = len(items) * len(conditions) * len(measures)
     report_progress(len(results), total)
     for task, measured in run_parallel(_measure_item, tasks, jobs=jobs, dask=dask):
-        if measured is None:
-            measured = [DEAD_PROCESS] * len(task.missing)
         for (condition, measure, key), values in zip(task.missing, measured, strict=True):
             results[task.number, condition.name, measure.name] = values
             if key and not isinstance(values, str):
                 names = {"condition": condition.name, "measure": measure.name}
                 store.append(key, {"item": task.source.name, **names, "values": values})
         report_progress(len(results), total)
-    return _make_table(items, conditions, measures, results)
+    table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
+    table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
+    return table
 
 
 def _digest(source: Source, condition: Condition) -> str | None:
     try:
         return source.digest(condition.name)
-    except ValueError:  # Loading the item or its output fails later for the same reason.
+    except (OSError, ValueError):  # Loading the item or its output fails for the same reason.
         return None
 
 
@@ -310,18 +295,6 @@ def _key(digest: str | None, condition: Condition, measure: Measure) -> str:
     """Return the key of stored values, which is empty if they cannot be stored."""
     parts = [digest, condition.fingerprint, measure.fingerprint]
     return "" if None in parts else value_hash([*parts, measure.name])
-
-
-def _warn_of_unknown_fingerprints(parts: Sequence[Condition | Measure]) -> None:
-    """Warn of conditions and measures whose scores cannot be stored."""
-    unknown = [part.name for part in parts if part.fingerprint is None]
-    if unknown:
-        warnings.warn(
-            f"scores with {', '.join(unknown)} are not stored and will be computed again by the "
-            "next run; to store them, add an attribute fingerprint, such as a version, to the "
-            "object that computes them",
-            stacklevel=3,
-        )
 
 
 @one_thread()
@@ -354,25 +327,44 @@ def _measure_item(task: _Task) -> list[Values | str]:
 
 def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     """Process an item, and cut the item and its output to the shorter length."""
-    output = condition.output(item)
-    if not output.isfinite().all():
-        raise ValueError(
-            f"expected finite samples in the output of {condition.name}, got NaN or infinite ones"
-        )
-    lengths = item.clean.shape[-1], output.shape[-1]
-    samples = common_length(lengths, item.sample_rate, (item.name, f"its output {condition.name}"))
-    if samples < lengths[0]:
+    output = cut_output(condition.output(item), item.clean, item.sample_rate)
+    samples = output.shape[-1]
+    if samples < item.clean.shape[-1]:
         item = replace(item, clean=item.clean[:samples], signal=item.signal[:samples])
-    return item, output[:samples]
+    return item, output
 
 
-def _make_table(
+def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
+    """Validate the output of an aid, and cut it to the length of its input if it is longer.
+
+    Args:
+        output: The output. Shape: (..., time), where ``time`` may differ by 0.1 s.
+        signal: The input. Shape: (..., time).
+        sample_rate: Sample rate in Hz.
+
+    Raises:
+        ValueError: The output has another shape, or samples that are not finite.
+
+    >>> cut_output(torch.ones(1601), torch.ones(1600), 16000).shape
+    torch.Size([1600])
+    """
+    if output.shape[:-1] != signal.shape[:-1]:
+        raise ValueError(
+            f"expected an output of shape {tuple(signal.shape)}, got {tuple(output.shape)}"
+        )
+    if not output.isfinite().all():
+        raise ValueError("expected finite samples in the output, got NaN or infinite ones")
+    lengths = signal.shape[-1], output.shape[-1]
+    return output[..., : common_length(lengths, sample_rate, ("the input", "the output"))]
+
+
+def _make_rows(
     items: Sequence[Source],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
     results: Mapping[tuple[int, str, str], Values | str],
-) -> DataFrame:
-    """Return the table of a study.
+) -> list[dict[str, Any]]:
+    """Return the rows of the table of a study.
 
     Args:
         items, conditions, measures: See ``run_study``.
@@ -398,6 +390,4 @@ def _make_table(
                 )
             row |= values
         rows.append({**row, "failure": "; ".join(dict.fromkeys(reasons)) or None})
-    table = require("pandas", "eval").DataFrame(rows)
-    table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
-    return table
+    return rows

@@ -39,7 +39,6 @@ _GROUPS = {
 _COLUMNS: Columns = {
     "Output level (dB SPL)": (statistic("level"), ".1f"),
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
-    "Peaks beyond the limit": (statistic("beyond_limit", "sum"), "g"),
     "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     "Mean absolute loudness error (dB)": (statistic("loudness_error", "mean absolute"), ".1f"),
     "Loudness error against speech alone (dB)": (statistic("loudness_error_clean"), "+.1f"),
@@ -63,8 +62,7 @@ _COLUMN_NOTES = (
     "noise, so that a further column compares with the speech alone. The band error is the "
     "median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
     "perceived by the impaired ear and, for clean speech, by a normal ear, both by the exact "
-    "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0; the limit is "
-    "that of the compensator.",
+    "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0.",
     "The reference of HASQI is clean speech amplified by NAL-R, which is therefore its ceiling: "
     "an output that is closer to normal hearing than NAL-R's has a lower HASQI.",
     "A condition at a compensator's level is NAL-R, or an equaliser, whose output is brought to "

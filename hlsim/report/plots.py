@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram.plot import frequency_axis
-from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
@@ -183,8 +182,7 @@ def scores_pictures(evaluation: Evaluation) -> list[Picture]:
     if c is None or c.overall.n < 2:
         return []
     before, after = evaluation.wide(c.measure)[[c.before, c.after]].dropna().to_numpy().T
-    scale = MEASURES[c.measure].score_range if c.measure in MEASURES else None
-    axis_range = scale and (scale[0] - 0.03, scale[1] + 0.03)
+    axis_range = (-0.03, 1.03) if c.measure in ("haspi", "hasqi", "haaqi", "stoi") else None
 
     def draw(axes: Any) -> None:
         axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")

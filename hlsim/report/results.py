@@ -291,7 +291,7 @@ def score_details(evaluation: Evaluation) -> Section:
         "dB SPL.",
         STATISTICS_NOTE,
     ]
-    if "ears" in evaluation.groups:
+    if evaluation.settings.get("better_ear"):
         notes.append("Each score is that of the better ear, by each measure.")
     sections = _comparison_sections(evaluation)
     if "snr" in evaluation.table and evaluation.table["snr"].nunique() > 1:

@@ -139,8 +139,7 @@ def raise_error(waveform: Tensor, ear: Audiogram) -> Tensor:
     ("aid", "message"),
     [
         (lambda waveform, ear: waveform * math.nan, "got NaN"),
-        (lambda waveform, ear: waveform[None], "expected a finite output of shape"),
-        (lambda waveform, ear: None, "got NoneType"),
+        (lambda waveform, ear: waveform[None], "expected an output of shape"),
         (lambda waveform, ear: torch.cat((waveform, waveform)), "a difference of 1 s"),
         (raise_error, "RuntimeError: no battery"),
     ],

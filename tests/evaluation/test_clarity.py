@@ -22,13 +22,7 @@ from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.clarity import (
-    _make_conditions,
-    _measure_look_ahead,
-    _Pair,
-    _Scene,
-    evaluate_scenes,
-)
+from hlsim.evaluation.clarity import evaluate_scenes
 from hlsim.report.recordings import _conditions_table, scenes_page
 
 RATE = 44100
@@ -197,25 +191,9 @@ def test_the_command_writes_page_scores_and_signals_and_continues(
     assert rate == LOW_RATE and np.allclose(output, 4 * np.roll(mix, -128, 0), atol=1e-6)
     assert (out / "report.html").read_text().count("<audio") == 10
     stored, report = (out / "scores.jsonl").read_text(), (out / "report.json").read_text()
-    signal.unlink()
-    other = out / "signals" / "soft" / "S06001_L0001_HA-output.wav"
-    written = other.stat().st_mtime_ns
     assert main(command) == 0
-    assert np.allclose(soundfile.read(signal)[0], output), "a missing signal is written again"
-    assert other.stat().st_mtime_ns == written and (out / "report.json").read_text() == report
-    assert (out / "scores.jsonl").read_text().startswith(stored)
-
-
-@pytest.mark.usefixtures("quick_scores")
-def test_signals_of_another_aid_with_the_same_label_are_replaced(
-    clarity: Path, tmp_path: Path
-) -> None:
-    signal = tmp_path / "signals" / "aid" / "S06001_L0001_HA-output.wav"
-    outputs = []
-    for name in ("wdrc", f"{__name__}:Anticipating", "wdrc"):
-        evaluate_scenes({"aid": name}, out=tmp_path, **options(clarity, stride=4))
-        outputs.append(signal.read_bytes())
-    assert outputs[0] == outputs[2] != outputs[1]
+    assert (out / "report.json").read_text() == report
+    assert (out / "scores.jsonl").read_text() == stored
 
 
 @pytest.mark.usefixtures("quick_scores")
@@ -277,11 +255,8 @@ def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Ten
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [
-        ("mix", 0, ""),
         ("target_anechoic", 100, ""),
-        ("target", -100, ""),
         ("mix", -100, ""),
-        ("target", -8000, "S06002_target_CH1.wav 8000"),
         ("mix", -8000, "16000 samples"),
     ],
 )
@@ -298,18 +273,6 @@ def test_lengths_may_differ_by_a_tenth_of_a_second(
     assert output.frames == soundfile.info(scenes / "S06001_mix_CH1.wav").frames
     assert study.failures.empty == (not message)
     assert message in scenes_page(study, listen=0).markdown()
-
-
-def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(
-    clarity: Path, tmp_path: Path
-) -> None:
-    sound = 0.02 * np.sin(np.arange(2.0 * LOW_RATE)).reshape(-1, 2)
-    write(tmp_path / "mix.wav", np.concatenate([np.zeros((5 * LOW_RATE, 2)), sound]))
-    listener = read_listeners(clarity / "listeners.json")["L0001"]
-    conditions = _make_conditions({}, [], False, LOW_RATE, 94.0)
-    files = _Scene(tmp_path / "mix.wav", tmp_path / "mix.wav", None)
-    look_ahead = _measure_look_ahead(conditions, _Pair("S1", files, "L0001", listener))
-    assert look_ahead["unaided"] == 0.0 and 1.0 < look_ahead["NAL-R"] <= 7.0
 
 
 @pytest.mark.usefixtures("quick_scores")
@@ -331,16 +294,13 @@ LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scenes": "listeners.json"}, "expected a folder with files"),
-        ({"scenes": "."}, "expected a folder with files"),
-        ({"scenes": "no reference"}, r"put S1_target_anechoic_CH1\.wav or"),
+        ({"scenes": ".", "scenes_listeners": None}, "expected files that end with _mix_CH1"),
+        ({"scenes": "no reference", "scenes_listeners": None}, "put S1_target_anechoic_CH1.wav or"),
         ({"scenes_listeners": {"S06001": ["L0009"]}}, "listener 'L0009'"),
         ({"scenes_listeners": {"S9": ["L0001"]}}, "scene 'S9'"),
         ({"scenes_listeners": []}, "cannot be read"),
         ({"scenes_listeners": {}}, "no scene has a listener"),
         ({"listeners": LEFT_EAR_ONLY}, "L0001"),
-        ({"listeners": {"../x": LISTENERS["L0001"]}}, "a name that a file can have"),
-        ({"stride": 0}, "got 0"),
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
@@ -354,8 +314,9 @@ def test_invalid_settings_are_rejected_before_anything_is_written(
     if "listeners" in change:
         settings["scenes_listeners"] = None
     for name in change.keys() & {"listeners", "scenes_listeners"}:
-        settings[name] = tmp_path / f"{name}.json"
-        settings[name].write_text(json.dumps(change[name]))
+        if change[name] is not None:
+            settings[name] = tmp_path / f"{name}.json"
+            settings[name].write_text(json.dumps(change[name]))
     settings["scenes"] = clarity / settings["scenes"]
     with pytest.raises(ValueError, match=message):
         evaluate_scenes(settings.pop("aids"), out=tmp_path / "out", **settings)

@@ -84,11 +84,10 @@ FIVE_RISES = {"a": [0.5] * 5, "b": [0.7 + i / 1e3 for i in range(5)]}
     ("scores", "settings", "sentences"),
     [
         (draw(30, 0.2), {}, ["b is better than a: HASPI", "(30 items, change +0.2"]),
-        (draw(30, -0.2), {"louder": 0.5}, ["b is worse than a: HASPI", "by only +0.5 dB"]),
+        (draw(30, -0.2), {"louder": 0.5}, ["b is worse than a: HASPI", "changed by +0.5 dB. The"]),
         (draw(30, 0.2), {"louder": 3.0}, ["b scores higher than a, which is 3.0 dB softer: HASPI"]),
-        (draw(30, -0.2), {"louder": -6.0}, ["by 6.0 dB, and HASPI rewards gain: less"]),
-        (draw(30, 0.2), {"louder": -6.0}, ["so gain does not explain a rise"]),
-        (draw(30, 0.2), {"louder": 20.0}, ["rose by 20.0 dB, and HASPI rewards gain: more"]),
+        (draw(30, -0.2), {"louder": -6.0}, ["by -6.0 dB. HASPI rewards gain, which alone may"]),
+        (draw(30, 0.2), {"louder": -6.0}, ["by -6.0 dB. The tests"]),
         (draw(10, 0.0), {}, ["b cannot be distinguished from a: HASPI"]),
         (draw(10, 0.0), {"louder": -6.0}, ["distinguished", "The mean level changed by -6.0 dB. "]),
         (draw(30, 0.2), {"listeners": 6}, ["the means of the 6 listeners gives p"]),
@@ -96,9 +95,7 @@ FIVE_RISES = {"a": [0.5] * 5, "b": [0.7 + i / 1e3 for i in range(5)]}
         ({"a": [0.5] * 3, "b": [0.5] * 3}, {}, ["cannot be distinguished", "neither test"]),
         (OUTLIER, {}, ["b may be worse than a"]),
         (FIVE_RISES, {}, ["b is better than a", "Wilcoxon p = 0.06250"]),
-        (draw(10, 0.1), {"measure": "stoi", "louder": 20.0}, ["STOI rates the output itself"]),
-        (draw(10, -0.1), {"measure": "hasqi", "louder": 20.0}, ["changes HASQI too"]),
-        (draw(10, 0.1), {"measure": "crest"}, ["crest rates the output itself"]),
+        (draw(10, 0.1), {"measure": "stoi", "louder": 20.0}, ["by +20.0 dB. The tests"]),
     ],
 )
 def test_sentences(scores: Scores, settings: dict[str, Any], sentences: list[str]) -> None:

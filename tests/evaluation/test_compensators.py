@@ -60,13 +60,10 @@ def test_perception_is_that_of_the_exact_model_and_of_the_loss(
     losses = {"msbg": values["loss_msbg"]}
     losses[network] = network_loss(network).compute(item, output)["loss_neuro"]
     with torch.no_grad():
-        levels = {
-            "perceived_level": MSBG(N3)(output),
-            "normal_level": MSBG(NORMAL)(noisy),
-            "normal_clean_level": MSBG(NORMAL)(clean),
-        }
-        for name, signal in levels.items():
-            assert values[name] == pytest.approx(float(level_spl(signal)), abs=1e-3)
+        perceived = level_spl(MSBG(N3)(output))
+        for name, signal in (("loudness_error", noisy), ("loudness_error_clean", clean)):
+            error = perceived - level_spl(MSBG(NORMAL)(signal))
+            assert values[name] == pytest.approx(float(error), abs=1e-3)
         for simulator, loss in losses.items():
             expected = HearingLossLoss(N3, criterion="bands", simulator=simulator)(output, clean)
             assert loss == pytest.approx(float(expected), rel=1e-4)
@@ -161,12 +158,8 @@ def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"compensators": {}},
         {"compensators": {"NAL-R": Unaided()}},
-        {"compensators": {"mine": lambda waveform, ear: waveform}},
-        {"audiogram": None},
         {"items": 0},
-        {"levels": (130.0,)},
         {"audiogram": Audiogram.standard("N7")},
         {"enhancers": ["no_such:module"]},
     ],

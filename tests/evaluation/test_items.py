@@ -12,7 +12,6 @@ from hlsim import Audiogram
 from hlsim.calibration import level_spl
 from hlsim.evaluation.items import (
     SIMULATOR_LEVELS,
-    TREATMENTS,
     apply_treatments,
     draw_aid_items,
     draw_simulator_items,
@@ -33,9 +32,7 @@ def test_all_ears_have_different_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("count", "levels"),
     [
-        (8, (50.0, 65.0, 80.0)),
         (11, (50.0, 65.0, 80.0)),
-        (8, (55.0, 75.0)),
         (8, (5.0, 6.0, 7.0, 8.0)),
     ],
 )
@@ -51,7 +48,7 @@ def test_every_ear_has_every_level_and_ratio(
     assert len(noisy) == len(combinations) == expected
 
 
-@pytest.mark.parametrize("count", [2, 4, 5])
+@pytest.mark.parametrize("count", [4, 5])
 def test_every_kind_of_ear_of_simulators_has_every_level_and_ratio(
     speech_dir: Path, ears_file: Path, count: int
 ) -> None:
@@ -96,8 +93,9 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     drawn = draw_simulator_items(speech_dir / "valid", None, ears_file, **settings)
     halving = torch.nn.Module()
     halving.forward = lambda waveform, ear: 0.5 * waveform  # type: ignore[method-assign]
-    treated = apply_treatments(drawn, TREATMENTS, halving)
-    assert [item.facts["treatment"] for item in treated] == list(TREATMENTS)
+    treatments = ["as-is", "louder", "nal-r", "compressed", "compensated"]
+    treated = apply_treatments(drawn, treatments, halving)
+    assert [item.facts["treatment"] for item in treated] == treatments
     as_is, louder, amplified, compressed, compensated = (item.signal for item in treated)
     assert torch.equal(as_is, drawn[0].signal) and torch.equal(compensated, 0.5 * as_is)
     assert float(level_spl(louder)) == pytest.approx(85.0, abs=0.01)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import soundfile
 import torch
 from torch import Tensor
 
@@ -12,13 +13,13 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
 from hlsim.evaluation.recordings import _read_manifest
-from hlsim.evaluation.store import content_hash
+from hlsim.files import sha256
 from hlsim.metrics import haspi
 
 pytest.importorskip("pandas")
 
 N4 = Audiogram.standard("N4")
-HEADER = "file," + ",".join(N4.to_row())
+HEADER = "listener,ear," + ",".join(N4.to_row())
 LEVELS = ",".join(N4.to_row().values())
 
 
@@ -32,7 +33,10 @@ def corpus(tmp_path: Path, speech_dir: Path) -> Path:
         for folder, signal in (("clean", clean), ("before", noisy), ("after", 8 * noisy)):
             path = tmp_path / folder / f"{name}{'.flac' if folder == 'clean' else '.wav'}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_audio(path, signal, rate)
+            if folder == "clean":
+                soundfile.write(path, signal.T.numpy(), rate)
+            else:
+                write_audio(path, signal, rate)
     return tmp_path
 
 
@@ -51,12 +55,11 @@ def test_a_score_is_that_of_the_metric_and_is_read_again(corpus: Path) -> None:
     assert list(report.table.name) == ["a.b", "a.b", "p2/c", "p2/c"]
     for row in report.table.itertuples():
         clean = corpus / "clean" / f"{row.name}.flac"
-        seed = (4 + int(content_hash(clean)[:8], 16)) % 2**32
+        seed = (4 + int(sha256(clean)[:8], 16)) % 2**32
         output = first_channel(corpus / row.condition / f"{row.name}.wav")
-        options: dict[str, Any] = {"sample_rate": row.sample_rate, "full_scale_spl": 90.0}
+        options: dict[str, Any] = {"sample_rate": read_audio(clean)[1], "full_scale_spl": 90.0}
         options |= {"noise": "seeded", "seed": seed, "whole_khz": True}
-        score = haspi(output, first_channel(clean), N4, **options)
-        assert (row.haspi, row.seed) == (float(score), seed)
+        assert row.haspi == float(haspi(output, first_channel(clean), N4, **options))
         level = 90.0 + 10.0 * math.log10(float(output.square().mean()))
         assert row.level == pytest.approx(level, abs=1e-9)
     comparison = report.headline
@@ -98,7 +101,7 @@ def test_a_file_that_cannot_be_scored_is_a_failure(corpus: Path, damage: str) ->
     report = haspi_report(**folders(corpus), audiogram=N4, measures=("stoi",))
     (failure,) = report.failures.itertuples()
     assert (failure.name, failure.condition) == ("p2/c", "after")
-    assert "after" in failure.failure and "\n" not in failure.failure
+    assert "\n" not in failure.failure
     assert report.table.stoi.notna().sum() == 3
 
 
@@ -147,24 +150,22 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         best = both.loc[both.haspi.idxmax()]
         assert (row.haspi, row.level) == (best.haspi, best.level)
     assert set(better.table.ear) == {"right"}, "the better ear in the last condition"
-    assert better.groups["ears"].table.equals(ears.table)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("5,N3\n", "5,N9\n", "line 2: .*N9"),
-        ("A,before", "../A,before", "line 2: expected the path of a file below"),
         (
             "L1,left,aided",
             "L1,left,unaided",
             "line 3: expected one row of L1 left .* under condition unaided",
         ),
-        ("L1,left,aided", "L1,left,", "line 3: expected the name of a condition"),
-        ("N3\nL2", "N4\nL2", r"line 3: expected the audiogram .* 'N3', got 'N4'"),
+        ("L1,left,aided", "L1,left,", "line 3: expected a value in the column condition"),
+        ("N3\nL2", "N4\nL2", r"line 3: expected the audiogram .* got Audiogram\('N4'\)"),
         (",5,N3", ",x,N3", "line 2: expected a number of dB in the column snr, got 'x'"),
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
-        ("condition,", "treatment,", "there is no column condition"),
+        ("condition,", "treatment,", "line 2: expected a value in the column condition"),
         (",snr,", ",spl,", "expected no column spl, .* pass the option --spl"),
         (",audiogram\n", ",ear_of\n", "line 2: there is no audiogram of listener 'L1'"),
     ],
@@ -176,34 +177,26 @@ def test_the_line_of_an_invalid_row_is_named(
         _read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
 
 
-def test_audiograms_may_be_in_a_file_of_their_own(corpus: Path) -> None:
+def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> None:
     ears = corpus / "ears.csv"
     unused = LEVELS.replace("80", "NR")  # Only ears that are used are validated.
-    settings = {**folders(corpus), "audiograms": ears, "measures": ("stoi",)}
-    ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{LEVELS}\nother,{unused}\n")
-    assert haspi_report(**settings).table.audiogram.tolist() == [list(N4.thresholds)] * 4
-    ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\n")
-    with pytest.raises(ValueError, match=r"ears\.csv: there is no audiogram of file 'p2/c'"):
-        haspi_report(**settings)
-    ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{unused}\n")
-    with pytest.raises(ValueError, match=r"ears\.csv, line 3: .*NR"):
-        haspi_report(**settings)
     manifest = write_manifest(corpus, MANIFEST.replace(",audiogram\n", ",remark\n"))
-    names = HEADER.replace("file", "listener,ear")
-    ears.write_text(f"{names}\nL1,left,{LEVELS}\nL2,,{LEVELS}\nL3,left,{unused}\n")
+    ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,R,{LEVELS}\nL3,left,{unused}\n")
     assert {r.audiogram for r in _read_manifest(manifest, audiograms=ears)} == {N4}
+    ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,left,{LEVELS}\n")
+    with pytest.raises(ValueError, match="line 4: there is no audiogram of listener 'L2'"):
+        _read_manifest(manifest, audiograms=ears)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "expected either audiogram"),
+        ({}, "expected either a manifest"),
         ({"audiogram": N4, "full_scale_spl": 300.0}, "full_scale_spl"),
         ({"audiogram": N4, "measures": ()}, "got none"),
         ({"audiogram": N4, "baseline": "unaided"}, "no condition 'unaided'"),
         ({"audiogram": N4, "better_ear": True}, "one left and one right ear"),
-        ({"audiogram": N4, "after": None}, "expected either the folders"),
-        ({"audiogram": N4, "manifest": "study.csv"}, "expected either the folders"),
+        ({"audiogram": N4, "manifest": "study.csv"}, "expected either a manifest"),
     ],
 )
 def test_invalid_settings_are_rejected_before_scoring(
@@ -217,7 +210,7 @@ def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
     (corpus / "after" / "a.b.wav").rename(corpus / "after" / "d.wav")
     with pytest.raises(
         ValueError,
-        match=r"after: expected files with the same names, but only \S*clean has a\.b",
+        match=r"after: expected files with the same names, but only one of them has a\.b",
     ):
         haspi_report(**folders(corpus), audiogram=N4)
     (corpus / "after" / "d.wav").rename(corpus / "after" / "a.b.wav")
