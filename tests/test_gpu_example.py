@@ -29,7 +29,7 @@ def test_gpu_measurement_on_a_cpu(
     paper = {"cnn": {"channels": 8, "blocks": 1}}
     monkeypatch.setattr(example, "simulator_names", lambda: ["neuro-msbg-light"])
     monkeypatch.setattr(example, "CRITERIA", ["interaural"])
-    timed = example.speed_subjects()[::4]
+    timed = example.speed_subjects()[::12]
     monkeypatch.setattr(example, "speed_subjects", lambda: timed)
     monkeypatch.setattr(example, "scores", list)
     monkeypatch.setattr(example, "PAPER_NETWORKS", paper)

@@ -3,7 +3,7 @@
 Run with ``pytest -m browser``. Needs npm, playwright and a Chromium: its own (``playwright install chromium``), or one
 of the system, found by name or in the environment variable ``CHROMIUM``. This command prints the figures of the guide:
 
-    pytest -n 0 -s -m browser tests/test_listening_page.py -k figures
+    pytest -n 0 -s -m browser tests/test_listening_page.py -k first_sound
 """
 
 import http.server
@@ -339,62 +339,23 @@ LIVE = """async (thresholds) => {
 }"""
 
 
-def seconds_to_first_sound(chromium: Any, address: str) -> float:
-    """Open the page without a cache, and play the impaired ear as soon as possible."""
-    context = chromium.new_context()
-    page = context.new_page()
+def test_the_first_sound_comes_soon_and_the_live_aid_is_fast(page: Any, address: str) -> None:
+    """Print the figures of docs/measured.md, and fail where one misses its target."""
     begin = time.perf_counter()
     page.goto(address)
     page.locator("#version-ear .play").click()
     page.wait_for_selector("#version-ear.playing")
     seconds = time.perf_counter() - begin
-    context.close()
-    return seconds
-
-
-def test_figures_of_the_guide(page: Any, chromium: Any, address: str, tmp_path: Path) -> None:
-    """Print the figures of the guide, and fail where one misses its target."""
-    first_sounds = sorted(seconds_to_first_sound(chromium, address) for _ in range(3))
-    seconds = " ".join(f"{value:.1f}" for value in first_sounds)
-    print(f"\nfirst sound of the impaired ear after opening the page: {seconds} s")
-
-    path, signal = speech_file(tmp_path, 48_000)
-    page.goto(address)
     wait(page)
-    set_file(page, path)
-    expected = expected_results(signal, "N3")
-    for name, output in expected.items():
-        print(f"{name}, N3, 3 s: {error_db(result(page, name), output):.0f} dB relative to Python")
-
-    times = page.evaluate(
-        f"""async (thresholds) => {{
-            {PAGE}
-            const {{ simulate, compensate }} = await import('./engine.js');
-            const best = async (call) => {{
-                const times = [];
-                for (let run = 0; run < 7; run++) {{
-                    const begin = performance.now();
-                    await call(state.sound, thresholds);
-                    times.push((performance.now() - begin) / 3000);
-                }}
-                return times.sort((a, b) => a - b)[3];
-            }};
-            return {{ simulator: await best(simulate), aid: await best(compensate) }};
-        }}""",
-        list(hlsim.Audiogram.standard("N3").thresholds),
-    )
-    for name, share in times.items():
-        print(f"{name}, 3 s, median of 7 runs: {share:.3f} of real time")
-
     live = page.evaluate(LIVE, list(hlsim.Audiogram.standard("N3").thresholds))
-    given, output = (torch.tensor(channel) for channel in live["recording"])
-    points = 2 * len(given)
-    product = torch.fft.rfft(output, points) * torch.fft.rfft(given, points).conj()
+    microphone, output = (torch.tensor(channel) for channel in live["recording"])
+    points = 2 * len(microphone)
+    product = torch.fft.rfft(output, points) * torch.fft.rfft(microphone, points).conj()
     delay = float(torch.fft.irfft(product)[:4000].abs().argmax()) / 16.0
     print(
-        f"live: {delay:.1f} ms from input to output of the audio graph; {live['late']} of "
-        f"{live['blocks']} blocks of 8 ms were late; {live['milliseconds']:.2f} ms for the last one"
+        f"\nfirst sound of the impaired ear after opening the page: {seconds:.1f} s\nlive: "
+        f"{delay:.1f} ms from input to output of the audio graph; {live['late']} of "
+        f"{live['blocks']} blocks of 8 ms were late"
     )
-    assert first_sounds[0] < 5.0  # The other runs may have shared the computer.
-    assert max(times.values()) < 1.0 / 3.0
+    assert seconds < 5.0
     assert delay < 50.0 and abs(delay - live["delay"]) < 1.0

@@ -3,7 +3,6 @@
 import doctest
 import struct
 from collections.abc import Iterator
-from itertools import cycle
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,7 +17,6 @@ from hlsim import MSBG
 from hlsim.calibration import level_spl
 from hlsim.training.clips import Clips
 from tests.helpers import EXAMPLES, load_example
-from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
 WIDTH, TOKENS, PROMPT = 64, 12, [10, 11]
 EARS = torch.full((3, 8), 50.0)
@@ -68,21 +66,15 @@ def test_examples_of_docstrings(example: ModuleType) -> None:
     assert result.attempted >= 1 and result.failed == 0
 
 
-def test_probabilities_of_all_tokens_add_up_to_1(likelihood: Any) -> None:
+def test_probabilities_of_all_tokens_add_up_to_1_and_depend_on_the_sound(likelihood: Any) -> None:
     waveform = 0.1 * torch.randn(1, 16000).expand(TOKENS, -1)
     # All beginnings are equal; the last token takes every value.
     texts = torch.tensor([[3, 7, last] for last in range(TOKENS)])
     logs = likelihood(waveform, texts)
     torch.testing.assert_close(logs[:, 2].exp().sum(), torch.tensor(1.0))
     torch.testing.assert_close(logs[:, :2], logs[:1, :2].expand(TOKENS, -1))
-
-
-def test_likelihood_depends_on_the_sound_and_on_earlier_tokens(likelihood: Any) -> None:
-    waveform = 0.1 * torch.randn(2, 16000)
-    logs = likelihood(waveform, torch.tensor([[3, 7], [3, 7]]))
-    assert float((logs[0] - logs[1]).abs().max()) > 1e-4
-    other = likelihood(waveform, torch.tensor([[4, 7], [4, 7]]))
-    assert float((logs - other)[:, 1].abs().min()) > 1e-6
+    other = likelihood(0.1 * torch.randn(1, 16000), texts[:1])
+    assert float((logs[0] - other).abs().max()) > 1e-4
 
 
 def test_weights_are_read_from_a_file(
@@ -125,30 +117,6 @@ def test_a_batch_has_the_levels_and_ratios_of_training(batches: Iterator[Any]) -
     assert batch.ears.shape == (4, 8) and batch.tokens.shape[0] == 4
 
 
-def test_terms_are_0_where_the_aid_equals_the_reference(
-    example: ModuleType, likelihood: Any, batches: Iterator[Any]
-) -> None:
-    """Clean speech through an aid that changes nothing, for normal ears, is as it should be."""
-
-    def pass_unchanged(waveform: Tensor, ears: Tensor) -> Tensor:
-        return waveform
-
-    batch = next(batches)
-    quiet = batch._replace(noisy=batch.clean, ears=torch.zeros(4, 8))
-    simulator = MSBG(sample_rate=16000)
-    terms = example.loss_terms(pass_unchanged, pass_unchanged, quiet, likelihood, simulator)
-    assert {name: len(term) for name, term in terms.items()} == {
-        **dict.fromkeys(("words", "bands", "level"), 4),
-        **dict.fromkeys(("clean_bands", "clean_loudness"), 2),
-        "haspi": 1,
-    }
-    for name in ("bands", "level", "clean_bands", "clean_loudness"):
-        assert float(terms[name].max()) < 1e-4, name
-    assert float(terms["haspi"]) < 0.05
-    # The average token of twelve has a negative log likelihood of about log 12.
-    assert 0.0 < float(terms["words"].mean()) < 4.0
-
-
 def test_terms_know_gain_and_noise(
     example: ModuleType, likelihood: Any, batches: Iterator[Any]
 ) -> None:
@@ -181,46 +149,3 @@ def test_a_step_trains_both_parts(
     line = capsys.readouterr().out
     # The aid has not changed before the first step, so neither has its level.
     assert line.startswith("step 1: words ") and ", level 0.000, " in line
-
-
-def test_terms_are_computed_on_the_device(
-    example: ModuleType, weights: dict[str, Tensor], likelihood: Any, batches: Iterator[Any]
-) -> None:
-    aid, batch = load_compensator("hearing-aid"), next(batches)
-    simulator = MSBG(sample_rate=16000)
-    expected = example.loss_terms(aid, aid, batch, likelihood, simulator)
-    with PretendDevice():
-        aid.to(DEVICE)
-        moved = {name: weight.to(DEVICE) for name, weight in weights.items()}
-        there = example.TextLikelihood(moved, likelihood.mel_filters.to(DEVICE), PROMPT)
-        batch = example.Batch(*(tensor.to(DEVICE) for tensor in batch))
-        terms = example.loss_terms(aid, aid, batch, there, simulator.to(DEVICE))
-    for name, term in terms.items():
-        assert isinstance(term, PretendTensor)
-        torch.testing.assert_close(term.inner, expected[name], rtol=1e-3, atol=1e-3)
-
-
-def test_clips_have_a_text_of_which_the_recogniser_is_sure(
-    example: ModuleType, speech_dir: Path
-) -> None:
-    """One in three clips has no words, and one has words of which the recogniser is not sure."""
-    texts = cycle(["", "one two three", "four five six"])
-
-    class Recogniser:
-        def __call__(self, waveform: Any) -> str:
-            return next(texts)
-
-        def encode(self, text: str) -> list[int]:
-            return [len(word) for word in text.split()]
-
-    class Likelihood:
-        device = torch.device("cpu")
-
-        def __call__(self, sound: Tensor, tokens: Tensor) -> Tensor:
-            assert float(sound.abs().max()) == pytest.approx(0.5)
-            return torch.full(tokens.shape, -0.1 if tokens[0, 0] == 4 else -2.0)
-
-    speech = Clips(speech_dir / "train", sample_rate=16000, seconds=1.0)
-    generator = torch.Generator().manual_seed(0)
-    clips = example.draw_text_clips(speech, Recogniser(), Likelihood(), 2, generator)
-    assert [clip.tokens.tolist() for clip in clips] == [[4, 4, 3]] * 2

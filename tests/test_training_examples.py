@@ -1,7 +1,6 @@
 """The examples of training through the loss run as they stand, a few steps."""
 
 import importlib
-import math
 import sys
 from pathlib import Path
 
@@ -29,10 +28,7 @@ def test_conv_tasnet_trains(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("network", "loss"),
-    [("gru-mask", "with-haspi"), ("gru-mask-8ms", "haspi"), ("waveform", "default")],
-)
+@pytest.mark.parametrize(("network", "loss"), [("gru-mask", "with-haspi"), ("waveform", "default")])
 def test_networks_are_trained_and_compared_with_nalr(
     network: str,
     loss: str,
@@ -205,20 +201,11 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
     assert unaided < louder  # Both texts begin with HASPI.
 
 
-def test_haspi_trains_with_the_level_and_without(
+def test_haspi_trains(
     speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(TRAINING)
     example = load_example("training/haspi_objective.py")
-    ear = example.Audiogram.standard("N3")
-    for name in ("HASPILoss", "HASPI alone"):
-        aid = example.train_filter_bank(
-            str(speech_dir / "train"), example.LOSSES[name](ear), 3, clips=2
-        )
-        assert len(capsys.readouterr().err.splitlines()) == 2  # the first step and the last
-        assert float(aid.gain.detach().mean()) > 0.05  # of 10 dB: speech is heard too softly
-    speech = example.Clips(speech_dir / "valid", sample_rate=16000, seconds=1.0)
-    text = example.describe_aid_in_noise(
-        aid, ear, speech.draw(1, torch.Generator().manual_seed(0)), math.inf
-    )
-    assert text.startswith("HASPI 0.") and 80.0 < float(text.split()[-3]) < 110.0
+    loss = example.LOSSES["HASPILoss"](example.Audiogram.standard("N3"))
+    aid = example.train_filter_bank(str(speech_dir / "train"), loss, 3, clips=2)
+    assert float(aid.gain.detach().mean()) > 0.05  # of 10 dB: speech is heard too softly

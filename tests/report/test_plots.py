@@ -1,10 +1,5 @@
 """Plots: legible in light and dark, labels as they are, and no picture of a single group."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 from hlsim.evaluation import Condition
@@ -50,12 +45,3 @@ def test_colours_of_conditions() -> None:
     assert colours["none"] == UNAIDED_COLOUR
     assert colours["NAL-R, same level"] == (colours["mine"], 0.6)
     assert len({str(colour) for colour in colours.values()}) == 4
-
-
-def test_a_backend_of_a_notebook_that_is_not_installed_is_not_needed() -> None:
-    program = (
-        "from hlsim.report.plots import _draw_picture as d; d(lambda axes: axes.plot([1, 2]), 't')"
-    )
-    environment = {**os.environ, "MPLBACKEND": "module://missing_inline.backend"}
-    command, folder = [sys.executable, "-c", program], Path(__file__).parents[2]
-    subprocess.run(command, env=environment, cwd=folder, check=True)
