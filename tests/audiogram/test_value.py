@@ -1,6 +1,5 @@
 """Audiograms against Bisgaard's tables and pyclarity's class; interpolation, severity and rows."""
 
-import dataclasses
 import json
 from collections.abc import Callable
 from typing import Any
@@ -42,13 +41,8 @@ def test_standard_ears_are_bisgaards_and_flat_above_6_khz(name: str) -> None:
     assert Audiogram.standard("NH").levels == (0.0,) * 8
 
 
-def test_is_frozen_hashable_and_holds_floats() -> None:
-    ear = Audiogram(np.arange(8))  # type: ignore[arg-type]
-    assert ear == Audiogram(tuple(range(8)))
-    assert hash(ear) == hash(Audiogram(tuple(range(8))))
-    assert all(type(value) is float for value in ear.levels + ear.frequencies)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        ear.levels = (0.0,) * 8  # type: ignore[misc]
+def test_equal_values_of_any_type_are_equal_keys() -> None:
+    assert {Audiogram(np.arange(8)), Audiogram(tuple(range(8)))} == {as_audiogram([*range(8)])}  # type: ignore[arg-type]
 
 
 BAD_POINTS: list[tuple[Any, Any]] = [
@@ -68,8 +62,6 @@ BAD_POINTS: list[tuple[Any, Any]] = [
 BAD_CALLS: list[tuple[Callable[..., Audiogram], tuple[Any, ...]]] = [
     *((Audiogram, points) for points in BAD_POINTS),
     *((Audiogram.standard, (name,)) for name in ("N9", ["N3"], None)),
-    *((Audiogram.from_row, (row,)) for row in ({"file": "a.wav"}, {"hl_250": ""})),
-    (Audiogram.from_row, ({"hl_250": "10", "hl_500": "loud"},)),
 ]
 
 
@@ -88,13 +80,10 @@ def test_other_grids_are_interpolated_linearly_over_log_frequency_and_flat_beyon
     assert ear.levels == (10.0, 50.0, 30.0)  # kept as given
     for hz, level in ((250.0, -10.0), (8000.0, 120.0)):
         assert Audiogram((level,), (hz,)).thresholds == (level,) * 8
-
-
-def test_an_unmeasured_level_is_left_out() -> None:
-    expected = Audiogram((10.0, 30.0), (500.0, 4000.0))
-    for level in (None, float("nan")):
-        levels: Any = (10.0, level, 30.0)
-        assert Audiogram(levels, (500.0, 2000.0, 4000.0)) == expected
+    for unmeasured in (None, float("nan")):
+        assert as_audiogram({500: 10, 2000: unmeasured, 4000: 30}) == as_audiogram(
+            {500: 10, 4000: 30}
+        )  # type: ignore[dict-item]
 
 
 def test_pure_tone_average_is_the_mean_of_four_frequencies() -> None:
@@ -169,8 +158,5 @@ def test_pyclaritys_audiograms_are_ears() -> None:
     ear = Audiogram.standard("S2")
     theirs = ear.to_clarity()
     assert isinstance(theirs, clarity.Audiogram) and as_audiogram(theirs) == ear
-    mild = as_audiogram(clarity.AUDIOGRAM_MILD)
-    assert (mild.frequencies[0], mild.levels[0], mild.levels[-1]) == (125.0, 5.0, 50.0)
-    assert mild.thresholds == (10, 15, 19, 25, 28, 31, 35, 38)
-    mixed = [theirs, ear, clarity.AUDIOGRAM_MILD]
-    assert torch.equal(as_thresholds(mixed), as_thresholds([ear, ear, mild]))
+    levels = as_thresholds([theirs, clarity.AUDIOGRAM_MILD])
+    assert levels.tolist() == [list(ear.levels), [10, 15, 19, 25, 28, 31, 35, 38]]
