@@ -208,14 +208,14 @@ def level_db(powers: Tensor) -> Tensor:
     return 10.0 * torch.log10(powers + POWER_FLOOR) + PASCAL_SPL
 
 
-def speech_band_levels(bands: int) -> tuple[float, ...]:
+def speech_band_levels(bands: int) -> NDArray[np.float64]:
     """Return the level of average speech in each band in dB SPL, at 65 dB SPL in total.
 
-    >>> [round(level) for level in speech_band_levels(4)]
-    [60, 63, 53, 43]
+    >>> print(speech_band_levels(4).round())
+    [60. 63. 53. 43.]
     """
     powers = speech_density(GRID_POINTS) @ _band_shares(bands, GRID_POINTS)[1:]
-    return tuple((10.0 * np.log10(powers / powers.sum()) + SPEECH_SPL).tolist())
+    return 10.0 * np.log10(powers / powers.sum()) + SPEECH_SPL
 
 
 def speech_density(points: int) -> NDArray[np.float64]:

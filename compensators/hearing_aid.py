@@ -9,16 +9,13 @@ from torch.nn import functional
 from compensators.config import HearingAidConfig
 from compensators.filter_bank import (
     HISTORY,
-    band_centres,
     band_powers,
     frame_power,
     level_db,
 )
-from compensators.nalr import nalr_gains_db
 from compensators.smoothing import follow_peaks
-from compensators.stream import Stream
 from compensators.wearable import Slider, State, Wearable
-from hlsim.audiogram.thresholds import AudiogramLike, interpolate
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 
 DEFAULT_NOISE_REDUCTION = 0.5
@@ -98,6 +95,11 @@ class HearingAid(Wearable):
         self.config = config = config or HearingAidConfig()
         self.bands = config.bands
         self.limit_spl = config.limit_spl
+        self.state_shapes = {
+            "levels": (3, config.bands + 1),
+            "attenuation": (3, config.bands),
+            "hidden": (2, config.hidden),
+        }
         inner = config.inner
         corrections = nn.Linear(inner, config.bands)
         self.correct = nn.Sequential(
@@ -112,10 +114,9 @@ class HearingAid(Wearable):
         self.enter = nn.Linear(config.bands + config.bins, config.width)
         self.recur = nn.LSTM(config.width, config.hidden, batch_first=True)
         self.leave = nn.Linear(config.hidden + config.width, config.bands)
-        with torch.no_grad():
-            corrections.weight.zero_()
-            corrections.bias.zero_()
-            self.leave.bias.fill_(INITIAL_REDUCTION_LOGIT)
+        nn.init.zeros_(corrections.weight)
+        nn.init.zeros_(corrections.bias)
+        nn.init.constant_(self.leave.bias, INITIAL_REDUCTION_LOGIT)
 
     def train(self, mode: bool = True) -> Self:
         """Set the mode of all modules except the LSTM, which stays in training mode.
@@ -152,43 +153,6 @@ class HearingAid(Wearable):
                 outside 0 to 1, or shapes do not fit.
         """
         return self._process(waveform, audiogram, (noise_reduction, amplification))
-
-    def stream(
-        self,
-        audiogram: AudiogramLike,
-        noise_reduction: Slider = DEFAULT_NOISE_REDUCTION,
-        amplification: Slider = 1.0,
-    ) -> Stream:
-        """Return a function that processes a signal in chunks of any size, as it arrives.
-
-        The output is that for the whole signal, ``latency`` samples late. The sliders are
-        attributes of the stream that may be set between chunks.
-
-        Args:
-            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the chunks.
-            noise_reduction: Share of the attenuation of noise that is applied, 0 to 1.
-            amplification: Share of the amplification that is applied, 0 to 1.
-
-        Raises:
-            ValueError: The sample rate is not 16000 Hz, or an argument is not valid.
-        """
-        return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
-
-    def fit(self, thresholds: Tensor) -> Tensor:
-        # The hearing loss in each band, followed by NAL-R's gain in each band, both in dB
-        centres = band_centres(self.bands)
-        loss = interpolate(thresholds, centres)
-        prescribed = interpolate(nalr_gains_db(thresholds), centres)
-        return torch.cat((loss, prescribed), -1)
-
-    def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
-        items = len(sliders)
-        return super().initial_state(sliders) | {
-            "levels": sliders.new_zeros(items, 3, self.bands + 1),
-            "attenuation": sliders.new_zeros(items, 3, self.bands),
-            "hidden": sliders.new_zeros(items, 2, self.config.hidden),
-        }
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
@@ -238,10 +202,15 @@ class HearingAid(Wearable):
         loss, prescribed = fitted.chunk(2, -1)
         ear = torch.cat((loss / 50.0, prescribed / 20.0), -1)
         ear = ear.unsqueeze(1).expand(-1, level.shape[1], -1)
-        reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
+        positive_loss = loss.clamp_min(0.0)
+        reach = config.reach_db * positive_loss / (positive_loss + 10.0)
         features = torch.cat((ear, (levels - 40.0) / 20.0, (present - level) / 10.0), -1)
         correction = reach.unsqueeze(1) * torch.tanh(self.correct(features))
-        gain = (_restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
+        # The inverse of MSBG's recruitment: at a level of 105 dB SPL - loss, the ear perceives 0 dB
+        # SPL, and at 105 dB SPL it perceives the same as a normal ear.
+        below_no_gain = (NO_GAIN_SPL - level.clamp_min(SOFTEST_SPL)).clamp_min(0.0)
+        restoring_gain = (positive_loss / CATCH_UP_SPL).unsqueeze(1) * below_no_gain
+        gain = (restoring_gain + correction).clamp(0.0, config.cap_db)
         fade = ((total - config.quiet_spl) / QUIET_FADE_DB + 1.0).clamp(0.0, 1.0)
         return fade * gain, {"levels": memory}
 
@@ -265,19 +234,6 @@ class HearingAid(Wearable):
         gain = -config.reduction_db * torch.sigmoid(logits)
         gain, memory = follow_peaks(gain, state["attenuation"], config.opening, config.closing)
         return gain, {"attenuation": memory, "hidden": torch.stack((hidden, cell), 1)}
-
-
-def _restoring_gains(levels: Tensor, loss: Tensor) -> Tensor:
-    """Return the gain that makes a band as loud for an impaired ear as for a normal one.
-
-    It inverts MSBG's recruitment: at a level of 105 dB SPL - loss, the ear perceives 0 dB SPL, and
-    at 105 dB SPL it perceives the same as a normal ear.
-
-    Shape: (items, frames, bands) dB SPL, (items, bands) dB HL -> (items, frames, bands), 0 dB or
-        more.
-    """
-    share = (loss.clamp_min(0.0) / CATCH_UP_SPL).unsqueeze(1)
-    return share * (NO_GAIN_SPL - levels.clamp_min(SOFTEST_SPL)).clamp_min(0.0)
 
 
 def _lstm_step(lstm: nn.LSTM, frame: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,9 @@ from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.torchtools import constant_like
 
+ORDER = 220
+"""Order of the filter, which has one more tap."""
+
 BIAS_DB = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
 """Constant of NAL-R's formula at each of its frequencies."""
 
@@ -30,7 +33,7 @@ class NALR(nn.Module):
     NAL-R is the revised prescription of the National Acoustic Laboratories: Byrne and Dillon 1986,
     Ear and Hearing 7(4), and for severe losses Byrne, Parkinson and Newall 1990, Ear and Hearing
     11(1). The filter has linear phase, and is that of pyclarity 0.9.0 without its delay of
-    ``order / 2`` samples. It amplifies loud sounds as much as soft ones, and the output has no
+    110 samples. It amplifies loud sounds as much as soft ones, and the output has no
     limit.
 
     Args:
@@ -40,7 +43,6 @@ class NALR(nn.Module):
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0. It has no effect here; all
             compensators accept it.
-        order: Order of the filter, which has ``order + 1`` taps: an even number, 2 to 1022.
 
     Raises:
         ValueError: A value is out of range.
@@ -61,14 +63,10 @@ class NALR(nn.Module):
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
-        order: int = 220,
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        if order not in range(2, 1024, 2):
-            raise ValueError(f"expected an even order from 2 to 1022, got {order!r}")
-        self.order = order
         thresholds = store_thresholds(audiogram, highest=HIGHEST_LEVEL)
         self.register_buffer("thresholds", thresholds, persistent=False)
         self._two_ears = has_listeners(audiogram)
@@ -94,44 +92,39 @@ class NALR(nn.Module):
         with torch.autocast(waveform.device.type, enabled=False):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
-            points = scipy.fft.next_fast_len(time + self.order, real=True)
+            points = scipy.fft.next_fast_len(time + ORDER, real=True)
             taps = self._taps(thresholds).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
-            delay = self.order // 2
+            delay = ORDER // 2
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
             return output.to(waveform.dtype)
 
-    def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
+    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
         """Compute the insertion gains: the output level minus the input level at each frequency.
 
         Args:
-            audiogram: One or more ears, by default those that were passed to the constructor.
+            audiogram: One or more ears.
             level: Presentation level in dB SPL, which changes nothing here. All aids accept it.
 
         Returns:
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: There is no audiogram, or a threshold is outside -10 to 120 dB HL.
+            ValueError: A threshold is outside -10 to 120 dB HL.
 
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
         """
-        thresholds = self.thresholds
-        if audiogram is not None:
-            thresholds = as_thresholds(audiogram, highest=HIGHEST_LEVEL)
-        if thresholds is None:
-            raise ValueError("no audiogram; pass one to gains, or to NALR when building it")
-        return nalr_gains_db(thresholds)
+        return nalr_gains_db(as_thresholds(audiogram, highest=HIGHEST_LEVEL))
 
     def _taps(self, thresholds: Tensor) -> Tensor:
         """Return the taps of the filter for ears, symmetric around the middle one.
 
-        Shape: (..., 8) dB HL -> (..., order + 1).
+        Shape: (..., 8) dB HL -> (..., ORDER + 1).
         """
-        frequencies = np.linspace(0.0, self.sample_rate / 2.0, self.order + 1)
+        frequencies = np.linspace(0.0, self.sample_rate / 2.0, ORDER + 1)
         gains = interpolate(nalr_gains_db(thresholds.double()), tuple(frequencies.tolist()))
-        return (10.0 ** (gains / 20.0)) @ constant_like(gains, _design, self.order)
+        return (10.0 ** (gains / 20.0)) @ constant_like(gains, _design)
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
@@ -165,13 +158,14 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     return torch.where(has_no_loss, 0.0, all_gains)
 
 
-def _design(order: int) -> NDArray[np.float64]:
-    """Return the taps for a gain of 1 at each of ``order + 1`` evenly spaced frequencies.
+def _design() -> NDArray[np.float64]:
+    """Return the taps for a gain of 1 at each of ``ORDER + 1`` evenly spaced frequencies.
 
     The filter is linear in its gains.
 
-    Returns: (order + 1, order + 1), one row per frequency.
+    Returns: (ORDER + 1, ORDER + 1), one row per frequency.
     """
-    grid = np.arange(order + 1) / order
-    rows = [frequency_sampling_fir(order + 1, grid, gain) for gain in np.eye(order + 1)]
+    points = ORDER + 1
+    grid = np.arange(points) / ORDER
+    rows = [frequency_sampling_fir(points, grid, gain) for gain in np.eye(points)]
     return np.stack(rows)

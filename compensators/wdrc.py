@@ -3,12 +3,10 @@
 import torch
 from torch import Tensor
 
-from compensators.filter_bank import band_centres, band_powers, level_db, speech_band_levels
-from compensators.nalr import nalr_gains_db
+from compensators.filter_bank import band_powers, level_db, speech_band_levels
 from compensators.smoothing import follow_peaks
-from compensators.stream import Stream
 from compensators.wearable import State, Wearable
-from hlsim.audiogram.thresholds import AudiogramLike, interpolate
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
 from hlsim.torchtools import constant_like
@@ -63,6 +61,7 @@ class WDRC(Wearable):
         self.attack = attack
         self.release = release
         self.limit_spl = limit_spl
+        self.state_shapes = {"levels": (3, self.bands)}
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the output for a complete recording, time-aligned with the input.
@@ -80,32 +79,6 @@ class WDRC(Wearable):
         """
         return self._process(waveform, audiogram, ())
 
-    def stream(self, audiogram: AudiogramLike) -> Stream:
-        """Return a function that processes a signal in chunks of any size, as it arrives.
-
-        The output is that for the whole signal, ``latency`` samples late.
-
-        Args:
-            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the chunks.
-
-        Raises:
-            ValueError: The sample rate is not 16000 Hz, or the audiogram is not valid.
-        """
-        return Stream(self, audiogram)
-
-    def fit(self, thresholds: Tensor) -> Tensor:
-        # NAL-R's gain in each band in dB, followed by the compression ratio in each band
-        centres = band_centres(self.bands)
-        prescribed = interpolate(nalr_gains_db(thresholds), centres)
-        loss = interpolate(thresholds, centres)
-        ratios = 1.0 + ((loss - 10.0) / 40.0).clamp(0.0, 2.0)
-        return torch.cat((prescribed, ratios), -1)
-
-    def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
-        levels = sliders.new_zeros(len(sliders), 3, self.bands)
-        return super().initial_state(sliders) | {"levels": levels}
-
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -113,7 +86,8 @@ class WDRC(Wearable):
             level_db(band_powers(powers, self.bands)), state["levels"], self.attack, self.release
         )
         above_speech = levels - constant_like(levels, speech_band_levels, self.bands)
-        prescribed, ratios = fitted.chunk(2, -1)
+        loss, prescribed = fitted.chunk(2, -1)
+        ratios = 1.0 + ((loss - 10.0) / 40.0).clamp(0.0, 2.0)
         slope = (1.0 / ratios - 1.0).unsqueeze(1)
         gains = prescribed.unsqueeze(1) + slope * above_speech.clamp_min(-KNEE_DB)
         highest_gains = (self.limit_spl - levels).clamp_min(0.0)

@@ -1,4 +1,4 @@
-"""Base class of the wearable aids: hearing aids with a gain per band and a delay of 4 ms.
+"""Base class of the wearable aids, hearing aids with a delay of 4 ms, and their streams.
 
 Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms of its input (a
 *frame*). Terms of all methods:
@@ -12,8 +12,10 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
   aid itself stores none, so that whole signals, streams and exported programs run the same code.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -24,14 +26,18 @@ from compensators.filter_bank import (
     HOP,
     RATE,
     apply_gains,
+    band_centres,
     frame_power,
     gain_at_rate,
 )
 from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
+from compensators.nalr import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
+    as_thresholds,
     check_two_channels,
+    interpolate,
     resolve_thresholds,
 )
 from hlsim.calibration import check_full_scale, gain_to_pascals
@@ -51,9 +57,6 @@ SLIDER_STEP = 0.04
 BLOCK_SAMPLES = 320_000
 """Samples of all items that are processed together, which limits memory and changes no output."""
 
-RESAMPLER_LOOKAHEAD = 136
-"""Samples at 16 kHz by which resampling to 16 kHz and back looks ahead."""
-
 
 class Wearable(MeasuredAid):
     """Base class of hearing aids that amplify bands with a delay of 4 ms.
@@ -63,8 +66,8 @@ class Wearable(MeasuredAid):
     16 ms, every 4 ms, and interpolated linearly between these times.
 
     A slider is a control that the user may set from 0 to 1, such as the strength of noise
-    reduction. Subclasses define ``bands``, ``limit_spl``, ``fit`` and ``compute_gains``; if they
-    have sliders, ``SLIDERS``; and if their gains depend on the past, ``initial_state``.
+    reduction. Subclasses define ``bands``, ``limit_spl`` and ``compute_gains``; if they have
+    sliders, ``SLIDERS``; and if their gains depend on the past, ``state_shapes``.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
@@ -79,6 +82,8 @@ class Wearable(MeasuredAid):
         SLIDERS: Default value of each slider under its name.
         bands: Number of bands.
         limit_spl: Peak of the output in dB SPL.
+        state_shapes: Shape per item of each tensor that the subclass adds to the state, by name.
+        latency: Delay of a stream in samples at 16 kHz.
 
     Raises:
         ValueError: A rate or level is out of range.
@@ -90,8 +95,10 @@ class Wearable(MeasuredAid):
     """
 
     SLIDERS: ClassVar[dict[str, float]] = {}
+    latency = DELAY
     bands: int
     limit_spl: float
+    state_shapes: Mapping[str, tuple[int, ...]]
 
     def __init__(self, sample_rate: int, full_scale_spl: float, linked: bool = False) -> None:
         super().__init__()
@@ -99,20 +106,32 @@ class Wearable(MeasuredAid):
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
 
-    @property
-    def latency(self) -> int:
-        """Delay of a stream in samples, and look-ahead of the output for a whole signal."""
-        if self.sample_rate == RATE:
-            return DELAY
-        return -(-(DELAY + RESAMPLER_LOOKAHEAD) * self.sample_rate // RATE)
+    def stream(self, audiogram: AudiogramLike, **sliders: Slider) -> Stream:
+        """Return a function that processes a signal in chunks of any size, as it arrives.
+
+        The output is that for the whole signal, ``latency`` samples late. The sliders are
+        attributes of the stream that may be set between chunks.
+
+        Args:
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the chunks.
+            sliders: Value from 0 to 1 under each slider's name, such as ``noise_reduction``, one
+                number or one value per item; by default those of ``SLIDERS``.
+
+        Raises:
+            ValueError: The sample rate is not 16000 Hz, or the audiogram is not valid.
+            AttributeError: The aid has no such slider.
+        """
+        return Stream(self, audiogram, **sliders)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Compute the parameters of the aid for each ear, such as the prescribed gains.
+        """Compute the hearing loss in each band in dB HL, followed by NAL-R's gain in each in dB.
 
-        Shape: (items, 8) in dB HL -> (items, n), where n is the number of parameters that the
-            subclass needs for an ear.
+        Shape: (items, 8) in dB HL -> (items, 2 * bands).
         """
-        raise NotImplementedError
+        centres = band_centres(self.bands)
+        prescribed = interpolate(nalr_gains_db(thresholds), centres)
+        return torch.cat((interpolate(thresholds, centres), prescribed), -1)
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
@@ -126,8 +145,7 @@ class Wearable(MeasuredAid):
             state: Memory of earlier frames, as ``initial_state`` returns it.
 
         Returns:
-            The gains in dB, and the new values of those entries of the state that this class adds
-            to ``initial_state``.
+            The gains in dB, and the new values of the entries of the state in ``state_shapes``.
 
         Shape: (items, frames, FRAME / 2 + 1), (items, n), (items, frames, sliders) -> (items,
             frames, bands).
@@ -142,17 +160,14 @@ class Wearable(MeasuredAid):
 
         Returns: Named tensors, (items, ...) each, of the type and device of ``sliders``.
         """
-        past = sliders.new_zeros(len(sliders), HISTORY)
-        gains = sliders.new_zeros(len(sliders), 2, self.bands)
-        return {"past": past, "gains": gains, "gliding": sliders}
+        shapes = {"past": (HISTORY,), "gains": (2, self.bands), **self.state_shapes}
+        zeros = {name: sliders.new_zeros(len(sliders), *shape) for name, shape in shapes.items()}
+        return {**zeros, "gliding": sliders}
 
-    def excess_gains(
+    def process_hops(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the gain of each band for some hops of 64 samples (4 ms) of the input.
-
-        The filters delay the signal by one hop. While the first of these hops comes in, the
-        preceding one goes out, so the gains at the beginning and the end of that hop are included.
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Compute the output, before its limit, for some hops of 64 samples (4 ms) of the input.
 
         Args:
             samples: Input in pascals at 16 kHz.
@@ -163,10 +178,11 @@ class Wearable(MeasuredAid):
                 preceding hops returned.
 
         Returns:
-            Linear gains minus 1 at the ends of the two hops before the first one, followed by those
+            The output in pascals, delayed by 64 samples; linear gains minus 1 of the highest band
             at the end of each hop; and the state after the last hop.
 
-        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, 2 + hops, bands).
+        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, hops * HOP), (items,
+            hops).
         """
         padded = torch.cat((state["past"], samples), -1)
         powers = frame_power(padded)
@@ -174,27 +190,12 @@ class Wearable(MeasuredAid):
             powers = powers.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0)
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
         gains_db, changed_state = self.compute_gains(powers, fitted, gliding, state)
+        # While the first of these hops comes in, the preceding one goes out, because the filters
+        # delay by one hop: its two gains are in the state.
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
+        output = apply_gains(padded[:, HISTORY - 2 * DELAY :], gains[:, :-1])
         state = {"past": padded[:, -HISTORY:], "gains": gains[:, -2:], "gliding": gliding[:, -1]}
-        return gains, state | changed_state
-
-    def process_hops(
-        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Compute the output, before its limit, for some hops of 64 samples (4 ms) of the input.
-
-        The arguments are those of ``excess_gains``.
-
-        Returns:
-            The output in pascals, delayed by 64 samples; linear gains minus 1 of the highest band
-            at the end of each hop; and the state after the last hop.
-
-        Shape: (items, hops * HOP), (items, n), (items, sliders) -> (items, hops * HOP), (items,
-            hops).
-        """
-        gains, next_state = self.excess_gains(samples, fitted, sliders, state)
-        padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
-        return apply_gains(padded, gains[:, :-1]), gains[:, 2:, -1], next_state
+        return output, gains[:, 2:, -1], state | changed_state
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         sliders = signals.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
@@ -281,26 +282,131 @@ class Wearable(MeasuredAid):
             ValueError: A value is outside 0 to 1.
             RuntimeError: A shape does not broadcast to ``batch``.
         """
-        values = []
-        for name, slider in zip(self.SLIDERS, sliders, strict=True):
+        values = like.new_zeros(batch.numel(), len(self.SLIDERS))
+        for column, (name, slider) in enumerate(zip(self.SLIDERS, sliders, strict=True)):
             if not isinstance(slider, Tensor):
                 check_number(name, slider, 0.0, 1.0)
                 slider = like.new_full((), slider)
             in_range = (slider >= 0.0) & (slider <= 1.0)
             if slider.device.type == "cpu" and not bool(in_range.all()):
                 raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
-            value = torch.where(in_range, slider, torch.nan)
-            value = value.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
-            values.append(value.expand(batch))
-        if not values:
-            return like.new_zeros(batch.numel(), 0)
-        return torch.stack(values, -1).reshape(-1, len(values))
+            values[:, column] = torch.where(in_range, slider, torch.nan).expand(batch).flatten()
+        return values
 
-    def extra_repr(self) -> str:
-        return (
-            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
-            f"bands={self.bands}"
-        )
+
+class Stream:
+    """An aid for a signal that arrives in chunks: a function from a chunk to the next output.
+
+    Chunks may have any number of samples. The output has as many, and is delayed by ``aid.latency``
+    samples. It is that of the aid for the whole signal, without gradients.
+
+    Sliders of the aid, such as ``noise_reduction``, are attributes that may be set at any time.
+    They take 0.1 s from 0 to 1, so that nothing clicks. For more than eight items, a chunk needs at
+    least nine samples, because a smaller one looks like an array with time first.
+
+    Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
+
+    Args:
+        aid: Aid at 16 kHz.
+        audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the leading
+            dimensions of the chunks.
+        sliders: Value from 0 to 1 under each slider's name, one number or one value per item.
+
+    Raises:
+        ValueError: The aid has another sample rate, or rejects the ear; a call rejects the value of
+            a slider, other leading dimensions than before, and samples that are NaN or infinite,
+            which would affect all later output. After a rejected chunk, the stream goes on as if
+            there had been none.
+        AttributeError: An attribute is set that is not a slider of the aid.
+
+    >>> import hlsim
+    >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")
+    >>> stream.noise_reduction = 0.3
+    >>> stream(torch.zeros(100)).shape
+    torch.Size([100])
+    """
+
+    def __init__(self, aid: Wearable, audiogram: AudiogramLike, **sliders: Slider) -> None:
+        if aid.sample_rate != RATE:
+            raise ValueError(
+                f"expected an aid with sample_rate={RATE} for a stream, got {aid.sample_rate}; "
+                f"use such an aid, and resample the signal to {RATE} Hz"
+            )
+        as_thresholds(audiogram)  # the first chunk may come later
+        self._aid = aid
+        self._audiogram = audiogram
+        self._state: dict[str, Tensor] = {}  # empty before the first chunk
+        self._shape = self._batch = torch.Size()
+        self._partial_hop = self._fitted = self._sliders = torch.empty(0)
+        for name, slider in {**aid.SLIDERS, **sliders}.items():
+            setattr(self, name, slider)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name not in self._aid.SLIDERS:
+            sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
+            aid = type(self._aid).__name__
+            raise AttributeError(f"the stream of a {aid} has no slider {name}; it has {sliders}")
+        super().__setattr__(name, value)
+
+    def __call__(self, chunk: Tensor) -> Tensor:
+        check_waveform(chunk, "chunk", full_scale_spl=self._aid.full_scale_spl)
+        if not bool(chunk.isfinite().all()):
+            raise ValueError("expected finite samples in a chunk, got NaN or infinity")
+        with torch.no_grad(), torch.autocast(chunk.device.type, enabled=False):
+            self._prepare(chunk)
+            gain = gain_to_pascals(self._aid.full_scale_spl)
+            samples = flatten_items(chunk, self._batch, self._fitted.dtype) * gain
+            outputs = []
+            while samples.shape[-1] > 0:
+                count = HOP - self._partial_hop.shape[-1]
+                if count == HOP <= samples.shape[-1]:
+                    count = samples.shape[-1] // HOP * HOP
+                outputs.append(self._process(samples[:, :count]))
+                samples = samples[:, count:]
+            output = soft_limit(torch.cat(outputs, -1), self._aid.limit_spl) / gain
+            return output.reshape(*self._batch, -1).to(chunk.dtype)
+
+    def flush(self) -> Tensor:
+        """Return the output that is still missing because of the delay, and begin again.
+
+        The next chunk is the beginning of another signal.
+
+        Shape: -> (..., latency), with the leading dimensions of the chunks.
+        """
+        rest = self(self._fitted.new_zeros(*self._shape, DELAY))
+        self._state = {}
+        return rest
+
+    def _prepare(self, chunk: Tensor) -> None:
+        """Fit the aid to the ears with the first chunk, and read the sliders."""
+        is_first = not self._state
+        if is_first:
+            self._shape = chunk.shape[:-1]
+            self._batch, self._fitted = self._aid.prepare(chunk, self._audiogram)
+        elif chunk.shape[:-1] != self._shape:
+            raise ValueError(
+                f"expected a chunk of shape {(*self._shape, 'time')} as before, "
+                f"got {tuple(chunk.shape)}"
+            )
+        values = [getattr(self, name) for name in self._aid.SLIDERS]
+        self._sliders = self._aid.stack_sliders(values, self._batch, self._fitted)
+        if is_first:
+            self._state = self._aid.initial_state(self._sliders)
+            self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
+
+    def _process(self, samples: Tensor) -> Tensor:
+        """Process whole hops, or samples that do not go beyond the end of the current hop."""
+        position, time, state = self._partial_hop.shape[-1], samples.shape[-1], self._state
+        self._partial_hop = hops = torch.cat((self._partial_hop, samples), -1)
+        if hops.shape[-1] % HOP == 0:
+            self._partial_hop = hops[:, :0]
+            output, _, self._state = self._aid.process_hops(
+                hops, self._fitted, self._sliders, state
+            )
+            if position == 0:
+                return output
+        padded = torch.cat((state["past"], hops), -1)[:, -2 * DELAY - time :]
+        return apply_gains(padded, state["gains"], position)
 
 
 def _glide(start: Tensor, target: Tensor, frames: int) -> Tensor:

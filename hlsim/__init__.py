@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from hlsim.audiogram.listener import Listener
     from hlsim.audiogram.table import read_audiograms
     from hlsim.checkpoint import list_pretrained
-    from hlsim.losses.haspi_loss import HASPILoss
-    from hlsim.losses.hearing_loss import HearingLossLoss
+    from hlsim.losses.hearing_loss import HASPILoss, HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
     from hlsim.neuro import NeuroMSBG, load_pretrained
     from hlsim.shortcuts import compensate, example_speech, info, listen, load_audio, simulate
@@ -61,8 +60,7 @@ _NAMES = {
     "hlsim.audiogram.listener": ["Listener"],
     "hlsim.audiogram.table": ["read_audiograms"],
     "hlsim.checkpoint": ["list_pretrained"],
-    "hlsim.losses.haspi_loss": ["HASPILoss"],
-    "hlsim.losses.hearing_loss": ["HearingLossLoss"],
+    "hlsim.losses.hearing_loss": ["HASPILoss", "HearingLossLoss"],
     "hlsim.msbg": ["MSBG", "estimate_delay"],
     "hlsim.neuro": ["NeuroMSBG", "load_pretrained"],
     "hlsim.shortcuts": "compensate example_speech info listen load_audio simulate".split(),

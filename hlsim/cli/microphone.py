@@ -1,7 +1,7 @@
 """Live processing from microphone to headphones: the function per block, and the loop around it.
 
 A *stream* is a function from a block of samples to its output, which remembers what it needs of
-earlier blocks: a ``compensators.stream.Stream`` or a ``SimulatedStream``.
+earlier blocks: a ``compensators.wearable.Stream`` or a ``SimulatedStream``.
 """
 
 from __future__ import annotations

@@ -61,9 +61,9 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     >>> levels.shape
     torch.Size([63, 24])
     """
-    stft, shares = band_analysis(waveform, sample_rate)
+    stft, shares, scale = band_analysis(waveform, sample_rate)
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
-    powers = (power(spectrum) * spectrum_scale(stft)) @ shares
+    powers = (power(spectrum) * scale) @ shares
     levels = 10.0 * torch.log10(powers + LOWEST_POWER) + PASCAL_SPL
     return levels.reshape(*waveform.shape[:-1], *levels.shape[-2:])
 
@@ -144,37 +144,28 @@ def audibility_weights(levels: Tensor, threshold: Tensor) -> Tensor:
     return ((levels.detach() - threshold) / RISE).clamp(0.0, 1.0)
 
 
-def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor]:
-    """Return what computes band powers: a short-time Fourier transform, and weights of its bins.
+def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor, float]:
+    """Return what computes band powers: a Fourier transform, weights of its bins, and a factor.
 
     Args:
         like: Tensor with the type and the device of the weights.
         sample_rate: Sample rate in Hz.
 
     Returns:
-        The transform, and the share of each of its frequencies in each band, (frequencies, 24). The
-        powers of a spectrum times these shares are the powers in bands.
+        The short-time Fourier transform; the share of each of its frequencies in each band,
+        (frequencies, 24); and the factor from the squared magnitude of a spectrum, times these
+        shares, to the powers of a signal in bands.
 
-    >>> stft, shares = band_analysis(torch.zeros(1), sample_rate=16000)
-    >>> stft.hop, shares.shape
-    (256, torch.Size([257, 24]))
+    >>> stft, shares, scale = band_analysis(torch.zeros(1), sample_rate=16000)
+    >>> stft.hop, shares.shape, round(scale * 512**2, 3)
+    (256, torch.Size([257, 24]), 5.333)
     """
     hop = round(FRAME_SECONDS / 2.0 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
     shares = constant(_band_shares, stft.fft, sample_rate, dtype=like.dtype, device=like.device)
-    return stft, shares
-
-
-def spectrum_scale(stft: STFT) -> float:
-    """Return the factor that turns squared magnitudes of a spectrum into powers of the signal.
-
-    The powers of all frequencies then add up to the mean square of the signal. The factor counts
-    positive and negative frequencies. The squares of a Hann window of n samples sum to 3 n / 8.
-
-    >>> spectrum_scale(STFT(512, 512, 256)) * 512**2 * 3 / 16
-    1.0
-    """
-    return 2.0 / (stft.fft * 0.375 * stft.window)
+    # Positive and negative frequencies count. The squares of a Hann window of n samples sum to
+    # 3 n / 8.
+    return stft, shares, 2.0 / (stft.fft * 0.375 * stft.window)
 
 
 def band_edges() -> NDArray[np.float64]:
@@ -194,8 +185,7 @@ def band_centres() -> NDArray[np.float64]:
     1423.0
     """
     edges = band_edges()
-    centres: NDArray[np.float64] = np.sqrt(edges[1:] * edges[:-1])
-    return centres
+    return np.sqrt(edges[1:] * edges[:-1])
 
 
 def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
@@ -217,7 +207,4 @@ def threshold_in_quiet() -> NDArray[np.float64]:
     2.0
     """
     khz = band_centres() / 1000.0
-    levels: NDArray[np.float64] = (
-        3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4
-    )
-    return levels
+    return 3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4

@@ -37,7 +37,7 @@ from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
-from hlsim.losses.band_levels import band_analysis, spectrum_scale, threshold_in_quiet
+from hlsim.losses.band_levels import band_analysis, threshold_in_quiet
 from hlsim.torchtools import constant
 
 DEFAULT_WEIGHTS = {
@@ -120,8 +120,8 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
     >>> {name: round(part.item(), 2) + 0.0 for name, part in parts.items()}
     {'incoherence': 0.0, 'misalignment': 0.0, 'levels': 10.99, 'louder': 0.0}
     """
-    stft, shares = band_analysis(perceived, sample_rate)
-    shares = shares * spectrum_scale(stft)
+    stft, shares, scale = band_analysis(perceived, sample_rate)
+    shares = shares * scale
     spectrum, reference = stft.analyse(perceived), stft.analyse(normal)
     level = _average_segments(power(spectrum) @ shares)
     reference_level = _average_segments(power(reference) @ shares)
@@ -286,5 +286,4 @@ def _decibels(powers: Tensor) -> Tensor:
 
 def _quiet_power() -> NDArray[np.float64]:
     """Return the power of each band at the threshold of hearing, (24,)."""
-    powers: NDArray[np.float64] = 10.0 ** ((threshold_in_quiet() - PASCAL_SPL) / 10.0)
-    return powers
+    return 10.0 ** ((threshold_in_quiet() - PASCAL_SPL) / 10.0)

@@ -98,7 +98,7 @@ class FrozenSimulator:
         for item, ear, end in zip(items, ears, lengths.expand(batch).flatten(), strict=True):
             perceived = self.simulator(item[:end], ear)
             outputs.append(functional.pad(perceived, (0, time - int(end))))
-        return check_shape(torch.stack(outputs), "simulator", items.shape).reshape(*batch, time)
+        return torch.stack(outputs).reshape(*batch, time)
 
     def reference(
         self,
@@ -128,22 +128,21 @@ class FrozenSimulator:
         choice = self.choice or ("clean" if criterion == "paper" else "normal-hearing")
         if criterion in ("coherent-bands", "bands"):
             choice = "normal-hearing"
-        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
-            reference = clean = self._limit_band(clean)
-            if choice == "normal-hearing" and self.normal is not None:
-                reference = check_shape(self.normal(clean), "normal ear", clean.shape)
-            elif choice == "normal-hearing":
-                if self._has_bank_phase and criterion not in ("bands", "paper"):
-                    items = flatten_items(clean, batch, clean.dtype)
-                    return simulate_normal_ear(items, ears, self.sample_rate).reshape(shape)
-                cpu = torch.device("cpu")
-                no_loss = constant(np.zeros, len(FREQUENCIES), dtype=clean.dtype, device=cpu)
-                reference = self.simulate(clean, on_device(no_loss, clean.device), lengths)
-            if criterion == "bands" or not self._has_bank_phase:
-                return reference.expand(shape)
-            items = flatten_items(reference, batch, clean.dtype)
-            normal = choice == "normal-hearing"
-            return apply_bank_phase(items, ears, self.sample_rate, normal=normal).reshape(shape)
+        reference = clean = self._limit_band(clean)
+        if choice == "normal-hearing" and self.normal is not None:
+            reference = check_shape(self.normal(clean), "normal ear", clean.shape)
+        elif choice == "normal-hearing":
+            if self._has_bank_phase and criterion not in ("bands", "paper"):
+                items = flatten_items(clean, batch, clean.dtype)
+                return simulate_normal_ear(items, ears, self.sample_rate).reshape(shape)
+            cpu = torch.device("cpu")
+            no_loss = constant(np.zeros, len(FREQUENCIES), dtype=clean.dtype, device=cpu)
+            reference = self.simulate(clean, on_device(no_loss, clean.device), lengths)
+        if criterion == "bands" or not self._has_bank_phase:
+            return reference.expand(shape)
+        items = flatten_items(reference, batch, clean.dtype)
+        normal = choice == "normal-hearing"
+        return apply_bank_phase(items, ears, self.sample_rate, normal=normal).reshape(shape)
 
     def _limit_band(self, clean: Tensor) -> Tensor:
         """Remove the frequencies above those that the simulator returns."""

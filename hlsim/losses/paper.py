@@ -134,14 +134,12 @@ class _FadedPhaseDifference(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         estimate, target = ctx.saved_tensors
-        estimate_slope = target_slope = None
-        if ctx.needs_input_grad[0]:
-            estimate_slope = _times_i(estimate, -gradient * _fade_weight(estimate, target))
-        if ctx.needs_input_grad[1]:
-            target_slope = _times_i(target, gradient * _fade_weight(target, estimate))
-        return estimate_slope, target_slope
+        return (
+            _times_i(estimate, -gradient * _fade_weight(estimate, target)),
+            _times_i(target, gradient * _fade_weight(target, estimate)),
+        )
 
 
 def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:

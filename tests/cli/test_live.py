@@ -146,7 +146,7 @@ def test_each_ear_gets_the_signal_of_its_microphone_or_of_the_only_one(
 
 def test_keys_move_the_sliders_that_a_stream_has() -> None:
     aid: Any = varied_hearing_aid()
-    live = Live(aid.stream(EAR, 1.0, 0.5), 94.0)
+    live = Live(aid.stream(EAR, noise_reduction=1.0, amplification=0.5), 94.0)
     for key in "nnnNaAAx":
         live.press(key)
     assert live.status() == "noise reduction 0.8 (n/N), amplification 0.6 (a/A), drop-outs 0"

@@ -123,7 +123,6 @@ def test_a_saved_aid_is_the_same_when_loaded(name: str, tmp_path: Path, utteranc
 
 
 BAD_SETTINGS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
-    *((NALR, {"order": order}) for order in (221, "220", 0, 1024)),
     (NALR, {"audiogram": torch.full((8,), 121.0)}),
     (NALR, {"sample_rate": 8000}),
     *((WDRC, {name: 200.0}) for name in ("attack", "release", "limit_spl")),

@@ -53,7 +53,7 @@ def test_each_slider_has_its_own_effect_for_each_item(utterance: Tensor) -> None
 def test_a_slider_moves_in_a_stream_without_a_click() -> None:
     """Beside a tone, everything farther away than 100 Hz stays 40 dB below it."""
     aid: Any = varied_hearing_aid()
-    stream = aid.stream(EAR, 0.0, 0.0)
+    stream = aid.stream(EAR, noise_reduction=0.0, amplification=0.0)
     before, after = tone(1000.0, 60.0, 2.0).split(16000)
     outputs = [stream(before)]
     stream.amplification = 1.0
@@ -68,7 +68,7 @@ def test_a_slider_moves_in_a_stream_without_a_click() -> None:
 def test_sliders_of_a_stream_are_tensors_or_numbers_by_name() -> None:
     aid: Any = varied_hearing_aid()
     slider, signal = torch.tensor(0.5), torch.randn(2000)
-    by_tensor, by_number = aid.stream(EAR, slider), aid.stream(EAR)
+    by_tensor, by_number = aid.stream(EAR, noise_reduction=slider), aid.stream(EAR)
     assert torch.equal(by_tensor(signal), by_number(signal))
     slider.fill_(0.0)
     by_number.noise_reduction = 0.0

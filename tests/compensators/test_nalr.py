@@ -12,13 +12,13 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.training.ears import draw_thresholds
 
 
-def pyclarity_nalr(waveform: Tensor, ear: Audiogram, rate: int, order: int = 220) -> np.ndarray:
+def pyclarity_nalr(waveform: Tensor, ear: Audiogram, rate: int) -> np.ndarray:
     """Compute the output of pyclarity's filter without its delay."""
     module = pytest.importorskip("clarity.enhancer.nalr")
-    model = module.NALR(order, rate)
+    model = module.NALR(220, rate)
     taps, _ = model.build(ear.to_clarity())
     output = model.apply(taps, waveform.double().numpy())
-    return output[order // 2 : order // 2 + len(waveform)]
+    return output[110 : 110 + len(waveform)]
 
 
 @pytest.mark.parametrize("rate", [16000, 22050, 44100])
@@ -30,15 +30,14 @@ def test_equals_pyclarity(name: str, rate: int) -> None:
     assert np.abs(output - expected).max() < 1e-4 * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("order", [64, 220])
-def test_equals_pyclarity_on_drawn_ears_and_another_grid(order: int) -> None:
+def test_equals_pyclarity_on_drawn_ears_and_another_grid() -> None:
     waveform = torch.randn(2000, dtype=torch.float64)
     drawn = draw_thresholds(12, torch.Generator().manual_seed(3)).tolist()
     ears = [Audiogram(tuple(levels)) for levels in drawn]
     ears.append(Audiogram((10.0, 20.0, 35.0, 60.0, 75.0), (125.0, 500.0, 1500.0, 3000.0, 7000.0)))
     for ear in ears:
-        output = NALR(torch.tensor(ear.thresholds).double(), order=order)(waveform).numpy()
-        expected = pyclarity_nalr(waveform, ear, 16000, order)
+        output = NALR(torch.tensor(ear.thresholds).double())(waveform).numpy()
+        expected = pyclarity_nalr(waveform, ear, 16000)
         tolerance = 1e-9 if ear.frequencies == FREQUENCIES else 1e-4
         assert np.abs(output - expected).max() < tolerance * np.abs(expected).max()
 
