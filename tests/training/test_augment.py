@@ -15,27 +15,20 @@ def tones(*hz: float, rate: int = 16000, seconds: float = 0.5) -> Tensor:
     return torch.stack([torch.sin(2 * torch.pi * f * time) for f in hz])
 
 
-def test_mix_has_the_ratio_asked_for_and_leaves_the_speech() -> None:
-    speech, noise = 0.03 * torch.randn(4, 2000), 7.0 * torch.randn(4, 2000)
-    snr = torch.tensor([-5.0, 0.0, 10.0, 20.0])
+def test_mix_has_the_ratio_asked_for_without_pauses_if_a_rate_is_stated() -> None:
+    speech, noise = 0.03 * torch.randn(2, 48000), 7.0 * torch.randn(2, 48000)
+    speech[0, 16000:] = 0.0  # a third is speech, 4.8 dB
+    snr = torch.tensor([-5.0, 20.0])
     added = mix(speech, noise, snr) - speech
-    measured = level_spl(speech) - level_spl(added)
-    torch.testing.assert_close(measured, snr, atol=0.01, rtol=0)
-    # only the noise's level is changed
+    torch.testing.assert_close(level_spl(speech) - level_spl(added), snr, atol=0.01, rtol=0)
     torch.testing.assert_close(
         added / added.norm(dim=-1, keepdim=True), noise / noise.norm(dim=-1, keepdim=True)
     )
-
-
-def test_mix_by_the_active_level_does_not_count_pauses() -> None:
-    speech, noise = 0.03 * torch.randn(2, 48000), torch.randn(2, 48000)
-    speech[0, 16000:] = 0.0  # a third is speech, 4.8 dB
-    added = mix(speech, noise, torch.full((2,), 10.0), 16000) - speech
+    active = mix(speech, noise, snr, 16000) - speech
     for item in range(2):
         level = active_level_db(speech[item], 16000)
-        assert level - float(dbfs(added[item])) == pytest.approx(10.0, abs=0.01)
-    assert float(level_spl(speech[0]) - level_spl(added[0])) < 7.0
-    assert not bool(mix(0 * speech, noise, torch.zeros(2), 16000).isnan().any())
+        assert level - float(dbfs(active[item])) == pytest.approx(float(snr[item]), abs=0.01)
+    assert float(level_spl(active[0]) - level_spl(added[0])) > 3.0
 
 
 @pytest.mark.parametrize("rate", [16000, 44100])

@@ -32,19 +32,14 @@ def test_clips_are_pieces_of_the_recordings(tmp_path: Path) -> None:
         torch.testing.assert_close(clips.read_recording(index), whole, atol=step, rtol=0)
         torch.testing.assert_close(clips.cut_clip(index, 0.0), whole[:1600], atol=step, rtol=0)
         torch.testing.assert_close(clips.cut_clip(index, 1.0), whole[-1600:], atol=step, rtol=0)
-        middle = (len(whole) - 1600) // 2
-        torch.testing.assert_close(
-            clips.cut_clip(index, 0.5), whole[middle : middle + 1600], atol=step, rtol=0
-        )
 
 
 def test_short_recordings_end_in_silence_or_are_repeated(tmp_path: Path) -> None:
     folder = folder_with(tmp_path, a=ramp(700))
-    silent = Clips(folder, sample_rate=16000, seconds=0.1).cut_clip(0, 0.7)
-    torch.testing.assert_close(silent[:700], ramp(700), atol=1e-4, rtol=0)
-    assert silent.shape == (1600,) and not bool(silent[700:].any())
-    repeated = Clips(folder, sample_rate=16000, seconds=0.1, repeat=True).cut_clip(0, 0.0)
-    torch.testing.assert_close(repeated, ramp(700).repeat(3)[:1600], atol=1e-4, rtol=0)
+    once = torch.cat((ramp(700), torch.zeros(900)))
+    for repeat, expected in ((False, once), (True, ramp(700).repeat(3)[:1600])):
+        clip = Clips(folder, sample_rate=16000, seconds=0.1, repeat=repeat).cut_clip(0, 0.0)
+        torch.testing.assert_close(clip, expected, atol=1e-4, rtol=0)
 
 
 def test_other_rates_are_resampled_and_the_first_channel_is_taken(tmp_path: Path) -> None:
@@ -57,32 +52,14 @@ def test_other_rates_are_resampled_and_the_first_channel_is_taken(tmp_path: Path
     torch.testing.assert_close(clip[200:-200], expected[200:-200], atol=3e-2, rtol=0)
 
 
-def test_drawing_depends_on_the_generator_and_reaches_all(speech_dir: Path) -> None:
-    clips = Clips(speech_dir / "train", sample_rate=16000, seconds=0.25)
-    first = clips.draw(40, torch.Generator().manual_seed(1))
-    assert first.shape == (40, 4000)
-    again = Clips(speech_dir / "train", sample_rate=16000, seconds=0.25)
-    assert torch.equal(first, again.draw(40, torch.Generator().manual_seed(1)))
-    assert not torch.equal(first, clips.draw(40, torch.Generator().manual_seed(2)))
-    assert float(first.abs().max()) <= 1.0
-    assert len({index for index in clips._recordings}) > 10  # of the 14 recordings
-
-
-def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
-    wave = torch.zeros(40000)
-    wave[20000:24000] = torch.randn(4000).clamp(-1, 1)
-    clips = Clips(folder_with(tmp_path, a=wave), sample_rate=16000, seconds=0.1)
-    drawn = clips.draw(20, torch.Generator().manual_seed(0))
-    assert float(drawn.square().mean(-1).min()) > 1e-7
-
-
-def test_drawing_ends_where_all_clips_are_silent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_drawn_clip_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hlsim.training.clips.MAX_FAILURES", 300)
     wave = torch.zeros(40000)
-    wave[-1] = 1.0  # of 24,001 places only the last reaches it
+    wave[20000:24000] = torch.randn(4000).clamp(-1, 1)
     folder = folder_with(tmp_path, a=wave)
+    drawn = Clips(folder, sample_rate=16000, seconds=0.1).draw(20, torch.Generator())
+    assert float(drawn.square().mean(-1).min()) > 1e-7
+    folder_with(tmp_path, a=torch.eye(1, 40000)[0].flip(0))  # Only the last place is not silent.
     with pytest.raises(ValueError, match=r"300 draws .*a\.wav"):
         Clips(folder, sample_rate=16000, seconds=1.0).draw(1, torch.Generator().manual_seed(0))
 
@@ -126,5 +103,6 @@ def test_a_file_that_cannot_be_used_causes_one_warning_and_another_draw(tmp_path
     for message, name in zip(messages, "bce", strict=True):
         assert f"{tmp_path / name}.wav: " in message
     assert first.shape == (30, 1600) and bool((first > 0.5).any()) and bool((first < -0.5).any())
-    # Draws do not depend on whether the bad files are already known.
+    # Draws depend on the generator, and not on whether the bad files are already known.
     assert torch.equal(first, clips.draw(30, torch.Generator().manual_seed(2)))
+    assert not torch.equal(first, clips.draw(30, torch.Generator().manual_seed(3)))

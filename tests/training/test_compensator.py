@@ -9,7 +9,7 @@ import torch
 
 pytest.importorskip("lightning")
 
-from compensators import HearingAid, load_compensator
+from compensators import load_compensator
 from hlsim import Audiogram
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
@@ -32,15 +32,14 @@ SMALL_AID = replace(SMALL, kind="hearing-aid", model={"width": 8, "hidden": 8})
 N3 = Audiogram.standard("N3")
 
 
-def train(data: TrainingData, recipe: CompensatorRecipe, out: Path, **options: Any) -> Path:
-    """Train through the exact MSBG, or through another simulator."""
+def train(data: TrainingData, recipe: CompensatorRecipe, out: Path, **options: Any) -> Any:
+    """Train through the exact MSBG or another simulator, and return the checkpoint's record."""
     settings = {"simulator": "msbg", "accelerator": "cpu"} | options
-    return train_compensator(data, recipe, out=out, **settings)
+    return read_record(train_compensator(data, recipe, out=out, **settings))["about"]
 
 
-def draw(recipe: CompensatorRecipe, data: TrainingData, count: int, seed: int = 0) -> Batch:
-    batches = compensator_data(data, replace(recipe, batch=count, seed=seed), None)
-    return batches.training[0]
+def draw(recipe: CompensatorRecipe, data: TrainingData, count: int) -> Batch:
+    return compensator_data(data, replace(recipe, batch=count), None).training[0]
 
 
 @pytest.fixture
@@ -49,38 +48,38 @@ def noisy(data: TrainingData) -> TrainingData:
     return TrainingData(data.speech, noise=data.speech, valid_speech=data.valid_speech)
 
 
-def test_a_personal_compensator_learns_from_random_weights(
-    data: TrainingData, tmp_path: Path
+@pytest.mark.parametrize(
+    "recipe",
+    [SMALL, replace(SMALL_AID, weights={"coherent-bands": 1.0, "denoising": 10.0}, unreduced=0.5)],
+)
+def test_an_aid_learns_from_random_weights(
+    noisy: TrainingData, tmp_path: Path, recipe: CompensatorRecipe
 ) -> None:
-    recipe = replace(SMALL, steps=10, learning_rate=0.02)
-    about = read_record(train(data, recipe, tmp_path, audiogram=N3))["about"]
+    recipe = replace(recipe, steps=10, learning_rate=0.02)
+    about = train(noisy, recipe, tmp_path, audiogram=N3)
     assert about["audiogram"] == N3.to_dict() and about["simulator"] == "msbg"
     assert about["validation"]["valid_loss"] < about["start_validation"]["valid_loss"]
+    load_compensator(tmp_path / "checkpoint")
 
 
-def test_another_ear_or_simulator_needs_another_folder(data: TrainingData, tmp_path: Path) -> None:
+def test_another_simulator_needs_another_folder(data: TrainingData, tmp_path: Path) -> None:
     config = NeuroConfig(channels=4, blocks=1)
     simulator = tmp_path / "simulator"
-
-    def save_simulator() -> None:
-        save_checkpoint(simulator, "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
-
-    save_simulator()
-    train(data, SMALL, tmp_path / "out", audiogram=N3, simulator=simulator)
-    with pytest.raises(ValueError, match="differs in audiogram;"):
-        train(data, SMALL, tmp_path / "out", simulator=simulator)
-    save_simulator()  # with other random weights
+    save_checkpoint(simulator, "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
+    train(data, SMALL, tmp_path / "out", simulator=simulator)
+    save_checkpoint(simulator, "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
     with pytest.raises(ValueError, match="differs in simulator_sha256;"):
-        train(data, SMALL, tmp_path / "out", audiogram=N3, simulator=simulator)
+        train(data, SMALL, tmp_path / "out", simulator=simulator)
 
 
 def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_path: Path) -> None:
-    recipe = replace(SMALL, model={}, start="compensator-general", learning_rate=10.0)
-    folder = train(data, recipe, tmp_path)
-    about = read_record(folder)["about"]
+    start = load_compensator("compensator-general")
+    model = start.config.to_dict()  # type: ignore[union-attr]
+    recipe = replace(SMALL, model=model, start="compensator-general", learning_rate=10.0)
+    about = train(data, recipe, tmp_path)
     assert about["steps"] == 0
     assert about["start_sha256"] == read_record("compensator-general")["sha256"]
-    start, saved = load_compensator("compensator-general"), load_compensator(folder)
+    saved = load_compensator(tmp_path / "checkpoint")
     for initial, final in zip(start.parameters(), saved.parameters(), strict=True):
         assert torch.equal(initial, final)
 
@@ -89,22 +88,14 @@ def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_p
     "settings",
     [
         {"start": "nalr"},
-        {"start": "none"},
         {"start": "neuro-msbg"},
         {"start": "compensator-general"},  # whose model is another
-        {"model": {"layers": 2}},
         {"kind": "hearing-aid", "model": {"channels": 2}},
     ],
 )
 def test_networks_that_cannot_be_trained(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         CompensatorTraining(replace(SMALL, **settings), simulator="msbg")
-
-
-def test_the_model_of_a_start_may_be_repeated() -> None:
-    config: Any = load_compensator("compensator-general").config
-    recipe = replace(SMALL, start="compensator-general", model=config.to_dict())
-    assert CompensatorTraining(recipe, simulator="msbg").network.config == config
 
 
 def test_a_general_compensator_draws_ears_and_noise(noisy: TrainingData, tmp_path: Path) -> None:
@@ -123,45 +114,25 @@ def test_a_general_compensator_draws_ears_and_noise(noisy: TrainingData, tmp_pat
 
 def test_haspi_is_a_criterion_of_speech_tones_and_clicks(data: TrainingData) -> None:
     weights = {"coherent-bands": 1.0, "haspi": 0.3}
-    recipe = replace(SMALL, weights=weights, seconds=0.8, sounds=0.6)
+    recipe = replace(SMALL, weights=weights, seconds=0.7, sounds=0.5)
     module = CompensatorTraining(recipe, simulator="msbg")
-    batch = draw(recipe, data, 4, seed=1)
+    batch = draw(recipe, data, 8)
     assert bool((batch["clean"].count_nonzero(dim=-1) <= 8).any())
     check_gradients(module, batch)
 
 
-def test_a_hearing_aid_learns_to_amplify_and_to_reduce_noise(
-    noisy: TrainingData, tmp_path: Path
-) -> None:
-    weights = {"coherent-bands": 1.0, "denoising": 10.0}
-    recipe = replace(SMALL_AID, steps=10, learning_rate=0.02, weights=weights, unreduced=0.5)
-    folder = train(noisy, recipe, tmp_path)
-    about = read_record(folder)["about"]
-    assert about["validation"]["valid_loss"] < about["start_validation"]["valid_loss"]
-    assert isinstance(load_compensator(folder), HearingAid)
-
-
-def test_noise_reduction_is_off_for_its_share_of_the_items(data: TrainingData) -> None:
-    recipe = replace(SMALL_AID, unreduced=0.5)
-    sliders = draw(recipe, data, 64)["noise_reduction"]
-    assert set(sliders.tolist()) == {0.0, 1.0} and 0.3 < float(sliders.mean()) < 0.7
-    for batch in compensator_data(data, replace(recipe, unreduced=1.0), None).validation:
-        assert batch["noise_reduction"].count_nonzero() == 0
-
-
 @pytest.mark.parametrize(
-    ("weights", "unreduced", "frozen"),
+    ("weights", "frozen"),
     [
-        ({"denoising": 1.0, "intelligibility": 1.0}, 0.0, {"correct"}),
-        ({"coherent-bands": 1.0}, 1.0, {"enter", "recur", "leave"}),
-        ({"coherent-bands": 1.0}, 0.5, {"enter", "recur", "leave"}),
-        ({"coherent-bands": 1.0, "denoising": 1.0}, 0.5, set()),
+        ({"denoising": 1.0, "intelligibility": 1.0}, {"correct"}),
+        ({"coherent-bands": 1.0}, {"enter", "recur", "leave"}),
+        ({"coherent-bands": 1.0, "denoising": 1.0}, set()),
     ],
 )
 def test_parts_of_a_hearing_aid_without_a_criterion_are_frozen(
-    noisy: TrainingData, weights: dict[str, float], unreduced: float, frozen: set[str]
+    noisy: TrainingData, weights: dict[str, float], frozen: set[str]
 ) -> None:
-    recipe = replace(SMALL_AID, seconds=0.8, noisy=1.0, weights=weights, unreduced=unreduced)
+    recipe = replace(SMALL_AID, seconds=0.8, noisy=1.0, weights=weights, unreduced=0.5)
     module = CompensatorTraining(recipe, simulator="msbg")
     module.training_loss(draw(recipe, noisy, 2)).backward()
     trained = {
@@ -172,28 +143,21 @@ def test_parts_of_a_hearing_aid_without_a_criterion_are_frozen(
     assert len(trained) == 4
 
 
-def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
-    def clicks(sounds: float) -> int:
-        clean = draw(replace(SMALL, equalised=0.0, sounds=sounds), data, 64)["clean"]
-        return int((clean.count_nonzero(dim=-1) <= 8).sum())  # every second sound is a few clicks
-
-    assert clicks(0.0) == 0 and 5 < clicks(0.4) < 21 and clicks(1.0) == 32
-
-
 def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: TrainingData) -> None:
-    recipe = replace(SMALL, equalised=0.0, noisy=1.0)
-    sounds = draw(replace(recipe, sounds=1.0), noisy, 2)
-    assert torch.equal(sounds["signal"], sounds["clean"])
-    speech = draw(replace(recipe, babble=1.0), noisy, 2)
+    recipe = replace(SMALL_AID, equalised=0.0, noisy=1.0, sounds=0.4, unreduced=0.5)
+    batch = draw(recipe, noisy, 64)
+    is_click = batch["clean"].count_nonzero(dim=-1) <= 8  # Every second sound is a few clicks.
+    assert 5 < int(is_click.sum()) < 21
+    assert torch.equal(batch["signal"][is_click], batch["clean"][is_click])
+    sliders = batch["noise_reduction"]
+    assert set(sliders.tolist()) == {0.0, 1.0} and 0.3 < float(sliders.mean()) < 0.7
+    speech = draw(replace(recipe, sounds=0.0, babble=1.0), noisy, 2)
     noise = speech["signal"] - speech["clean"]
     other_voices = speech["clean"].flip(0)
     assert (torch.cosine_similarity(noise, other_voices, -1) > 0.999).all()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"weights": {"denoising": 1.0}}, {"weights": {"intelligibility": 1.0}}, {"babble": 0.3}],
-)
+@pytest.mark.parametrize("settings", [{"weights": {"denoising": 1.0}}, {"babble": 0.3}])
 def test_noise_is_not_learned_without_noise(data: TrainingData, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="noise"):
-        compensator_data(data, replace(SMALL_AID, seconds=1.0, **settings), None)
+        compensator_data(data, replace(SMALL_AID, **settings), None)

@@ -27,22 +27,6 @@ def test_no_attenuation_is_right_without_noise_and_wrong_in_noise() -> None:
     assert (attenuation_error(aid, clean, clean) > 0.2).all()
 
 
-def test_an_aid_learns_to_distinguish_a_tone_from_noise() -> None:
-    aid = HearingAid(HearingAidConfig(width=16, hidden=16))
-    optimiser = torch.optim.Adam(aid.parameters(), lr=0.02)
-    turns = 1000.0 * torch.arange(8000) / 16000.0
-    tone = set_level(torch.sin(2.0 * torch.pi * turns), 60.0).repeat(4, 1)
-    errors = []
-    for _ in range(30):
-        noise = set_level(torch.randn(4, 8000), 60.0)
-        error = attenuation_error(aid, tone + noise, tone).mean()
-        optimiser.zero_grad()
-        error.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        errors.append(error.item())
-    assert errors[-1] < 0.3 * errors[0]
-
-
 def test_intelligibility_is_haspi_at_the_level_of_amplified_clean_speech(
     speech: list[tuple[torch.Tensor, int]],
 ) -> None:
@@ -52,13 +36,6 @@ def test_intelligibility_is_haspi_at_the_level_of_amplified_clean_speech(
         torch.randn(2, 16000, generator=torch.Generator().manual_seed(0)), 60.0
     )
     missing = missing_intelligibility(aid, signal, clean, ears)
-    missing.mean().backward()  # type: ignore[no-untyped-call]
-    reached = {
-        name
-        for name, parameter in aid.named_parameters()
-        if parameter.grad is not None and parameter.grad.any()
-    }
-    assert {name.split(".")[0] for name in reached} == {"enter", "recur", "leave", "correct"}
     level = level_spl(aid(clean, ears, 0.0))
     expected = 1.0 - haspi(set_level(aid(signal, ears, 1.0), level), clean, ears)
     torch.testing.assert_close(missing, expected)

@@ -13,26 +13,16 @@ from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 ROOT = Path(__file__).parents[2]
 AID_YAML = """
 kind: hearing-aid
-model:
-  width: 8
-  hidden: 16
+model: {width: 8, hidden: 16}
 learning_rate: 1e-3
-weights: {denoising: 2}
 snr: [-5, 20]
-babble: 0.3
 """
 AID_OPTIONS = (
     "--recipe.kind=hearing-aid --recipe.model.width 8 --recipe.model.hidden=16 "
-    "--recipe.learning_rate 1e-3 --recipe.weights={'denoising':2} --recipe.snr [-5,20] "
-    "--recipe.babble 0.3"
+    "--recipe.learning_rate 1e-3 --recipe.snr [-5,20]"
 )
 AID_RECIPE = CompensatorRecipe(
-    kind="hearing-aid",
-    model={"width": 8, "hidden": 16},
-    learning_rate=1e-3,
-    weights={"denoising": 2.0},
-    snr=(-5.0, 20.0),
-    babble=0.3,
+    kind="hearing-aid", model={"width": 8, "hidden": 16}, learning_rate=1e-3, snr=(-5.0, 20.0)
 )
 
 
@@ -52,7 +42,7 @@ def test_python_yaml_and_the_command_line_agree(tmp_path: Path) -> None:
     options = f"--recipe.model.width 4 --recipe {file} --start hearing-aid --recipe.seed -3"
     recipe = from_options(options)  # Options come before the file.
     assert recipe.model == {"width": 4, "hidden": 16}
-    assert (recipe.start, recipe.seed, recipe.babble) == ("hearing-aid", -3, 0.3)
+    assert (recipe.start, recipe.seed, recipe.snr) == ("hearing-aid", -3, (-5.0, 20.0))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.yaml")), ids=str)
