@@ -5,7 +5,7 @@ from typing import Any
 
 from hlsim.metrics.haaqi_score import HaaqiReference, haaqi
 from hlsim.metrics.haspi_score import HaspiReference, haspi
-from hlsim.metrics.hasqi_score import HasqiParts, HasqiReference, hasqi
+from hlsim.metrics.hasqi_score import HasqiReference, hasqi
 from hlsim.metrics.mbstoi_score import mbstoi
 
 _TORCHMETRICS = ["HAAQI", "HASPI", "HASQI"]
@@ -13,7 +13,6 @@ _TORCHMETRICS = ["HAAQI", "HASPI", "HASQI"]
 __all__ = [
     "HaaqiReference",
     "HaspiReference",
-    "HasqiParts",
     "HasqiReference",
     "haaqi",
     "haspi",

@@ -23,8 +23,6 @@ on Audio, Speech, and Language Processing 24(2), 354-365, doi 10.1109/TASLP.2015
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import scipy
 import torch
@@ -37,10 +35,9 @@ from hlsim.checks import Lengths
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
-from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise, match_pair
-from hlsim.metrics.quality import Comparison, QualityParts, QualityReference
+from hlsim.metrics.quality import QualityParts, QualityReference
 from hlsim.torchtools import constant_like, not_compiled
 
 ENVELOPE_SEGMENT = 192
@@ -69,7 +66,7 @@ def haaqi(
     full_scale_spl: float = PASCAL_SPL,
     lengths: Lengths | None = None,
     noise: Noise = "expected",
-    seed: int | Sequence[int] = 0,
+    seed: int = 0,
     whole_khz: bool = False,
 ) -> Tensor:
     """Compute HAAQI version 1 of each item: how good processed music sounds, from 0 to 1.
@@ -88,7 +85,7 @@ def haaqi(
         noise: Noise at the threshold of hearing. ``"expected"`` uses the same noise every time;
             ``"seeded"`` draws the noise that pyclarity draws with ``seed``; ``"none"`` leaves it
             out.
-        seed: Seed of the drawn noise, or one seed for each item.
+        seed: Seed of the drawn noise of each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
 
     Returns:
@@ -120,6 +117,30 @@ def haaqi(
     return reference.score(processed, noise=noise, seed=seed)
 
 
+def _split_by_rate(waves: Tensor) -> Tensor:
+    """Divide the fluctuations of cepstral coefficients into bands of modulation from 20 to 125 Hz.
+
+    Shape: (items, 5, time) -> (items, 4 bands, 5, time or more).
+    """
+    time = waves.shape[-1]
+    points = fft_length(max(time + MODULATION_ORDER // 2, MODULATION_ORDER + 1), 2)
+    responses = constant_like(waves, _modulation_responses, points)
+    spectrum = torch.fft.rfft(waves, points)[:, None] * responses[:, None]
+    return torch.fft.irfft(spectrum, points)
+
+
+def _modulation_responses(points: int) -> NDArray[np.float64]:
+    """Return the frequency responses of the bands of modulation: (4, points // 2 + 1)."""
+    filters = []
+    for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
+        edges = [low] if high is None else [low, high]
+        taps = scipy.signal.firwin(
+            MODULATION_ORDER + 1, edges, window="hann", pass_zero=False, fs=ENVELOPE_RATE
+        )
+        filters.append(taps)
+    return zero_phase_responses(filters, points)
+
+
 class HaaqiReference(QualityReference):
     """Clean music that is prepared once for the HAAQI of many outputs in one impaired ear.
 
@@ -145,21 +166,11 @@ class HaaqiReference(QualityReference):
     True
     """
 
-    score_name = "HAAQI"
     envelope_segment = ENVELOPE_SEGMENT
+    split_by_rate = staticmethod(_split_by_rate)
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> QualityParts:
-        envelopes = fine_structure.envelope_correlation(
-            comparison.clean_levels,
-            comparison.processed_levels,
-            fine_structure.segments_of(extent, ENVELOPE_SEGMENT),
-            _split_by_rate,
-        )
-        counts = fine_structure.segments_of(extent)
-        fine = fine_structure.synchrony(comparison.coherence, comparison.energy, counts)
-        x = fine_structure.channel_shares(comparison.clean_spectrum)
-        y = fine_structure.channel_shares(comparison.processed_spectrum)
+    def _combine(envelopes: Tensor, fine: Tensor, x: Tensor, y: Tensor) -> QualityParts:
         shape = fine_structure.spectral_similarity(x - y, 2.5)
         relative_shape = fine_structure.spectral_similarity((x - y) / (x + y), 25.0)
         nonlinear = 0.754 * envelopes**3 + 0.246 * fine
@@ -167,27 +178,3 @@ class HaaqiReference(QualityReference):
         first_order = 0.336 * nonlinear + 0.001 * linear
         combined = first_order + 0.501 * nonlinear.square() + 0.161 * linear.square()
         return QualityParts(combined, nonlinear, linear)
-
-
-def _split_by_rate(waves: Tensor) -> Tensor:
-    """Divide the fluctuations of cepstral coefficients into bands of modulation from 20 to 125 Hz.
-
-    Shape: (items, 5, time) -> (items, 4 bands, 5, time or more).
-    """
-    time = waves.shape[-1]
-    points = fft_length(max(time + MODULATION_ORDER // 2, MODULATION_ORDER + 1), 2)
-    responses = constant_like(waves, _modulation_responses, points)
-    spectrum = torch.fft.rfft(waves, points)[:, None] * responses[:, None]
-    return torch.fft.irfft(spectrum, points)
-
-
-def _modulation_responses(points: int) -> NDArray[np.float64]:
-    """Return the frequency responses of the bands of modulation: (4, points // 2 + 1)."""
-    filters = []
-    for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
-        edges = [low] if high is None else [low, high]
-        taps = scipy.signal.firwin(
-            MODULATION_ORDER + 1, edges, window="hann", pass_zero=False, fs=ENVELOPE_RATE
-        )
-        filters.append(taps)
-    return zero_phase_responses(filters, points)

@@ -21,11 +21,10 @@ Communication 131, 35-46, doi 10.1016/j.specom.2020.05.001.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from functools import lru_cache, reduce
+from functools import reduce
 from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,11 +36,11 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanSpeech
+from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
-from hlsim.metrics.ear.model import CHANNELS
+from hlsim.metrics.ear.model import CHANNELS, HairCells
 from hlsim.metrics.pair import Noise, match_pair
-from hlsim.metrics.reference import PreparedBatch, Reference, map_on_cores
+from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import constant_like, not_compiled
 
 
@@ -55,7 +54,7 @@ def haspi(
     full_scale_spl: float = PASCAL_SPL,
     lengths: Lengths | None = None,
     noise: Noise = "expected",
-    seed: int | Sequence[int] = 0,
+    seed: int = 0,
     whole_khz: bool = False,
 ) -> Tensor:
     """Compute HASPI version 2 of each item: the intelligibility for an impaired ear, 0 to 1.
@@ -84,7 +83,7 @@ def haspi(
         noise: Internal noise of the ear. ``"expected"`` computes the mean score over all draws of
             the noise, which is smooth and the same every time; ``"seeded"`` draws the noise that
             pyclarity draws with ``seed`` (scores vary by up to 0.007); ``"none"`` leaves it out.
-        seed: Seed of the drawn noise, or one seed for each item.
+        seed: Seed of the drawn noise of each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does. From 44.1 to 44 kHz, scores
             change by up to 0.005.
 
@@ -139,8 +138,6 @@ class HaspiReference(Reference):
     True
     """
 
-    score_name = "HASPI"
-
     def __init__(
         self,
         clean: Tensor,
@@ -161,13 +158,48 @@ class HaspiReference(Reference):
             keep=keep,
         )
 
-    def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
-        normal = ear_model.hair_cells(torch.zeros(8, device=signals.device))
-        return map_on_cores(
-            lambda batch: _Batch(signals, batch, batch.signals, normal, keep),
-            signals.batches,
-            signals.clean,
+    def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
+        normal_ear = torch.zeros(8, device=clean.signals.device)
+        return clean.signals, ear_model.hair_cells(normal_ear)
+
+    def _features(
+        self,
+        sound: Tensor,
+        cells: HairCells,
+        channels: slice,
+        longest_delay: Tensor,
+        extent: Extent,
+    ) -> _Channels:
+        cochlea = ear_model.simulate_cochlea(sound, cells, channels, extent)
+        delays = longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
+        levels = ear_model.nerve_levels(cochlea.power, cells.inner[channels])
+        frames = envelopes.smooth_frames(levels, delays, extent)
+        return _Channels(
+            channels,
+            ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
+            delays,
+            envelopes.mean_amplitude(frames),
+            envelopes.cepstrum(frames, channels),
         )
+
+    def _compare(
+        self, batch: PreparedBatch, processed: Tensor, noise: Noise, seed: int, *ears: HairCells
+    ) -> Tensor:
+        """Compute the ten features of HASPI for each item. Shape: -> (items, 10)."""
+        extent, ear = batch.clean.audible, ears[0][batch.clean.items]
+        contributions = [
+            (clean.amplitude, clean.cepstrum, _cepstrum(clean, processed, ear, extent))
+            for clean in batch.features
+        ]
+        amplitude, *cepstra = (reduce(add, parts) for parts in zip(*contributions, strict=True))
+        indices, audible = envelopes.find_audible_frames(amplitude, extent)
+        x, y = (cepstrum.take_along_dim(indices[:, None], -1) for cepstrum in cepstra)
+        if noise == "expected":
+            return envelopes.expected_correlation(x, y, audible)
+        if noise == "seeded":
+            clean_noise, processed_noise = _draw_noise(seed, extent, audible, x)
+            x, y = x + clean_noise, y + processed_noise
+        return envelopes.correlation(x, y, audible)
 
     def score(
         self,
@@ -175,17 +207,16 @@ class HaspiReference(Reference):
         audiogram: AudiogramLike,
         *,
         noise: Noise = "expected",
-        seed: int | Sequence[int] = 0,
+        seed: int = 0,
     ) -> Tensor:
         """Return the HASPI of each output of an aid.
 
         Args:
-            processed: Outputs of the shape, rate and scale of the clean speech. Lengths that differ
-                by 0.1 s at most are cut to the shorter one, with a warning. Shape: (..., time).
+            processed: Outputs of the shape, rate and scale of the clean speech. Shape: (..., time).
             audiogram: The impaired ear, or one for each item, as in ``haspi``.
             noise: Internal noise of the ear: ``"expected"``, its mean effect; ``"seeded"``, the
                 noise that pyclarity draws; or ``"none"``.
-            seed: Seed of the drawn noise, or one seed for each item.
+            seed: Seed of the drawn noise of each item.
 
         Returns:
             Scores, 0 to 1. Shape: (...,).
@@ -194,8 +225,8 @@ class HaspiReference(Reference):
             ValueError: Outputs of another shape, not finite or on another device; an audiogram or
                 seed out of range.
         """
-        ears = ear_model.hair_cells(self._signals.thresholds(audiogram))
-        return _intelligibility(self._compare(processed, noise, seed, ears))
+        ears = ear_model.hair_cells(self._thresholds(audiogram))
+        return _intelligibility(self._compare_all(processed, noise, seed, ears))
 
 
 class _Channels(NamedTuple):
@@ -216,123 +247,43 @@ class _Channels(NamedTuple):
     cepstrum: Tensor
 
 
-class _Batch(PreparedBatch):
-    """Clean speech of a batch in a normal ear."""
-
-    def _prepare(self, channels: slice) -> _Channels:
-        extent = self._extent
-        cochlea = ear_model.simulate_cochlea(self._clean, self._cells, channels, extent)
-        spectrum = ear_model.lag_spectrum(cochlea.power.sqrt(), extent)
-        delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        levels = ear_model.nerve_levels(cochlea.power, self._cells.inner[channels])
-        frames = envelopes.smooth_frames(levels, delays, extent)
-        amplitude = envelopes.mean_amplitude(frames)
-        return _Channels(
-            channels, spectrum, delays, amplitude, envelopes.cepstrum(frames, channels)
-        )
-
-    def _cepstrum(self, clean: _Channels, sound: Tensor, ear: ear_model.HairCells) -> Tensor:
-        """Return the contribution of some channels to the cepstrum of the output's frames."""
-        channels, extent = clean.channels, self._extent
-        power = ear_model.simulate_cochlea(sound, ear, channels, extent).power
-        envelope = power.detach().sqrt()
-        power = ear_model.align_channels(power, envelope, clean.spectrum, extent)
-        levels = ear_model.nerve_levels(power, ear.inner[:, channels])
-        frames = envelopes.smooth_frames(levels, clean.delays, extent)
-        return envelopes.cepstrum(frames, channels)
-
-    def compare(
-        self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
-    ) -> Tensor:
-        """Compute the ten features of HASPI for each item, see ``PreparedBatch.compare``."""
-        items, extent = self._batch.items, self._extent
-        sound, ear = self._signals.align(processed, self._batch), ears[0][items]
-        contributions = [
-            (clean.amplitude, clean.cepstrum, self._cepstrum(clean, sound, ear))
-            for clean in self._clean_features()
-        ]
-        amplitude, *cepstra = (reduce(add, parts) for parts in zip(*contributions, strict=True))
-        indices, audible = envelopes.find_audible_frames(amplitude, extent)
-        x, y = (cepstrum.take_along_dim(indices[:, None], -1) for cepstrum in cepstra)
-        if noise == "expected":
-            return envelopes.expected_correlation(x, y, audible)
-        if noise == "seeded":
-            counts = [2 * CHANNELS * end for end in extent.ends]
-            pair = _draw_pairs(seeds[items], counts, audible, x)
-            x, y = x + pair[0], y + pair[1]
-        return envelopes.correlation(x, y, audible)
+def _cepstrum(clean: _Channels, processed: Tensor, ear: HairCells, extent: Extent) -> Tensor:
+    """Return the contribution of some channels to the cepstrum of the output's frames."""
+    channels = clean.channels
+    power = ear_model.simulate_cochlea(processed, ear, channels, extent).power
+    envelope = power.detach().sqrt()
+    power = ear_model.align_channels(power, envelope, clean.spectrum, extent)
+    levels = ear_model.nerve_levels(power, ear.inner[:, channels])
+    frames = envelopes.smooth_frames(levels, clean.delays, extent)
+    return envelopes.cepstrum(frames, channels)
 
 
-# -- noise -----------------------------------------------------------------------------------------
-
-DEVIATES_AT_ONCE = 2**16
-"""Approximate number of normally distributed numbers (deviates) that are processed at once."""
+FRAMES_AT_ONCE = 2048
+"""Frames of noise whose cepstrum is computed at once."""
 
 
-def _draw_pairs(
-    seeds: Sequence[int], skipped: Sequence[int], extent: Extent, like: Tensor
-) -> Tensor:
+def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Tensor:
     """Draw the internal noise of the ear for clean speech and for the output, as pyclarity does.
 
     Args:
-        seeds: Seed of each item.
-        skipped: Number of random numbers that pyclarity draws before, for each item.
-        extent: Number of audible frames of each item.
+        seed: Seed of each item.
+        extent: Number of samples of each item.
+        audible: Number of audible frames of each item.
         like: Cepstrum of the signals. Shape: (items, 5, audible).
 
     Returns:
         Cepstrum of the noise for clean speech, then for the output. Shape: (2, items, 5, audible).
     """
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
-    for item, (seed, count, frames) in enumerate(zip(seeds, skipped, extent.ends, strict=True)):
-        random = legacy_rng_after_normals(seed, count)
+    for item, (samples, frames) in enumerate(zip(extent.ends, audible.ends, strict=True)):
+        random = np.random.RandomState(seed)
+        for _ in range(2 * CHANNELS):  # the noise of other scores, which pyclarity draws before
+            random.standard_normal(samples)
         for signal in (0, 1):
             levels = torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like.dtype)
-            parts = levels.split(DEVIATES_AT_ONCE // CHANNELS)
-            cepstra = torch.cat([envelopes.cepstrum(part.mT) for part in parts], -1)
-            noise[signal, item, :, :frames] = envelopes.NOISE_DB * cepstra
-    return noise.to(like.device, non_blocking=like.device.type != "cpu")
-
-
-@lru_cache(maxsize=4)
-def _state_after(seed: int, count: int) -> Any:
-    """Return the state of numpy's legacy generator after an even number of normal deviates.
-
-    The generator draws points in a square until one lies in the circle, which gives two deviates.
-    It is enough to count these points.
-    """
-    random = np.random.RandomState(seed)
-    left = count // 2
-    while left:
-        coordinates = random.random_sample(2 * min(left, DEVIATES_AT_ONCE))
-        coordinates *= 2.0
-        coordinates -= 1.0
-        coordinates *= coordinates
-        square = coordinates[::2] + coordinates[1::2]
-        left -= int(np.count_nonzero(square < 1.0) - np.count_nonzero(square == 0.0))
-    return random.get_state()
-
-
-def legacy_rng_after_normals(seed: int, count: int) -> np.random.RandomState:
-    """Return numpy's legacy random generator as it is after drawing normally distributed numbers.
-
-    pyclarity uses one generator for several signals. This function leaps to the noise of a later
-    signal without computing that of the earlier ones.
-
-    Args:
-        seed: Seed of the generator.
-        count: Number of values that were drawn, an even number.
-
-    Returns:
-        Generator that draws the next values.
-
-    >>> expected = np.random.RandomState(7).standard_normal(5)[4]
-    >>> bool(legacy_rng_after_normals(7, 4).standard_normal() == expected)
-    True
-    """
-    random = np.random.RandomState()
-    random.set_state(_state_after(seed, count))
-    return random
+            parts = [envelopes.cepstrum(part.mT) for part in levels.split(FRAMES_AT_ONCE)]
+            noise[signal, item, :, :frames] = envelopes.NOISE_DB * torch.cat(parts, -1)
+    return noise.to(like.device)
 
 
 # -- networks --------------------------------------------------------------------------------------

@@ -9,20 +9,15 @@ Eng. Soc. 62(3), 99-117.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import fine_structure
-from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.pair import Noise, match_pair
-from hlsim.metrics.quality import Comparison, QualityParts, QualityReference
+from hlsim.metrics.quality import QualityParts, QualityReference
 from hlsim.torchtools import not_compiled
-
-HasqiParts = QualityParts
 
 
 @not_compiled  # tracing takes minutes
@@ -35,7 +30,7 @@ def hasqi(
     full_scale_spl: float = PASCAL_SPL,
     lengths: Lengths | None = None,
     noise: Noise = "expected",
-    seed: int | Sequence[int] = 0,
+    seed: int = 0,
     whole_khz: bool = False,
 ) -> Tensor:
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
@@ -53,7 +48,7 @@ def hasqi(
         noise: Noise at the threshold of hearing, which matters where nothing of the output is
             audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the noise
             that pyclarity draws with ``seed``; ``"none"`` leaves it out.
-        seed: Seed of the drawn noise, or one seed for each item.
+        seed: Seed of the drawn noise of each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
 
     Returns:
@@ -106,18 +101,10 @@ class HasqiReference(QualityReference):
     True
     """
 
-    score_name = "HASQI"
     envelope_segment = fine_structure.SEGMENT
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> QualityParts:
-        counts = fine_structure.segments_of(extent)
-        envelopes = fine_structure.envelope_correlation(
-            comparison.clean_levels, comparison.processed_levels, counts
-        )
-        fine = fine_structure.synchrony(comparison.coherence, comparison.energy, counts)
-        x = fine_structure.channel_shares(comparison.clean_spectrum)
-        y = fine_structure.channel_shares(comparison.processed_spectrum)
+    def _combine(envelopes: Tensor, fine: Tensor, x: Tensor, y: Tensor) -> QualityParts:
         shape = fine_structure.spectral_similarity(x - y, 2.5)
         slope = fine_structure.spectral_similarity((x - y).diff(dim=-1), 1.0)
         nonlinear = envelopes.square() * fine

@@ -25,12 +25,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram.listener import EARS
 from hlsim.audiogram.thresholds import check_two_channels
-from hlsim.checks import Lengths, check_lengths
 from hlsim.dsp.fft import power, rfft
-from hlsim.metrics.ear.extent import Extent, integers
-from hlsim.metrics.pair import cut_to_common_length
+from hlsim.metrics.pair import check_finite, match_pair
 from hlsim.metrics.reference import map_on_cores
 from hlsim.torchtools import constant_like
 
@@ -58,140 +55,56 @@ LEVELS = np.linspace(-20.0, 20.0, 40)
 CPU_SEGMENTS, GPU_SEGMENTS = 2**17 // 4000, 2**25 // 4000
 """Segments that are computed at once. Each takes 4000 values per band."""
 
-PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-"""Pairs of the four features of a band: the powers of the left and of the right ear, and the real
-and the imaginary part of their cross-spectrum."""
+LEFT_PAIR, RIGHT_PAIR = 0, 4
+"""Positions of two products among the ten pairwise products of a band's four features.
 
-LEFT_PAIR, RIGHT_PAIR = PAIRS.index((0, 0)), PAIRS.index((1, 1))
-"""Positions in ``PAIRS`` of the power of the left and of the right ear alone."""
+The features are the powers of the left and of the right ear, and the real and the imaginary part of
+their cross-spectrum. The two products are the squared powers of the left and of the right ear.
+"""
 
 
-def mbstoi(
-    processed: Tensor, clean: Tensor, *, sample_rate: int = 16000, lengths: Lengths | None = None
-) -> Tensor:
+def mbstoi(processed: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor:
     """Compute MBSTOI of each item: the intelligibility of speech at two ears, about 0 to 1.
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
     gradient: which frames are speech, the interaural delays and levels, and the better ear. Scores
-    are computed in float64 where the device supports it.
+    are computed in float64 where the device supports it. Zeros at the end of an item change its
+    score by up to 0.007, so score the items of a padded batch one by one.
 
     Args:
         processed: Processed speech at the left and the right ear. Shape: (..., 2, time).
         clean: Clean speech at the left and the right ear, time-aligned with ``processed``. Shape:
             (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        lengths: Number of samples of each item in a padded batch. Without it, zeros at the end of
-            an item change its score by up to 0.007. Shape: (...).
 
     Returns:
         Scores. Shape: (...).
 
     Raises:
         ValueError: Signals of other shapes, on different devices or not finite; clean speech that
-            is silent or lasts less than 0.41 s without its pauses; a rate or length out of range.
+            is silent or lasts less than 0.41 s without its pauses; a rate out of range.
 
     >>> from hlsim import example_speech
     >>> clean = torch.stack([example_speech(), example_speech()])
     >>> round(float(mbstoi(clean, clean)), 2)
     1.0
     """
-    equally_long = cut_to_common_length(processed, clean, sample_rate)
-    longest = max(processed.shape[-1], clean.shape[-1])
-    processed, clean = equally_long
+    processed, clean, _ = match_pair(processed, clean, sample_rate)
     check_two_channels(clean)
-    items, time = clean.shape[:-2], clean.shape[-1]
-    ends = [time] * items.numel()
-    if lengths is not None:
-        all_ends = check_lengths(lengths, torch.Size((*items, longest)))
-        ends = all_ends.clamp_max(time).flatten().tolist()
-    dtype = torch.promote_types(processed.dtype, clean.dtype)
+    *items, _, time = clean.shape
     precision = torch.float32 if processed.device.type == "mps" else torch.float64
-    with torch.autocast(processed.device.type, enabled=False):
-        signals = torch.stack([clean, processed], -3).to(precision).reshape(-1, 4, time)
-        _check_values(signals)
-        frames, counts = _remove_silence(*_resample_items(signals, ends, sample_rate))
-        envelopes = _band_features(frames.unflatten(1, (2, 2)))
-        return _mean_correlation(envelopes, counts).to(dtype).reshape(items)
+    signals = torch.stack([clean, processed], -3).to(precision).reshape(-1, 2, 2, time)
+    check_finite("processed or clean", signals)
 
+    def score(item: Tensor) -> Tensor:
+        if not bool(item[0].any()):
+            raise ValueError("clean is silent at both ears; leave the item out")
+        with torch.autocast(item.device.type, enabled=False):
+            frames = _remove_silence(_resample(item, sample_rate))
+            return _mean_correlation(_band_features(frames))
 
-def _mean_correlation(features: Tensor, counts: tuple[int, ...]) -> Tensor:
-    """Compute the mean correlation over all segments of each item.
-
-    Args:
-        features: Output of ``_band_features``.
-        counts: Number of frames of each item.
-
-    Returns:
-        Scores. Shape: (items,).
-    """
-    device = features.device
-    windows = features.unfold(1, SEGMENT, 1)  # a segment begins at every frame
-    segments = integers(counts, device) - SEGMENT
-    total = sum(counts) - SEGMENT * len(counts)
-    item = torch.arange(len(counts), device=device)
-    item = item.repeat_interleave(segments, output_size=total)
-    start = torch.arange(total, device=device) - (segments.cumsum(0) - segments)[item]
-    # As in pyclarity, one ear alone is not used in the last segment of an item.
-    may_use_one_ear = start < segments[item] - 1
-    segments_at_once = CPU_SEGMENTS if device.type == "cpu" else GPU_SEGMENTS
-    groups = torch.arange(total, device=device).split(segments_at_once)
-
-    def correlate(group: Tensor) -> Tensor:
-        return _correlate(windows[item[group], start[group]], may_use_one_ear[group])
-
-    if len(counts) == 1:  # a single item is so short that starting threads costs more
-        correlations = [correlate(group) for group in groups]
-    else:
-        correlations = map_on_cores(correlate, groups, features)
-    sums = features.new_zeros(len(counts)).index_add(0, item, torch.cat(correlations))
-    return sums / segments
-
-
-def _check_values(signals: Tensor) -> None:
-    """Raise ValueError unless all samples are finite and clean speech is not silent.
-
-    The host waits for the device once.
-
-    Args:
-        signals: Clean speech at the left and the right ear, then processed speech. Shape: (items,
-            4, time).
-    """
-    is_finite = signals.detach().isfinite().all(-1)
-    is_sounding = signals.detach()[:, :2].flatten(1).any(-1, keepdim=True)
-    names = [f"{signal} at the {ear} ear" for signal in ("clean", "processed") for ear in EARS]
-    for index, (*finite, sounding) in enumerate(torch.cat((is_finite, is_sounding), 1).tolist()):
-        item = f" of item {index}" if len(signals) > 1 else ""
-        if not all(finite):
-            raise ValueError(
-                f"{names[finite.index(False)]}{item} holds samples that are NaN or infinite; "
-                "remove them, or leave the item out"
-            )
-        if not sounding:
-            raise ValueError(
-                f"clean{item} is silent at the left and the right ear, so there is nothing to "
-                "compare with; leave the item out"
-            )
-
-
-def _resample_items(signals: Tensor, ends: list[int], rate: int) -> tuple[Tensor, Extent]:
-    """Resample items to 10 kHz, each by itself if their lengths differ, as pyclarity does.
-
-    Args:
-        signals: Signals. Shape: (items, 4, time).
-        ends: Number of samples of each item before padding.
-        rate: Sample rate in Hz.
-
-    Returns:
-        Resampled signals, zero after the end of each item, (items, 4, longest), and the number of
-        samples of each item.
-    """
-    if min(ends) == max(ends):
-        resampled = _resample(signals[..., : ends[0]], rate)
-        return resampled, Extent((resampled.shape[-1],) * len(ends))
-    items = [_resample(item[:, :end], rate) for item, end in zip(signals, ends, strict=True)]
-    extent = Extent(tuple(item.shape[-1] for item in items))
-    padded = [functional.pad(item, (0, extent.longest - item.shape[-1])) for item in items]
-    return torch.stack(padded), extent
+    scores = map_on_cores(score, signals.unbind(), signals)
+    return torch.stack(scores).to(clean.dtype).reshape(items)
 
 
 def _resample(signals: Tensor, rate: int) -> Tensor:
@@ -207,54 +120,39 @@ def _resample(signals: Tensor, rate: int) -> Tensor:
     return torch.fft.irfft(spectrum, points) * (points / time)
 
 
-def _remove_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, tuple[int, ...]]:
+def _remove_silence(signals: Tensor) -> Tensor:
     """Remove the frames where clean speech is silent at both ears, and overlap and add the others.
-
-    The host waits for the device once.
 
     Args:
         signals: Clean signals of the left and the right ear, then the processed ones. Shape:
-            (items, 4, time).
-        extent: Number of samples of each item before padding.
+            (2, 2, time).
 
     Returns:
-        Windowed frames of the shortened signals, (items, 4, frames, 256), and the number of frames
-        of each item.
+        Windowed frames of the shortened signals. Shape: (2, 2, frames, 256).
 
     Raises:
         ValueError: Too few frames remain for a segment.
     """
+    window = constant_like(signals, _window)
+    missing = FRAME + 1 - signals.shape[-1]
+    padded = functional.pad(signals, (0, max(0, missing)))
     # As in pyclarity, a frame that ends with the signal is left out.
-    frames_of = tuple(max(0, (end - 1 - FRAME) // HOP + 1) for end in extent.ends)
-    padded = max(FRAME, extent.longest - 1)
-    rows = functional.pad(signals, (0, max(0, padded - signals.shape[-1])))[..., :padded]
-    window = constant_like(rows, _window)
-    frames = rows.unfold(-1, FRAME, HOP) * window
-    indices = torch.arange(frames.shape[2], device=rows.device)
-    is_inside = indices < integers(frames_of, rows.device)[:, None]
-    norms = frames.detach()[:, :2].norm(dim=-1) * is_inside[:, None]
+    frames = padded[..., :-1].unfold(-1, FRAME, HOP) * window
+    norms = frames[0].detach().norm(dim=-1)
     levels = 20.0 * torch.log10(norms + np.finfo(np.float64).eps)
     is_loud = levels > levels.amax(-1, keepdim=True) - RANGE_DB
-    is_active = is_loud.any(1) & is_inside
-    counts = tuple(is_active.sum(-1).tolist())
-    if min(counts) <= SEGMENT:
-        item = f" in item {counts.index(min(counts))}" if len(counts) > 1 else ""
+    active = frames[..., is_loud.any(0), :]
+    count = active.shape[-2]
+    if count <= SEGMENT:
         raise ValueError(
-            f"expected at least {_seconds(SEGMENT + 1):.2g} s of clean speech within "
-            f"{RANGE_DB:g} dB of its loudest frame{item}, got {_seconds(min(counts)):.2g} s; pass "
+            f"expected at least {(SEGMENT + 2) * HOP / RATE:.2g} s of clean speech within "
+            f"{RANGE_DB:g} dB of its loudest frame, got {(count + 1) * HOP / RATE:.2g} s; pass "
             "longer signals"
         )
-    order = (~is_active).byte().argsort(dim=-1, stable=True)[:, : max(counts)]
-    is_used = Extent(counts).inside(rows.device)
-    active = frames.take_along_dim(order[:, None, :, None], 2) * is_used[:, None, :, None]
     first_halves = functional.pad(active[..., :HOP], (0, 0, 0, 1))
     second_halves = functional.pad(active[..., HOP:], (0, 0, 1, 0))
     hops = first_halves + second_halves
-    return torch.cat([hops[..., :-1, :], hops[..., 1:, :]], -1) * window, counts
-
-
-def _seconds(frames: int) -> float:
-    return (frames + 1) * HOP / RATE if frames else 0.0
+    return torch.cat([hops[..., :-1, :], hops[..., 1:, :]], -1) * window
 
 
 def _window() -> NDArray[np.float64]:
@@ -264,21 +162,34 @@ def _window() -> NDArray[np.float64]:
 
 
 def _band_features(frames: Tensor) -> Tensor:
-    """Compute the four features of each band, which ``PAIRS`` names, in each frame.
+    """Compute the four features of each band in each frame, see ``LEFT_PAIR``.
 
     Args:
         frames: Windowed frames of clean, then processed speech at the left, then the right ear.
-            Shape: (items, 2, 2, frames, 256).
+            Shape: (2, 2, frames, 256).
 
     Returns:
-        Features of clean, then processed speech. Shape: (items, frames, bands, 8).
+        Features of clean, then processed speech. Shape: (frames, bands, 8).
     """
-    spectrum = rfft(functional.pad(frames, (0, POINTS - FRAME)))
-    left, right = spectrum.unbind(2)
+    left, right = rfft(functional.pad(frames, (0, POINTS - FRAME))).unbind(1)
     cross = left * right.conj()
-    features = torch.stack([power(left), power(right), cross.real, cross.imag], 2)
+    features = torch.stack([power(left), power(right), cross.real, cross.imag], 1)
     bands = features @ constant_like(frames, _band_matrix)
-    return bands.flatten(1, 2).permute(0, 2, 3, 1)
+    return bands.flatten(0, 1).permute(1, 2, 0)
+
+
+def _mean_correlation(features: Tensor) -> Tensor:
+    """Compute the mean correlation over all segments of an item.
+
+    Shape: (frames, bands, 8) -> ().
+    """
+    windows = features.unfold(0, SEGMENT, 1)  # a segment begins at every frame
+    segments = len(windows) - 1
+    segments_at_once = CPU_SEGMENTS if features.device.type == "cpu" else GPU_SEGMENTS
+    groups = torch.arange(segments, device=features.device).split(segments_at_once)
+    # As in pyclarity, one ear alone is not used in the last segment.
+    correlations = [_correlate(windows[group], group < segments - 1) for group in groups]
+    return torch.cat(correlations).mean()
 
 
 def _band_matrix() -> NDArray[np.float64]:
@@ -304,7 +215,7 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
     """
     centred = windows - windows.mean(-1, keepdim=True)
     products = centred @ centred.transpose(-1, -2)
-    first, second = (integers(features, windows.device) for features in zip(*PAIRS, strict=True))
+    first, second = torch.triu_indices(4, 4, device=windows.device)
     clean, both, processed = (
         (part + part.transpose(-1, -2))[..., first, second]
         for part in (products[..., :4, :4], products[..., :4, 4:], products[..., 4:, 4:])
@@ -314,9 +225,7 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
         ratio, index = _find_largest_ratio(clean, processed, grid)
         is_silent = ~(clean.any(-1) & processed.any(-1))
         ratio = torch.where(is_silent, 0.0, ratio)
-        ears = integers((LEFT_PAIR, RIGHT_PAIR), windows.device)
-        of_ears = clean.index_select(-1, ears) / processed.index_select(-1, ears)
-        left, right = of_ears.unbind(-1)
+        left, right = (clean[..., pair] / processed[..., pair] for pair in (LEFT_PAIR, RIGHT_PAIR))
         # The ratio of an ear where both signals are silent is NaN, which is not larger.
         one_ear_is_better = (torch.maximum(left, right) > ratio) & may_use_one_ear[:, None]
         better_ear = torch.where(left > right, LEFT_PAIR, RIGHT_PAIR).unsqueeze(-1)
@@ -384,18 +293,18 @@ def _cancellation_weights() -> NDArray[np.float64]:
     cosine, sine = mean_cosine * np.cos(w * t), mean_cosine * np.sin(w * t)
     cosine2, sine2 = mean_cosine**4 * np.cos(2.0 * w * t), mean_cosine**4 * np.sin(2.0 * w * t)
     left, right = mean_gain * 10.0**g, mean_gain * 10.0**-g
-    entries = {
-        (0, 0): 0.5 * mean_gain**4 * 10.0 ** (2.0 * g),
-        (0, 1): 1.0,
-        (0, 2): -2.0 * left * cosine,
-        (0, 3): -2.0 * left * sine,
-        (1, 1): 0.5 * mean_gain**4 * 10.0 ** (-2.0 * g),
-        (1, 2): -2.0 * right * cosine,
-        (1, 3): -2.0 * right * sine,
-        (2, 2): 1.0 + cosine2,
-        (2, 3): 2.0 * sine2,
-        (3, 3): 1.0 - cosine2,
-    }
+    products = [
+        0.5 * mean_gain**4 * 10.0 ** (2.0 * g),  # L L
+        1.0,  # L R
+        -2.0 * left * cosine,  # L r
+        -2.0 * left * sine,  # L m
+        0.5 * mean_gain**4 * 10.0 ** (-2.0 * g),  # R R
+        -2.0 * right * cosine,  # R r
+        -2.0 * right * sine,  # R m
+        1.0 + cosine2,  # r r
+        2.0 * sine2,  # r m
+        1.0 - cosine2,  # m m
+    ]
     shape = BANDS, len(DELAYS), len(LEVELS)
-    weights = [np.broadcast_to(entries[pair], shape) for pair in PAIRS]
-    return np.stack(weights, 1).reshape(BANDS, len(PAIRS), -1)
+    weights = [np.broadcast_to(product, shape) for product in products]
+    return np.stack(weights, 1).reshape(BANDS, len(products), -1)

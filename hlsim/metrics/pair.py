@@ -1,22 +1,17 @@
-"""Validation of the two signals that a score compares, and of random seeds."""
+"""Validation of the two signals that a score compares."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from numbers import Integral
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, describe
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 
 SHORTEST_SECONDS = 0.7
 """Shortest signal in seconds for which a score can be trusted."""
-
-LOWEST_REFERENCE_SPL = 20.0
-"""Lowest level of clean speech or music in dB SPL for which a score can be trusted."""
 
 LARGEST_LENGTH_DIFFERENCE = 0.1
 """Largest difference in seconds between the lengths of two signals, of which the longer is cut."""
@@ -52,116 +47,71 @@ def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, 
     return min(lengths)
 
 
-def cut_to_common_length(
-    processed: Tensor, clean: Tensor, sample_rate: int
-) -> tuple[Tensor, Tensor]:
-    """Validate that an output and a clean signal can be compared, and cut the longer one.
+def check_pair(processed: Tensor, clean: Tensor) -> None:
+    """Raise ValueError unless two signals have the same shape and are on the same device.
+
+    Args:
+        processed: Output of an aid.
+        clean: Clean signal.
+
+    >>> check_pair(torch.ones(2, 9000), torch.ones(2, 9000))
+    """
+    if processed.shape != clean.shape or processed.device != clean.device:
+        raise ValueError(
+            f"expected processed and clean of the same shape on the same device, got "
+            f"{tuple(processed.shape)} on {processed.device} and {tuple(clean.shape)} on "
+            f"{clean.device}; pass one clean signal for each processed one"
+        )
+
+
+def check_finite(name: str, signals: Tensor) -> None:
+    """Raise ValueError if a sample is NaN or infinite. The host waits for the device once.
+
+    Args:
+        name: Name of the signals, for the message.
+        signals: Signals. Shape: (items, ...).
+
+    >>> check_finite("clean", torch.ones(2, 9000))
+    """
+    is_finite = signals.detach().flatten(1).isfinite().all(-1).tolist()
+    if not all(is_finite):
+        item = f" in item {is_finite.index(False)}" if len(is_finite) > 1 else ""
+        raise ValueError(
+            f"{name} holds samples that are NaN or infinite{item}; leave this signal out"
+        )
+
+
+def match_pair(
+    processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None = None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Cut an output and a clean signal to one length, and validate that they can be compared.
+
+    The precision of the clean signal becomes that of the output if this is higher.
 
     Args:
         processed: Output of an aid. Shape: (..., time).
         clean: Clean signal. Shape: (..., time), where ``time`` may differ by 0.1 s.
-        sample_rate: Sample rate of both in Hz.
-
-    Returns:
-        Output and clean signal of the same length.
-
-    Raises:
-        ValueError: A signal is not a waveform, the shapes or devices differ, the lengths differ by
-            more than 0.1 s, or the rate is out of range.
-
-    >>> output, clean = cut_to_common_length(torch.ones(9000), torch.ones(9000), 16000)
-    >>> output.shape
-    torch.Size([9000])
-    """
-    check_waveform(processed, "processed")
-    check_waveform(clean, "clean")
-    if processed.shape[:-1] != clean.shape[:-1]:
-        raise ValueError(
-            "expected processed and clean of the same shape, got "
-            f"{tuple(processed.shape)} and {tuple(clean.shape)}; pass one clean signal for each "
-            "processed one"
-        )
-    if processed.device != clean.device:
-        raise ValueError(
-            f"expected processed and clean on the same device, got {processed.device} and "
-            f"{clean.device}; move both with .to(device)"
-        )
-    times = processed.shape[-1], clean.shape[-1]
-    time = common_length(times, check_rate(sample_rate), ("processed", "clean"))
-    return processed[..., :time], clean[..., :time]
-
-
-def match_pair(
-    processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
-) -> tuple[Tensor, Tensor, Lengths | None]:
-    """Cut an output and clean speech to one length, and raise the precision of clean speech.
-
-    The precision of clean speech becomes that of the output if this is higher.
-
-    Args:
-        processed: Output of an aid. Shape: (..., time).
-        clean: Clean speech. Shape: (..., time), where ``time`` may differ by 0.1 s.
         sample_rate: Sample rate in Hz.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
 
     Returns:
-        Output, clean speech, and lengths that are limited to the common length.
+        Output, clean signal, and lengths that are limited to the common length.
 
     Raises:
         ValueError: A signal is not a waveform, the shapes or devices differ, the lengths differ by
             more than 0.1 s, the rate is out of range, or ``lengths`` do not fit.
 
-    >>> output, clean, _ = match_pair(torch.ones(8000).double(), torch.ones(8000), 16000, None)
+    >>> output, clean, _ = match_pair(torch.ones(8000).double(), torch.ones(8000), 16000)
     >>> clean.dtype
     torch.float64
     """
-    cut_processed, cut_clean = cut_to_common_length(processed, clean, sample_rate)
+    check_waveform(processed, "processed")
+    check_waveform(clean, "clean")
+    times = processed.shape[-1], clean.shape[-1]
+    time = common_length(times, check_rate(sample_rate), ("processed", "clean"))
+    processed, clean = processed[..., :time], clean[..., :time]
+    check_pair(processed, clean)
     if lengths is not None:
-        time = max(processed.shape[-1], clean.shape[-1])
-        lengths = check_lengths(lengths, torch.Size((*clean.shape[:-1], time)))
-        lengths = lengths.clamp_max(cut_clean.shape[-1])
-    dtype = torch.promote_types(clean.dtype, processed.dtype)
-    return cut_processed, cut_clean.to(dtype), lengths
-
-
-def check_seed(seed: int) -> int:
-    """Return a seed that NumPy accepts.
-
-    Args:
-        seed: Seed to validate.
-
-    Raises:
-        ValueError: The seed is not a whole number from 0 to 2 ** 32 - 1.
-
-    >>> check_seed(3)
-    3
-    """
-    if not isinstance(seed, Integral) or not 0 <= seed < 2**32:
-        raise ValueError(
-            f"expected seed to be a whole number from 0 to {2**32 - 1}, got {describe(seed)}"
-        )
-    return seed
-
-
-def item_seeds(seed: int | Sequence[int], items: int) -> list[int]:
-    """Return one seed for each item of a batch.
-
-    Args:
-        seed: One seed for all items, or a sequence with one for each item.
-        items: Number of items.
-
-    Raises:
-        ValueError: The number of seeds is another one, or a seed is out of range.
-
-    >>> item_seeds(3, 2)
-    [3, 3]
-    """
-    try:
-        seeds: list[Any] = list(seed)  # type: ignore[arg-type]
-    except TypeError:  # neither a sequence nor a tensor with elements
-        seeds = [seed] * items
-    if len(seeds) != items:
-        raise ValueError(
-            f"expected one seed or one for each of the {items} items, got {len(seeds)} seeds"
-        )
-    return [check_seed(value) for value in seeds]
+        longest = torch.Size((*clean.shape[:-1], max(times)))
+        lengths = check_lengths(lengths, longest).clamp_max(time)
+    return processed, clean.to(torch.promote_types(clean.dtype, processed.dtype)), lengths

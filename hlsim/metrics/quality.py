@@ -7,7 +7,6 @@ therefore show distortion, noise and colour, not whether enough is audible.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -22,13 +21,12 @@ from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
+from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
-from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS
+from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS, HairCells
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.haspi_score import legacy_rng_after_normals
 from hlsim.metrics.pair import Noise
-from hlsim.metrics.reference import PreparedBatch, Reference, map_on_cores
+from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import constant
 
 NALR_ORDER = 140
@@ -63,25 +61,18 @@ class QualityParts(NamedTuple):
     linear: Tensor
 
 
-class Comparison(NamedTuple):
-    """Features of a clean signal and of the output of an aid in one ear, which give a score.
-
-    The ear divides sounds into 32 channels, bands of frequencies.
+class _Comparison(NamedTuple):
+    """Features of a clean signal and of the output of an aid in some channels of one ear.
 
     Attributes:
-        clean_levels: Levels of the clean signal in dB over threshold, smoothed over segments of 16
-            ms (HASQI) or 8 ms (HAAQI). Shape: (items, 32, segments).
-        processed_levels: The same of the output.
+        clean_levels, processed_levels: Levels in dB over threshold, smoothed over segments of 16 ms
+            (HASQI) or 8 ms (HAAQI). Shape: (items, channels, segments).
         coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
-            (items, 32, segments).
-        energy: Mean square of the clean signal in each segment of 16 ms. Shape: (items, 32,
+            (items, channels, segments).
+        energy: Mean square of the clean signal in each segment of 16 ms. Shape: (items, channels,
             segments).
-        clean_spectrum: Long-term level of the clean signal in each channel, in dB over threshold.
-            Shape: (items, 32).
-        processed_spectrum: The same of the output.
-
-    >>> Comparison._fields[:2]
-    ('clean_levels', 'processed_levels')
+        clean_spectrum, processed_spectrum: Long-term levels in dB over threshold. Shape: (items,
+            channels).
     """
 
     clean_levels: Tensor
@@ -95,7 +86,7 @@ class Comparison(NamedTuple):
 class QualityReference(Reference):
     """Base of ``HasqiReference`` and ``HaaqiReference``: clean signals in an impaired ear.
 
-    Subclasses compute the score from a ``Comparison``.
+    Subclasses combine similarities of envelopes, fine structure and spectra into the score.
 
     Args:
         clean: Clean signals, not amplified. The scores have their dtype and their device. Their
@@ -120,30 +111,20 @@ class QualityReference(Reference):
     """
 
     envelope_segment: ClassVar[int]
+    """Samples of a segment of the smoothed envelopes at 24 kHz."""
 
-    def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
-        ears = signals.thresholds(self._audiogram)
-        host_ears = signals.thresholds(self._audiogram, host=True).detach().double()
+    split_by_rate: ClassVar[Any] = None
+    """Function that divides fluctuations of envelopes into bands of modulation."""
 
-        def prepare(batch: CleanBatch) -> _Batch:
-            amplified = _amplify(batch.signals, host_ears[batch.items], batch.audible)
-            cells = ear_model.hair_cells(ears[batch.items])
-            return _Batch(signals, batch, amplified, cells, keep, score=type(self))
-
-        return map_on_cores(prepare, signals.batches, signals.clean)
-
-    def score(
-        self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
-    ) -> Tensor:
+    def score(self, processed: Tensor, *, noise: Noise = "expected", seed: int = 0) -> Tensor:
         """Return the score of each output of an aid.
 
         Args:
-            processed: Outputs of the shape, rate and scale of the clean signals. Lengths that
-                differ by 0.1 s at most are cut to the shorter one, with a warning. Shape: (...,
+            processed: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
-            seed: Seed of the drawn noise, or one seed for each item.
+            seed: Seed of the drawn noise of each item.
 
         Returns:
             Scores, 0 to 1. Shape: (...,).
@@ -153,9 +134,7 @@ class QualityReference(Reference):
         """
         return self.parts(processed, noise=noise, seed=seed).combined
 
-    def parts(
-        self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
-    ) -> QualityParts:
+    def parts(self, processed: Tensor, *, noise: Noise = "expected", seed: int = 0) -> QualityParts:
         """Return the score of each output of an aid with its nonlinear and its linear part.
 
         Args:
@@ -163,25 +142,130 @@ class QualityReference(Reference):
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
-            seed: Seed of the drawn noise, or one seed for each item.
+            seed: Seed of the drawn noise of each item.
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device.
         """
-        return QualityParts(*self._compare(processed, noise, seed).unbind(-1))
+        return QualityParts(*self._compare_all(processed, noise, seed).unbind(-1))
 
     @staticmethod
     @abstractmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> QualityParts:
+    def _combine(envelopes: Tensor, fine: Tensor, x: Tensor, y: Tensor) -> QualityParts:
         """Compute the score of each item and its parts.
 
         Args:
-            comparison: Features of the clean signals and of the outputs.
-            extent: Number of samples of each item before padding.
+            envelopes: Correlation of the envelopes. Shape: (items,).
+            fine: Similarity of the fine structures. Shape: (items,).
+            x, y: Long-term spectra of clean signals and outputs: the share of each channel in the
+                sum of amplitudes. Shape: (items, 32).
         """
 
+    @property
+    def _unit(self) -> float:
+        """Amplitude of 20 uPa in the unit of the input."""
+        return 10.0 ** (-self._full_scale_spl / 20.0)
 
-# -- batches --------------------------------------------------------------------------------------
+    def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
+        ears = self._ears_on_host[clean.items].double()
+        amplified = _amplify(clean.signals, ears, clean.audible)
+        return amplified, ear_model.hair_cells(self._ears[clean.items])
+
+    def _features(
+        self,
+        sound: Tensor,
+        cells: HairCells,
+        channels: slice,
+        longest_delay: Tensor,
+        extent: Extent,
+    ) -> _Channels:
+        cochlea = ear_model.simulate_cochlea(sound, cells, channels, extent, motion=True)
+        delays = longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
+        inner = cells[..., channels].inner
+        levels, motion = self._adapt(cochlea.power, cochlea.motion, inner, delays, extent)
+        return _Channels(
+            channels=channels,
+            envelope=ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
+            motion=ear_model.lag_spectrum(cochlea.motion, extent),
+            delays=delays,
+            smooth_levels=levels,
+            adapted_motion=motion,
+            level=cochlea.level,
+        )
+
+    def _adapt(
+        self, power: Tensor, motion: Tensor, inner: Tensor, delays: Tensor, extent: Extent
+    ) -> tuple[Tensor, Tensor]:
+        """Return the smoothed levels, with equal group delays, and the adapted motion."""
+        levels = ear_model.nerve_levels(power, inner)
+        motion = _scale_motion_to_level(motion, power, levels, self._unit)
+        delayed = _delay(levels, delays, extent)
+        return fine_structure.smooth_levels(delayed, extent, self.envelope_segment), motion
+
+    def _compare(
+        self, batch: PreparedBatch, processed: Tensor, noise: Noise, seed: int, *ears: HairCells
+    ) -> Tensor:
+        """Compute the score of each item, its nonlinear and its linear part.
+
+        Shape: -> (items, 3).
+        """
+        extent = batch.clean.audible
+        noises = _threshold_noise(noise, seed, extent, processed)
+        comparisons = [
+            self._compare_channels(clean, processed, batch.cells, noises, extent)
+            for clean in batch.features
+        ]
+        joined = _Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
+        envelopes = fine_structure.envelope_correlation(
+            joined.clean_levels,
+            joined.processed_levels,
+            fine_structure.segments_of(extent, self.envelope_segment),
+            self.split_by_rate,
+        )
+        counts = fine_structure.segments_of(extent)
+        fine = fine_structure.synchrony(joined.coherence, joined.energy, counts)
+        x = fine_structure.channel_shares(joined.clean_spectrum)
+        y = fine_structure.channel_shares(joined.processed_spectrum)
+        return torch.stack(self._combine(envelopes, fine, x, y), -1)
+
+    def _compare_channels(
+        self,
+        clean: _Channels,
+        processed: Tensor,
+        cells: HairCells,
+        noises: tuple[Tensor | None, Tensor | None],
+        extent: Extent,
+    ) -> _Comparison:
+        channels, inner = clean.channels, cells[..., clean.channels].inner
+        cochlea = ear_model.simulate_cochlea(processed, cells, channels, extent, motion=True)
+        power, motion = cochlea.power, cochlea.motion
+        envelope = power.detach().sqrt()
+        power = ear_model.align_channels(power, envelope, clean.envelope, extent)
+        motion = ear_model.align_channels(motion, motion.detach(), clean.motion, extent)
+        levels, motion = self._adapt(power, motion, inner, clean.delays, extent)
+        clean_segments, segments = (
+            self._segment_spectra(signal, clean, noise, extent)
+            for signal, noise in zip((clean.adapted_motion, motion), noises, strict=True)
+        )
+        counts = fine_structure.segments_of(extent)
+        return _Comparison(
+            clean_levels=clean.smooth_levels,
+            processed_levels=levels,
+            coherence=fine_structure.coherence(clean_segments, segments, counts),
+            energy=clean_segments[1],
+            clean_spectrum=clean.level,
+            processed_spectrum=cochlea.level,
+        )
+
+    def _segment_spectra(
+        self, motion: Tensor, clean: _Channels, noise: Tensor | None, extent: Extent
+    ) -> tuple[Tensor, Tensor]:
+        """Add noise to the motion, delay its channels, and compute ``segment_spectra``."""
+        motion = motion[..., : extent.longest]
+        if noise is not None:
+            amplitude = self._unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0)
+            motion = motion + amplitude * noise[..., clean.channels, :].to(motion)
+        return fine_structure.segment_spectra(_delay(motion, clean.delays, extent), extent)
 
 
 @dataclass(frozen=True)
@@ -194,7 +278,6 @@ class _Channels:
         delays: Delays that make up for different group delays. Shape: (items, channels).
         smooth_levels: Smoothed levels. Shape: (items, channels, segments).
         adapted_motion: Motion after adaptation. Shape: (items, channels, padded).
-        segments: ``segment_spectra`` of that motion.
         level: Long-term level in dB over threshold. Shape: (items, channels).
     """
 
@@ -204,114 +287,12 @@ class _Channels:
     delays: Tensor
     smooth_levels: Tensor
     adapted_motion: Tensor
-    segments: tuple[Tensor, Tensor]
     level: Tensor
 
 
-class _Batch(PreparedBatch):
-    """Clean signals of a batch, amplified by NAL-R, in their impaired ears.
-
-    Args:
-        arguments: Those of ``PreparedBatch``.
-        score: The score that is computed.
-    """
-
-    def __init__(self, *arguments: Any, score: type[QualityReference]) -> None:
-        self._score = score
-        super().__init__(*arguments)
-
-    @property
-    def _unit(self) -> float:
-        """Amplitude of 20 uPa in the unit of the input."""
-        return 10.0 ** (-self._signals.full_scale / 20.0)
-
-    def _prepare(self, channels: slice) -> _Channels:
-        extent = self._extent
-        cochlea = self._simulate(self._clean, channels)
-        delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        levels, motion = self._adapt(cochlea.power, cochlea.motion, channels, delays)
-        return _Channels(
-            channels=channels,
-            envelope=ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
-            motion=ear_model.lag_spectrum(cochlea.motion, extent),
-            delays=delays,
-            smooth_levels=levels,
-            adapted_motion=motion,
-            segments=self._segment_spectra(motion, delays, None),
-            level=cochlea.level,
-        )
-
-    def _simulate(self, sound: Tensor, channels: slice) -> ear_model.CochlearOutput:
-        return ear_model.simulate_cochlea(sound, self._cells, channels, self._extent, motion=True)
-
-    def _adapt(
-        self, power: Tensor, motion: Tensor, channels: slice, delays: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the smoothed levels, with equal group delays, and the adapted motion."""
-        levels = ear_model.nerve_levels(power, self._cells[..., channels].inner)
-        motion = _scale_motion_to_level(motion, power, levels, self._unit)
-        segment = self._score.envelope_segment
-        delayed = self._delay(levels, delays)
-        return fine_structure.smooth_levels(delayed, self._extent, segment), motion
-
-    def _delay(self, signal: Tensor, delays: Tensor) -> Tensor:
-        """Delay channels. Shape: (items, channels, padded) -> (items, channels, longest)."""
-        ends, longest = self._extent.ends, self._extent.longest
-        return ear_model.shift(signal, delays, ends, ends, longest)
-
-    def _segment_spectra(
-        self, motion: Tensor, delays: Tensor, noise: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Add noise to the motion, delay its channels, and compute ``segment_spectra``."""
-        extent = self._extent
-        motion = motion[..., : extent.longest]
-        if noise is not None:
-            motion = motion + self._unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0) * noise
-        return fine_structure.segment_spectra(self._delay(motion, delays), extent)
-
-    def compare(
-        self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
-    ) -> Tensor:
-        """Compute the score of each item, its nonlinear and its linear part.
-
-        The arguments are those of ``PreparedBatch.compare``.
-        """
-        sound = self._signals.align(processed, self._batch)
-        sources = _NoiseSources(noise, seeds[self._batch.items], self._extent, sound)
-        comparisons = [
-            self._compare_channels(clean, sound, *sources.draw(clean.channels))
-            for clean in self._clean_features()
-        ]
-        joined = Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
-        return torch.stack(self._score._compute_parts(joined, self._extent), -1)
-
-    def _compare_channels(
-        self,
-        clean: _Channels,
-        sound: Tensor,
-        clean_noise: Tensor | None,
-        processed_noise: Tensor | None,
-    ) -> Comparison:
-        channels, extent = clean.channels, self._extent
-        cochlea = self._simulate(sound, channels)
-        power, motion = cochlea.power, cochlea.motion
-        envelope = power.detach().sqrt()
-        power = ear_model.align_channels(power, envelope, clean.envelope, extent)
-        motion = ear_model.align_channels(motion, motion.detach(), clean.motion, extent)
-        levels, motion = self._adapt(power, motion, channels, clean.delays)
-        segments = self._segment_spectra(motion, clean.delays, processed_noise)
-        clean_segments = clean.segments
-        if clean_noise is not None:
-            clean_segments = self._segment_spectra(clean.adapted_motion, clean.delays, clean_noise)
-        counts = fine_structure.segments_of(extent)
-        return Comparison(
-            clean_levels=clean.smooth_levels,
-            processed_levels=levels,
-            coherence=fine_structure.coherence(clean_segments, segments, counts),
-            energy=clean_segments[1],
-            clean_spectrum=clean.level,
-            processed_spectrum=cochlea.level,
-        )
+def _delay(signal: Tensor, delays: Tensor, extent: Extent) -> Tensor:
+    """Delay channels. Shape: (items, channels, padded) -> (items, channels, longest)."""
+    return ear_model.shift(signal, delays, extent.ends, extent.ends, extent.longest)
 
 
 def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
@@ -335,60 +316,35 @@ def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: 
 # -- noise -----------------------------------------------------------------------------------------
 
 
-class _NoiseSources:
-    """Noise at the threshold of hearing, which is added to the motion of clean signal and output.
+def _threshold_noise(
+    noise: Noise, seed: int, extent: Extent, like: Tensor
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return the noise at the threshold of hearing for the motion of clean signal and of output.
 
     Args:
         noise: Kind of the noise.
-        seeds: Seed of each item.
-        extent: Number of samples of each item before padding.
-        like: Tensor whose dtype and device the noise has.
+        seed: Seed of each item.
+        extent: Number of samples of each item.
+        like: Tensor whose device the noise has, and for ``"seeded"`` its dtype.
+
+    Returns:
+        Noise of both, (items, 32, longest) or (32, longest), or None where there is none.
     """
-
-    def __init__(self, noise: Noise, seeds: Sequence[int], extent: Extent, like: Tensor) -> None:
-        self._noise, self._extent, self._like = noise, extent, like
-        if noise == "seeded":  # pyclarity draws that of the clean signal, then that of the output
-            self._generators = [
-                [
-                    legacy_rng_after_normals(seed, skipped * CHANNELS * end)
-                    for seed, end in zip(seeds, extent.ends, strict=True)
-                ]
-                for skipped in (0, 1)
-            ]
-
-    def draw(self, channels: slice) -> tuple[Tensor | None, Tensor | None]:
-        """Return the noise of the clean signal and of the output in some channels.
-
-        Channels must be requested in ascending order.
-
-        Shape: -> (items or 1, channels, longest) twice, or None where there is no noise.
-        """
-        if self._noise == "seeded":
-            clean, processed = (self._draw(generators, channels) for generators in self._generators)
-            return clean, processed
-        if self._noise == "expected":
-            # Only audible parts of the clean signal count, and the noise is far below them.
-            return None, self._frozen_noise(channels)
-        return None, None
-
-    def _draw(self, generators: list[np.random.RandomState], channels: slice) -> Tensor:
-        """Draw the noise of pyclarity."""
-        ends, like = self._extent.ends, self._like
-        count = channels.stop - channels.start
-        noise = torch.zeros(len(ends), count, self._extent.longest, dtype=like.dtype)
-        for row, generator, end in zip(noise, generators, ends, strict=True):
-            row[:, :end] = torch.from_numpy(generator.standard_normal((count, end)))
-        return noise.to(like.device, non_blocking=like.device.type != "cpu")
-
-    def _frozen_noise(self, channels: slice) -> Tensor:
-        """Return the same noise every time: each channel takes its part of one signal."""
-        longest = self._extent.longest
-        table = constant(_frozen_table, dtype=torch.float32, device=self._like.device)
-        first = channels.start * FROZEN_STRIDE
-        last = (channels.stop - 1) * FROZEN_STRIDE
-        repeated = table.repeat(-(-(last + longest) // FROZEN_SAMPLES))[first:]
-        count = channels.stop - channels.start
-        return repeated.unfold(0, longest, FROZEN_STRIDE)[:count].to(self._like)
+    longest = extent.longest
+    if noise == "seeded":
+        drawn = torch.zeros(2, len(extent.ends), CHANNELS, longest, dtype=like.dtype)
+        for item, end in enumerate(extent.ends):
+            random = np.random.RandomState(seed)
+            drawn[:, item, :, :end] = torch.from_numpy(random.standard_normal((2, CHANNELS, end)))
+        clean_noise, processed_noise = drawn.to(like.device)
+        return clean_noise, processed_noise
+    if noise == "expected":
+        # The same noise every time: each channel takes its part of one signal. Only audible parts
+        # of the clean signal count, and the noise is far below them.
+        table = constant(_frozen_table, dtype=torch.float32, device=like.device)
+        copies = -(-((CHANNELS - 1) * FROZEN_STRIDE + longest) // FROZEN_SAMPLES)
+        return None, table.repeat(copies).unfold(0, longest, FROZEN_STRIDE)[:CHANNELS]
+    return None, None
 
 
 def _frozen_table() -> NDArray[np.float64]:
@@ -419,7 +375,7 @@ def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
     """
     points = fft_length(extent.longest + NALR_ORDER, 2)
     taps = torch.from_numpy(np.stack([_nalr_taps(ear) for ear in ears]))
-    fir = taps.to(signals.device, signals.dtype, non_blocking=signals.device.type != "cpu")
+    fir = taps.to(signals)
     spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(fir, points)
     filtered = torch.fft.irfft(spectrum, points)[:, NALR_ORDER : NALR_ORDER + extent.longest]
     return functional.pad(filtered, (0, extent.padded - extent.longest))

@@ -1,99 +1,57 @@
 """Scores of many outputs against the same clean signals, which are prepared once.
 
-``Reference`` is the base of ``HaspiReference``, ``HasqiReference`` and ``HaaqiReference``. It holds
-one ``PreparedBatch`` for each group of items that is computed together: a single item on a CPU, all
-items on a GPU.
+``Reference`` is the base of ``HaspiReference``, ``HasqiReference`` and ``HaaqiReference``. It
+computes items in groups: a single item on a CPU, all items on a GPU.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths, check_choice
+from hlsim.audiogram import HIGHEST_LEVEL
+from hlsim.audiogram.devices import on_host
+from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
+from hlsim.calibration import PASCAL_SPL, check_full_scale
+from hlsim.checks import (
+    Lengths,
+    broadcast_shape,
+    check_choice,
+    check_lengths,
+    check_number,
+    check_rate,
+    check_waveform,
+)
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
-from hlsim.metrics.pair import Noise, item_seeds
+from hlsim.metrics.ear.clean_speech import CleanBatch
+from hlsim.metrics.ear.extent import Extent
+from hlsim.metrics.ear.model import HairCells
+from hlsim.metrics.pair import SHORTEST_SECONDS, Noise, check_finite, check_pair
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 
-class PreparedBatch(ABC):
+class PreparedBatch(NamedTuple):
     """Clean signals of a batch as an ear receives them, ready to be compared with outputs of aids.
 
-    Subclasses compute the features of a score in a few channels of the ear at a time.
-
-    Args:
-        signals: All clean signals.
-        batch: The clean signals of this batch.
-        clean: Sound that reaches the ear, in multiples of 20 uPa. Shape: (items, padded).
+    Attributes:
+        clean: The clean signals.
         cells: Hair cells of the ear, or of the ear of each item. Shape: (32,) or (items, 32).
-        keep: Store the features of the clean signals instead of computing them for each score.
+        features: Features of the clean signals, for a few channels of the ear at a time.
 
-    >>> from hlsim.metrics import HaspiReference
-    >>> reference = HaspiReference(0.02 * torch.randn(2, 16000))
-    >>> [isinstance(batch, PreparedBatch) for batch in reference._batches]
-    [True, True]
+    >>> PreparedBatch._fields
+    ('clean', 'cells', 'features')
     """
 
-    def __init__(
-        self,
-        signals: CleanSpeech,
-        batch: CleanBatch,
-        clean: Tensor,
-        cells: ear_model.HairCells,
-        keep: bool,
-    ) -> None:
-        self._signals, self._batch, self._cells = signals, batch, cells
-        self._extent = batch.audible
-        self._clean = signals.through_middle_ear(clean)
-        self._longest_delay = ear_model.longest_group_delay(self._clean, cells, self._extent)
-        self._stored: list[Any] | None = None
-        if keep:
-            self._stored = list(self._clean_features())
-
-    def _clean_features(self) -> Iterator[Any]:
-        """Yield the features of the clean signals in a few channels, from low to high."""
-        if self._stored is not None:
-            yield from self._stored
-            return
-        items, padded = self._clean.shape
-        for channels in ear_model.channel_chunks(items, padded, self._signals.device):
-            with torch.no_grad():
-                features = self._prepare(channels)
-            yield features
-
-    @abstractmethod
-    def _prepare(self, channels: slice) -> Any:
-        """Compute the features of the clean signals in some channels."""
-
-    @abstractmethod
-    def compare(
-        self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
-    ) -> Tensor:
-        """Compare outputs of aids with the clean signals of this batch.
-
-        Args:
-            processed: Outputs for the items of all batches. Shape: (all items, time).
-            noise: Kind of the internal noise of the ear.
-            seeds: Seeds of the items of all batches.
-            ears: For HASPI one argument, the hair cells of the impaired ears of all items, with
-                shape (all items, 32); none for HASQI and HAAQI, where the outputs reach the same
-                ears as the clean signals.
-
-        Returns:
-            For each item of this batch, the ten features from which ``HaspiReference`` computes
-            HASPI, or HASQI or HAAQI with its nonlinear and its linear part. Shape: (items, 10) or
-            (items, 3).
-        """
+    clean: CleanBatch
+    cells: HairCells
+    features: list[Any]
 
 
 class Reference(ABC):
@@ -122,9 +80,6 @@ class Reference(ABC):
     True
     """
 
-    score_name: ClassVar[str]
-
-    @torch.inference_mode(False)  # the features may serve a training later
     def __init__(
         self,
         clean: Tensor,
@@ -136,41 +91,132 @@ class Reference(ABC):
         whole_khz: bool = False,
         keep: bool = True,
     ) -> None:
-        self._audiogram = audiogram
-        self._signals = CleanSpeech(
-            clean, sample_rate, full_scale_spl, lengths, whole_khz, self.score_name
-        )
-        self._batches = self._prepare(self._signals, keep)
+        rate = check_rate(sample_rate)
+        self._rate = 1000 * round(rate / 1000) if whole_khz else rate
+        self._full_scale_spl = check_full_scale(full_scale_spl)
+        check_waveform(clean, "clean", full_scale_spl=full_scale_spl)
+        self._clean = clean.detach()
+        self._rows = self._clean.reshape(-1, clean.shape[-1])
+        items, time = self._rows.shape
+        self._ends = [time] * items
+        if lengths is not None:
+            self._ends = check_lengths(lengths, clean.shape).flatten().tolist()
+        seconds = min(self._ends) / rate
+        if seconds < SHORTEST_SECONDS:
+            raise ValueError(
+                f"clean has an item of {seconds:.2g} s; expected {SHORTEST_SECONDS} s or more, "
+                "because a score means nothing below; pass longer signals"
+            )
+        check_finite("clean", self._rows)
+        if audiogram is not None:
+            self._ears = self._thresholds(audiogram)
+            self._ears_on_host = self._thresholds(audiogram, host=True)
+        self._groups = [slice(0, items)]
+        if clean.device.type == "cpu":
+            self._groups = [slice(item, item + 1) for item in range(items)]
+        self._batches: list[PreparedBatch] = []
+        if keep:
+            self._batches = map_on_cores(self._prepare, self._groups, self._clean)
 
+    def _thresholds(self, audiogram: AudiogramLike | None, *, host: bool = False) -> Tensor:
+        """Return the thresholds of the ear of each item.
+
+        Args:
+            audiogram: One ear, or one for each item; None raises ValueError.
+            host: Return the thresholds on the CPU, even if this must wait for a GPU.
+
+        Returns:
+            Thresholds. Shape: (items, 8) dB HL.
+        """
+        shape = self._clean.shape[:-1]
+        ears = resolve_thresholds(None, audiogram, self._clean, highest=HIGHEST_LEVEL)
+        if broadcast_shape(shape, ears.shape[:-1]) != shape:
+            raise ValueError(
+                f"expected one audiogram or one for each item, got shape {tuple(ears.shape)} "
+                f"for signals of shape {tuple(self._clean.shape)}"
+            )
+        ears = on_host(ears) if host else ears
+        return ears.expand(*shape, 8).reshape(-1, 8)
+
+    @torch.inference_mode(False)  # the features may serve a training later
     @torch.no_grad()
-    def _prepare(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
-        with torch.autocast(signals.device.type, enabled=False):
-            return self._prepare_batches(signals, keep)
+    def _prepare(self, items: slice) -> PreparedBatch:
+        """Validate the clean signals of some items, and compute their features."""
+        with torch.autocast(self._clean.device.type, enabled=False):
+            clean = CleanBatch(self._rows, self._ends, items, self._rate, self._full_scale_spl)
+            at_ear, cells = self._sound_at_ear(clean)
+            sound = clean.through_middle_ear(at_ear)
+            longest_delay = ear_model.longest_group_delay(sound, cells, clean.audible)
+            features = [
+                self._features(sound, cells, channels, longest_delay, clean.audible)
+                for channels in ear_model.channel_chunks(sound)
+            ]
+        return PreparedBatch(clean, cells, features)
 
     @abstractmethod
-    def _prepare_batches(self, signals: CleanSpeech, keep: bool) -> list[PreparedBatch]:
-        """Prepare the clean signals of each batch."""
+    def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
+        """Return the sound that reaches an ear, in multiples of 20 uPa, and the ear's hair cells.
 
+        Shape of the sound: (items, padded).
+        """
+
+    @abstractmethod
+    def _features(
+        self,
+        sound: Tensor,
+        cells: HairCells,
+        channels: slice,
+        longest_delay: Tensor,
+        extent: Extent,
+    ) -> Any:
+        """Compute the features of the clean signals in some channels.
+
+        Args:
+            sound: Clean signals behind the middle ear. Shape: (items, padded).
+            cells: Hair cells of all channels.
+            channels: The channels.
+            longest_delay: Delay to which all channels are delayed. Shape: (items, 1).
+            extent: Number of samples of each item before padding.
+        """
+
+    @abstractmethod
     def _compare(
-        self, processed: Tensor, noise: Noise, seed: int | Sequence[int], *ears: ear_model.HairCells
+        self, batch: PreparedBatch, processed: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
-        """Return the features of each output, from which its score follows.
+        """Compare outputs of aids with the clean signals of a batch.
 
-        The arguments are those of ``PreparedBatch.compare``, with one seed or one for each item.
+        Args:
+            batch: The clean signals.
+            processed: Aligned outputs behind the middle ear. Shape: (items, padded).
+            noise: Kind of the internal noise of the ear.
+            seed: Seed of the noise.
+            ears: For HASPI one argument, the hair cells of the impaired ears of all items, with
+                shape (all items, 32); none for HASQI and HAAQI, where the outputs reach the same
+                ears as the clean signals.
 
-        Shape: (..., time) -> (..., features).
+        Returns:
+            Numbers for each item from which its score follows. Shape: (items, numbers).
+        """
+
+    def _compare_all(self, processed: Tensor, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
+        """Validate outputs, and compare them with the clean signals.
+
+        The arguments are those of ``_compare``. Shape: (..., time) -> (..., numbers).
         """
         check_choice("noise", noise, Noise)
-        rows, signals = self._signals.match(processed)
-        batches = self._batches
-        if signals is not self._signals:
-            batches = self._prepare(signals, keep=False)
-        seeds = item_seeds(seed, len(rows))
+        check_number("seed", seed, 0, 2**32 - 1, whole=True)
+        check_waveform(processed, "processed", full_scale_spl=self._full_scale_spl)
+        check_pair(processed, self._clean)
+        rows = processed.reshape(self._rows.shape)
+        check_finite("processed", rows)
+
+        def compare(group: int) -> Tensor:
+            batch = self._batches[group] if self._batches else self._prepare(self._groups[group])
+            return self._compare(batch, batch.clean.align(rows), noise, seed, *ears)
+
         with torch.autocast(rows.device.type, enabled=False):
-            features = map_on_cores(
-                lambda batch: batch.compare(rows, noise, seeds, *ears), batches, rows
-            )
-        return torch.cat(features).reshape(*signals.shape, -1)
+            numbers = map_on_cores(compare, range(len(self._groups)), rows)
+        return torch.cat(numbers).reshape(*processed.shape[:-1], -1)
 
 
 def map_on_cores(

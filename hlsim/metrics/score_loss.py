@@ -52,27 +52,51 @@ def score_loss(
     """
     finite = processed.detach().isfinite().all(-1)
     processed = torch.where(finite.unsqueeze(-1), processed, 0.0)
-    losses = _score_loss(SCORES[name], processed, clean, ears, ends, sample_rate=sample_rate)
-    return torch.where(finite, losses, torch.nan)
+    scores = scores_or_errors(SCORES[name], processed, clean, ears, ends, sample_rate=sample_rate)
+    losses = []
+    for score, signal in zip(scores, processed, strict=True):
+        if isinstance(score, Tensor):
+            losses.append(1.0 - score)
+        elif isinstance(score, UnscorableError):
+            losses.append((0.0 * signal).sum())
+        else:
+            raise score
+    return torch.where(finite, torch.stack(losses), torch.nan)
 
 
-def _score_loss(
+def scores_or_errors(
     score: Callable[..., Tensor],
     processed: Tensor,
     clean: Tensor,
     ears: Tensor,
     ends: Sequence[int],
-    **options: Any,
-) -> Tensor:
-    """Compute ``score_loss`` of items whose samples are finite. Shape: -> (items,)."""
+    **settings: Any,
+) -> list[Tensor | ValueError]:
+    """Compute the score of each item of a batch, or the error that says why it has none.
+
+    One item without a score stops a batch, so then the items are scored one by one.
+
+    Args:
+        score: Function that computes the score, such as ``haspi``.
+        processed: Outputs of an aid. Shape: (items, time).
+        clean: Clean signals. Shape: (items, time).
+        ears: Thresholds of the ear of each item in dB HL. Shape: (items, 8).
+        ends: Number of samples of each item before padding.
+        settings: Further keyword arguments of ``score``.
+
+    >>> silence = torch.zeros(1, 16000)
+    >>> errors = scores_or_errors(haspi, silence, silence, torch.zeros(1, 8), [16000])
+    >>> type(errors[0]).__name__
+    'UnscorableError'
+    """
     try:
-        return 1.0 - score(processed, clean, ears, lengths=ends, **options)
-    except UnscorableError:
+        return list(score(processed, clean, ears, lengths=ends, **settings))
+    except ValueError as error:
         if len(clean) == 1:
-            return (0.0 * processed).sum(-1)
-    # One item without a score stops the batch, so the items are scored one by one.
-    losses = []
-    for item, end in enumerate(ends):
-        signals = processed[item, None], clean[item, None], ears[item, None]
-        losses.append(_score_loss(score, *signals, [end], **options))
-    return torch.cat(losses)
+            return [error]
+    results = []
+    for item in zip(
+        processed.split(1), clean.split(1), ears.split(1), [[end] for end in ends], strict=True
+    ):
+        results += scores_or_errors(score, *item, **settings)
+    return results

@@ -86,15 +86,10 @@ def test_equals_pyclarity_of_silence(
     assert float(mbstoi(y, x)) == pytest.approx(float(expected), abs=1e-6)
 
 
-@pytest.mark.parametrize("ends", [(24000, 24000, 24000), (24000, 17011, 12000)])
-def test_a_batch_equals_its_items(scenes: tuple[Tensor, Tensor], ends: tuple[int, ...]) -> None:
-    is_inside = torch.arange(24000) < torch.tensor(ends)[:, None, None]
-    clean, noisy = (torch.where(is_inside, signal, 0.0) for signal in scenes)
-    items = [
-        float(mbstoi(y[:, :end], x[:, :end])) for y, x, end in zip(noisy, clean, ends, strict=True)
-    ]
-    scores = mbstoi(noisy[:, None], clean[:, None], lengths=torch.tensor(ends)[:, None])
-    assert scores.shape == (3, 1) and scores.flatten().tolist() == pytest.approx(items, abs=1e-12)
+def test_a_batch_equals_its_items(scenes: tuple[Tensor, Tensor]) -> None:
+    clean, noisy = scenes
+    items = [mbstoi(y, x) for y, x in zip(noisy, clean, strict=True)]
+    assert torch.equal(mbstoi(noisy[:, None], clean[:, None]), torch.stack(items)[:, None])
 
 
 def test_identical_signals_score_1_and_the_level_does_not_count(
@@ -157,26 +152,14 @@ def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
         {"clean": torch.ones(3, 16000)},
         {"clean": torch.ones(2, 12000)},
         {"processed": torch.full((2, 16000), math.nan)},
-        {"processed": torch.zeros(2, 16000, device="meta")},
         {"clean": torch.zeros(2, 16000)},
         {"processed": torch.ones(2, 16000, dtype=torch.int16)},
         {"processed": torch.randn(2, 6000), "clean": torch.randn(2, 6000)},  # too short
         {"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)},
         {"sample_rate": 8000},
-        {"lengths": [16000, 16000]},
-        {"clean": torch.full((2, 16000), math.inf)},
     ],
 )
 def test_bad_arguments_raise_value_error(change: dict[str, Any]) -> None:
     arguments = {"processed": torch.randn(2, 16000), "clean": torch.randn(2, 16000)} | change
     with pytest.raises(ValueError):
         mbstoi(**arguments)
-
-
-def test_errors_name_signal_item_and_ear(scenes: tuple[Tensor, Tensor]) -> None:
-    clean, processed = (signal.clone() for signal in scenes)
-    processed[1, 1, 100] = math.nan
-    with pytest.raises(ValueError, match=r"^processed at the right ear of item 1 holds"):
-        mbstoi(processed, clean)
-    with pytest.raises(ValueError, match=r"^clean of item 2 is silent at the left and"):
-        mbstoi(clean, clean * torch.tensor([1.0, 1.0, 0.0])[:, None, None])

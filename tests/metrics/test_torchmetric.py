@@ -39,22 +39,19 @@ def noisy(clean: Tensor) -> Tensor:
     return clean + 0.003 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("settings", [{}, {"noise": "seeded", "seed": 3, "full_scale_spl": 96.0}])
+@pytest.mark.parametrize("full_scale", [94.0, 96.0])
 @pytest.mark.parametrize(("kind", "name"), [(HASPI, "haspi"), (HASQI, "hasqi"), (HAAQI, "haaqi")])
 def test_the_mean_of_the_functions_scores(
-    clean: Tensor, kind: type[Any], name: str, settings: dict[str, Any]
+    clean: Tensor, kind: type[Any], name: str, full_scale: float
 ) -> None:
-    metric, signals = kind(**settings), (*noisy(clean), clean[0])
+    metric, signals = kind(full_scale_spl=full_scale), (*noisy(clean), clean[0])
     metric.update(noisy(clean), clean, [N3, S2])
     metric.update(clean[0], clean[0], N3)
-    first_seed = settings.get("seed", 0)
-    references, ears = (*clean, clean[0]), (N3, S2, N3)
     expected = [
-        expected_score(x, y, ear, name=name, **settings | {"seed": first_seed + item})
-        for item, (x, y, ear) in enumerate(zip(references, signals, ears, strict=True))
+        expected_score(x, y, ear, name=name, full_scale_spl=full_scale)
+        for x, y, ear in zip((*clean, clean[0]), signals, (N3, S2, N3), strict=True)
     ]
     assert float(metric.compute()) == pytest.approx(sum(expected) / 3, abs=1e-6)
-    full_scale = settings.get("full_scale_spl", 94.0)
     levels = [full_scale + 10 * float(x.square().mean().log10()) for x in signals]
     assert float(metric.level) == pytest.approx(sum(levels) / 3, abs=1e-3)
     metric.reset()
@@ -64,26 +61,18 @@ def test_the_mean_of_the_functions_scores(
 
 
 def test_the_better_ear_of_two_channels_counts(clean: Tensor) -> None:
-    clean = clean[:1]
-    both = torch.stack([clean, clean], 1)
-    processed = torch.stack([noisy(clean), 3.0 * noisy(clean)], 1)  # (batch, left and right, time)
-    metric = HASPI(16000)
-    scores = [[expected_score(clean[0], processed[0, i], ear)] for i, ear in enumerate((N3, S2))]
-    expected = torch.tensor(scores, dtype=torch.float64)
-    for ears in (
-        [N3, S2],
-        torch.tensor([N3.levels, S2.levels]),
-        torch.tensor([[N3.levels, S2.levels]]),
-    ):
-        metric.reset()
+    both = torch.stack([clean[0], clean[0]])[None]
+    processed = torch.stack([noisy(clean)[0], 3.0 * noisy(clean)[0]])[None]  # (batch, 2, time)
+    scores = [expected_score(clean[0], processed[0, i], ear) for i, ear in enumerate((N3, S2))]
+    for ears in ([N3, S2], torch.tensor([[N3.levels, S2.levels]])):
+        metric = HASPI(16000)
         metric.update(processed, both, ears)
-        assert float(metric.compute()) == pytest.approx(float(expected.amax(0).mean()), abs=1e-6)
-        torch.testing.assert_close(metric.ears.double(), expected.mean(1), atol=1e-6, rtol=0)
+        assert float(metric.compute()) == pytest.approx(max(scores), abs=1e-6)
     metric.reset()
     processed[:, 0] = torch.nan  # an ear without a score does not count
     metric.update(processed, both, [N3, S2])
-    assert float(metric.compute()) == pytest.approx(float(expected[1].mean()), abs=1e-6)
-    assert int(metric.failed) == 0 and bool(metric.ears.isnan()[0])
+    assert float(metric.compute()) == pytest.approx(scores[1], abs=1e-6)
+    assert int(metric.failed) == 0
     for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
         with pytest.raises(ValueError, match=r"thresholds|audiogram"):
             metric.update(processed, both, wrong)
@@ -138,26 +127,18 @@ def test_values_are_plotted(clean: Tensor) -> None:
 
     collection = MetricCollection([HASPI(limit=1), HASQI(limit=1)])
     collection.update(noisy(clean), clean, N3)
-    metric = collection["HASPI"]
-    _, axes = metric.plot()
-    assert axes.lines[0].get_ydata().item() == pytest.approx(float(metric.compute()))
-    _, axes = metric.plot([metric.compute(), torch.tensor(0.5)])
-    assert len(axes.lines[0].get_ydata()) == 2
+    _, axes = collection["HASPI"].plot()
+    assert axes.lines[0].get_ydata().item() == pytest.approx(float(collection["HASPI"].compute()))
     assert len(collection.plot()) == 2
 
 
-def test_merged_states_are_one_mean_and_other_settings_are_rejected(clean: Tensor) -> None:
+def test_merged_states_are_one_mean(clean: Tensor) -> None:
     first, second, both = HASPI(), HASPI(), HASPI()
-    batches = (clean[:1], noisy(clean)[:1])
-    for metric, processed in zip((first, second), batches, strict=True):
+    for metric, processed in zip((first, second), (clean[:1], noisy(clean)[:1]), strict=True):
         metric.update(processed, clean[:1], N3)
         both.update(processed, clean[:1], N3)
     first.merge_state(second)
     torch.testing.assert_close(first.compute(), both.compute())
-    other = HASPI(48000)
-    for state in (other, other.metric_state):
-        with pytest.raises(ValueError, match="different settings"):
-            first.merge_state(state)
 
 
 def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> None:
@@ -171,8 +152,7 @@ def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> Non
         with pytest.warns(UserWarning, match=f"HASPI leaves out item 0: {reason}"):
             metric.update(processed, reference, N3)
         assert (int(metric.failed), int(metric.count)) == (1, 1)
-        # The seed of the second item does not depend on the first one.
-        expected = expected_score(clean[1], clean[1], N3, seed=1)
+        expected = expected_score(clean[1], clean[1], N3)
         assert float(metric.compute()) == pytest.approx(expected, abs=1e-6)
 
 
@@ -181,7 +161,7 @@ def test_silence_in_place_of_speech_counts(clean: Tensor) -> None:
     metric = HASPI(16000)
     metric.update(clean * torch.tensor([[0.0], [1.0]]), clean, N3)
     assert (int(metric.failed), int(metric.count)) == (0, 2)
-    alone = expected_score(clean[1], clean[1], N3, seed=1)
+    alone = expected_score(clean[1], clean[1], N3)
     assert float(metric.compute()) == pytest.approx(alone / 2.0, abs=0.01)
 
 
@@ -191,12 +171,7 @@ BAD_UPDATES: list[dict[str, Any]] = [
     {"processed": NOISE.short()},
     {"clean": NOISE.numpy()},
     {"audiogram": [N3]},
-    {"audiogram": 3},
-    {"audiogram": torch.zeros(3, 8)},
-    {"lengths": torch.tensor([12800])},
-    {"lengths": torch.tensor([12800, -5])},
     {"lengths": torch.tensor([12801, 12800])},
-    {"lengths": torch.tensor([12799.5, 12800.0])},
 ]
 
 
@@ -210,11 +185,7 @@ BAD_SETTINGS: list[dict[str, Any]] = [
     {"limit": 0},
     {"limit": 1.5},
     {"full_scale_spl": float("inf")},
-    {"seed": -1},
-    {"seed": "a"},
-    {"noise": "loud"},
     {"sample_rate": 8000},
-    {"dist_sync_on_step": True},
 ]
 
 
@@ -256,8 +227,7 @@ def test_in_a_lightning_validation_loop(clean: Tensor, tmp_path: Path) -> None:
     )
     model = Amplifier()
     trainer.fit(model, loader, loader)
-    # The second epoch has the same items with the same seeds.
-    expected = sum(expected_score(clean[i], 4.0 * clean[i], N3, seed=i) for i in range(2)) / 2
+    expected = sum(expected_score(clean[i], 4.0 * clean[i], N3) for i in range(2)) / 2
     assert float(trainer.callback_metrics["haspi"]) == pytest.approx(expected, abs=1e-6)
     # The checkpoint does not contain the metric.
     assert set(model.state_dict()) == {"gain"}

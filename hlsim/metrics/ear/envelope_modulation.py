@@ -26,7 +26,7 @@ from torch import Tensor
 
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.clean_speech import UnscorableError
-from hlsim.metrics.ear.extent import Extent, integers
+from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, shift
 from hlsim.torchtools import constant_like
 
@@ -78,7 +78,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
     torch.Size([1, 2, 15])
     """
     count = -(-extent.longest // STRIDE)
-    stops = [end + WINDOW_LEAD for end in extent.ends]
+    stops = tuple(end + WINDOW_LEAD for end in extent.ends)
     delayed = shift(
         levels, delays + WINDOW_LEAD, extent.ends, stops, STRIDE * (count + WINDOW_STRIDES - 1)
     )
@@ -186,7 +186,6 @@ class _Covariance(NamedTuple):
         waves: Coefficients without their means before the filters. Shape: (items, 5, audible)
             twice.
         spectra: Spectra of these. Shape: (items, 5, frequencies) twice.
-        extent: Number of audible frames of each item.
     """
 
     xx: Tensor
@@ -194,7 +193,6 @@ class _Covariance(NamedTuple):
     xy: Tensor
     waves: tuple[Tensor, Tensor]
     spectra: tuple[Tensor, Tensor]
-    extent: Extent
 
 
 def _modulation_covariance(reference: Tensor, processed: Tensor, extent: Extent) -> _Covariance:
@@ -218,7 +216,7 @@ def _modulation_covariance(reference: Tensor, processed: Tensor, extent: Extent)
         )
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
     xx, yy, xy = torch.cat(sums, 2)
-    return _Covariance(xx, yy, xy, waves, (a, b), extent)
+    return _Covariance(xx, yy, xy, waves, (a, b))
 
 
 def _points(frames: int) -> int:
@@ -330,11 +328,9 @@ def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -
     covariance = _modulation_covariance(reference, processed, extent)
     variance = NOISE_DB**2
     energies = torch.from_numpy(np.stack([_noise_energy(frames) for frames in extent.ends]))
-    on_gpu = reference.device.type != "cpu"
-    energies = energies.to(reference.device, reference.dtype, non_blocking=on_gpu)
-    noise = variance * energies.unsqueeze(-1)
+    noise = variance * energies.to(reference).unsqueeze(-1)
     xx, yy, xy = covariance.xx + noise, covariance.yy + noise, covariance.xy
-    xx2, yy2, xy2, noise2 = _energies_filtered_twice(covariance)
+    xx2, yy2, xy2, noise2 = _energies_filtered_twice(covariance, extent)
     noise2 = variance**2 * noise2
     spread_x = (4.0 * variance * xx2 + 2.0 * noise2) / xx.square()
     spread_y = (4.0 * variance * yy2 + 2.0 * noise2) / yy.square()
@@ -353,7 +349,7 @@ def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -
     return (folded + mean * torch.erf(mean / (2.0 * spread).sqrt())).mean(-1)
 
 
-def _energies_filtered_twice(covariance: _Covariance) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _energies_filtered_twice(covariance: _Covariance, extent: Extent) -> list[Tensor]:
     """Return the energies of coefficients and of white noise after filtering them twice.
 
     They determine the covariance of the coefficients with noise that passed the same filter. The
@@ -362,33 +358,18 @@ def _energies_filtered_twice(covariance: _Covariance) -> tuple[Tensor, Tensor, T
     Returns:
         Energies xx, yy and xy of the coefficients, (items, 10, 5), and of noise, (items, 10, 1).
     """
-    ends = covariance.extent.ends
-    if len({_points(frames) for frames in ends}) == 1:
-        return _filter_twice(*covariance.spectra, ends)
-    parts = []
-    for item, frames in enumerate(ends):
-        waves = (wave[item, None, :, :frames] for wave in covariance.waves)
-        x, y = (torch.fft.rfft(wave, _points(frames)) for wave in waves)
-        parts.append(_filter_twice(x, y, (frames,)))
-    xx, yy, xy, noise = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
-    return xx, yy, xy, noise
-
-
-def _filter_twice(
-    reference: Tensor, processed: Tensor, ends: tuple[int, ...]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return ``_energies_filtered_twice`` of items whose spectra are equally long.
-
-    Args:
-        reference, processed: Spectra. Shape: (items, 5, frequencies).
-        ends: Number of audible frames of each item.
-    """
-    x, y = torch.view_as_real(reference), torch.view_as_real(processed)
-    weights = constant_like(x, _twice_filtered, _points(max(ends)))
-    xx, yy, xy = (weights @ product.sum(-1).mT for product in (x.square(), y.square(), x * y))
-    counts = integers(ends, weights.device).to(weights)
-    noise = counts[:, None, None] * weights.sum(-1, keepdim=True)
-    return xx, yy, xy, noise
+    items = []
+    for item, frames in enumerate(extent.ends):
+        points = _points(frames)
+        a, b = (spectrum[item] for spectrum in covariance.spectra)
+        if points != _points(extent.longest):
+            a, b = (torch.fft.rfft(wave[item, :, :frames], points) for wave in covariance.waves)
+        x, y = torch.view_as_real(a), torch.view_as_real(b)
+        weights = constant_like(x, _twice_filtered, points)
+        products = x.square(), y.square(), x * y
+        energies = [weights @ product.sum(-1).mT for product in products]
+        items.append((*energies, frames * weights.sum(-1, keepdim=True)))
+    return [torch.stack(energies) for energies in zip(*items, strict=True)]
 
 
 @lru_cache(maxsize=1024)

@@ -50,10 +50,6 @@ class Extent:
 
     ends: tuple[int, ...]
 
-    def __getitem__(self, items: slice) -> Extent:
-        """Return the lengths of some of the items."""
-        return Extent(self.ends[items])
-
     @property
     def longest(self) -> int:
         """Length of the longest item."""
@@ -67,18 +63,13 @@ class Extent:
         """
         return -(-self.longest // BLOCK) * BLOCK
 
-    @property
-    def is_even(self) -> bool:
-        """Whether all items are equally long."""
-        return min(self.ends) == self.longest
-
     def cut(self, signal: Tensor) -> Tensor:
         """Cut a batch to its longest item, and set the samples after the end of each item to zero.
 
         Shape: (items, ..., time) -> (items, ..., longest), where ``time`` is ``longest`` or more.
         """
         signal = signal[..., : self.longest]
-        if self.is_even:
+        if min(self.ends) == self.longest:
             return signal
         inside = self.inside(signal.device).view(-1, *[1] * (signal.ndim - 2), self.longest)
         return torch.where(inside, signal, 0.0)

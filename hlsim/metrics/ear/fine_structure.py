@@ -99,8 +99,6 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
     rising, falling = (halves @ window).unbind(-1)
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
     means = torch.cat((falling[..., :1], inner, rising[..., -1:]), -1)
-    if counts.is_even:
-        return means
     is_last = _segment_kinds(counts, levels.device)[:, None] == _LAST
     return counts.cut(torch.where(is_last, rising, means))
 

@@ -25,10 +25,9 @@ equals.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import Any
 
 import numpy as np
 import torch
@@ -42,13 +41,12 @@ from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import (
     BLOCK,
     RATE,
-    Recursion,
     adaptation,
-    cached_filter,
+    apply_filter,
     gain_lowpass,
     gammatone,
 )
-from hlsim.torchtools import constant, constant_like
+from hlsim.torchtools import compute_once, constant, constant_like
 
 CHANNELS = 32
 """Number of channels of the ear."""
@@ -174,43 +172,30 @@ def _interpolation() -> NDArray[np.float64]:
     return np.stack([np.interp(centre_frequencies(), AUDIOMETRIC_HZ, row) for row in np.eye(6)])
 
 
-@cached_filter
 def _control_bandwidth(device: torch.device) -> Tensor:
     """Return the bandwidth of the control filters, relative to normal hearing. Shape: (32,)."""
     return hair_cells(torch.full((8,), CONTROL_LOSS, device=device)).bandwidth
 
 
-def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[slice]:
+def channel_chunks(sound: Tensor) -> Iterator[slice]:
     """Split the 32 channels into groups that are computed at once, from low to high frequencies.
 
     Args:
-        items: Number of items of the batch.
-        samples: Number of samples of each item before padding.
-        device: Device that computes.
+        sound: Sound that is divided into channels. Shape: (items, time).
 
     Yields:
         Channels of each group.
 
-    >>> len(list(channel_chunks(1, 48000, torch.device("cpu"))))
+    >>> len(list(channel_chunks(torch.zeros(1, 48000))))
     4
     """
-    size = CPU_CHUNK if device.type == "cpu" else GPU_CHUNK
-    step = min(CHANNELS, max(1, size // (items * samples)))
+    size = CPU_CHUNK if sound.device.type == "cpu" else GPU_CHUNK
+    step = min(CHANNELS, max(1, size // sound.numel()))
     step = -(-CHANNELS // -(-CHANNELS // step))  # chunks of equal size
     return (slice(start, min(start + step, CHANNELS)) for start in range(0, CHANNELS, step))
 
 
 # -- filters and compression -----------------------------------------------------------------------
-
-
-@cached_filter
-def _control_filters(
-    channels: tuple[int, int], device: torch.device, dtype: torch.dtype
-) -> Recursion:
-    """Return the control filters from the first to the last of ``channels``, which is excluded."""
-    group = slice(*channels)
-    decay = _decay(_control_bandwidth(device)[group], group)
-    return gammatone(decay, _centre_angles(device)[group], _filter_memory(group), dtype)
 
 
 def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
@@ -221,21 +206,24 @@ def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
     return bandwidth * constant_like(bandwidth, _normal_decay)[channels]
 
 
-def _filter_memory(channels: slice) -> int:
-    """Return the samples after which the response of normal and wider filters has vanished."""
-    return math.ceil(50.0 / float(_normal_decay()[channels.start]))
+def _apply_gammatones(bandwidth: Tensor, channels: slice, signal: Tensor) -> tuple[Tensor, Tensor]:
+    """Filter signals by gammatones, and return the real part and the power of the envelope.
 
+    Args:
+        bandwidth: Bandwidths of the filters, relative to normal hearing, which are the same for all
+            items, or those of each item. Shape: (channels,) or (items, channels).
+        channels: The channels.
+        signal: Signals. Shape: (items, padded).
 
-def _centre_angles(device: torch.device) -> Tensor:
-    """Return the phase by which a tone at each centre frequency advances per sample: (32,)."""
-    return constant(centre_frequencies, dtype=torch.float64, device=device) * (2.0 * math.pi / RATE)
-
-
-def _apply_filters(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
-    """Filter signals, and return the real part in blocks and the power of the envelope.
-
-    Shape: (items, padded) -> (items, channels, padded / 64, 64), (items, channels, padded).
+    Returns:
+        Real part in blocks, (items, channels, padded / 64, 64), and power, (items, channels,
+        padded).
     """
+    centres = constant(centre_frequencies, dtype=torch.float64, device=signal.device)[channels]
+    # The response of normal and wider filters has vanished after this number of samples.
+    memory = math.ceil(50.0 / float(_normal_decay()[channels.start]))
+    angles = centres * (2.0 * math.pi / RATE)
+    filters = gammatone(_decay(bandwidth, channels), angles, memory, signal.dtype)
     # Torch rounds products of tensors with a dimension for items differently.
     output = filters(signal)[None] if len(signal) == 1 else filters(signal[:, None])
     real, imaginary = output.split(BLOCK, -1)
@@ -247,8 +235,8 @@ def _control_power(signal: Tensor, channels: slice) -> Tensor:
 
     Shape: (items, padded) -> (items, channels, padded).
     """
-    filters = _control_filters((channels.start, channels.stop), signal.device, signal.dtype)
-    return _apply_filters(filters, signal)[1]
+    bandwidth = compute_once(_control_bandwidth, signal.device)[channels]
+    return _apply_gammatones(bandwidth, channels, signal)[1]
 
 
 def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Extent) -> Tensor:
@@ -267,7 +255,7 @@ def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Exte
     level = 10.0 * torch.log10(mean.clamp_min(10.0 ** (WIDENING_SPL / 10.0)))
     share = ((level - WIDENING_SPL) / WIDENING_SPL).clamp_max(1.0)
     return cells.bandwidth + share * (
-        _control_bandwidth(control.device)[channels] - cells.bandwidth
+        compute_once(_control_bandwidth, control.device)[channels] - cells.bandwidth
     )
 
 
@@ -316,13 +304,7 @@ def simulate_cochlea(
     cells = ear[..., channels]
     control = _control_power(signal, channels)
     bandwidth = _bandwidths(control, cells, channels, extent)
-    filters = gammatone(
-        _decay(bandwidth, channels).squeeze(0),
-        _centre_angles(signal.device)[channels],
-        _filter_memory(channels),
-        signal.dtype,
-    )
-    real, power = _apply_filters(filters, signal)
+    real, power = _apply_gammatones(bandwidth.squeeze(0), channels, signal)
     gain = _compression_gain(control, cells)
     compressed = power * gain.square()
     if not motion:
@@ -351,7 +333,7 @@ def _compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     exponent = 0.5 * (1.0 / ratio - 1.0)
     neper = math.log(10.0) / 20.0
     gain = torch.addcmul(-neper * (loss + 2.0 * exponent * knee), level, exponent).exp_()
-    return gain_lowpass(control.device, control.dtype)(gain).flatten(-2)
+    return apply_filter(gain_lowpass, gain)
 
 
 def _long_term_level(mean_power: Tensor, mean_control: Tensor, cells: HairCells) -> Tensor:
@@ -394,8 +376,7 @@ def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
     """
     loss = inner.to(power).unsqueeze(-1)
     level = torch.maximum(power, 10.0 ** (loss / 10.0)).log().mul_(10.0 / math.log(10.0))
-    adapted = adaptation(power.device, power.dtype)(level.sub_(loss))
-    return adapted.flatten(-2).clamp_min(0.0)
+    return apply_filter(adaptation, level.sub_(loss)).clamp_min(0.0)
 
 
 # -- alignment of channels -------------------------------------------------------------------------
@@ -467,81 +448,37 @@ def align_channels(
 
 
 def shift(
-    signal: Tensor, delays: Tensor, ends: Sequence[int], stops: Sequence[int], size: int
+    signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
 ) -> Tensor:
-    """Delay each channel by a whole number of samples.
+    """Delay each item, or each channel of it, by a whole number of samples.
 
     Sample t of the output is sample ``t - delay`` of the signal. Samples from outside of an item
     are 0.
 
     Args:
-        signal: Signals. Shape: (items, channels, time).
-        delays: Delays in samples; negative ones advance the signal. Shape: (items, channels),
-            int64.
+        signal: Signals. Shape: (items, time) or (items, channels, time).
+        delays: Delays in samples; negative ones advance the signal. Shape: (items,) or (items,
+            channels), int64.
         ends: Number of samples of each item of ``signal``; later samples count as 0.
         stops: Number of samples of each item of the output; later samples are 0.
         size: Number of samples of the output.
 
     Returns:
-        Delayed signals. Shape: (items, channels, size).
+        Delayed signals. Shape: (items, size) or (items, channels, size).
 
-    >>> signal = torch.tensor([[[1.0, 2.0, 3.0]]])
-    >>> shift(signal, torch.tensor([[1]]), ends=(3,), stops=(3,), size=4)
-    tensor([[[0., 1., 2., 0.]]])
+    >>> signal = torch.tensor([[1.0, 2.0, 3.0]])
+    >>> shift(signal, torch.tensor([1]), ends=(3,), stops=(3,), size=4)
+    tensor([[0., 1., 2., 0.]])
     """
-    delayed: Tensor = _Shift.apply(signal, delays, tuple(ends), tuple(stops), size)
-    return delayed
-
-
-class _Shift(torch.autograd.Function):
-    """Shift each channel by an integer delay.
-
-    The backward pass applies the opposite shift. Slices would allocate a tensor of zeros each.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        signal: Tensor,
-        delays: Tensor,
-        ends: tuple[int, ...],
-        stops: tuple[int, ...],
-        size: int,
-    ) -> Tensor:
-        ctx.settings = (delays, ends, stops, signal.shape[-1])
-        return _shift_rows(signal, delays, ends, stops, size)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None, None]:
-        delays, ends, stops, size = ctx.settings
-        return _shift_rows(gradient, -delays, stops, ends, size), None, None, None, None
-
-
-def _shift_rows(
-    signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
-) -> Tensor:
-    if signal.device.type != "cpu":
-        return _gather_rows(signal, delays, ends, stops, size)
-    delayed = signal.new_empty((*signal.shape[:-1], size))
-    for item, (end, stop) in enumerate(zip(ends, stops, strict=True)):
-        for row, out, delay in zip(signal[item], delayed[item], delays[item].tolist(), strict=True):
-            start = min(max(delay, 0), size)
-            last = max(start, min(end + delay, stop))
-            out[:start] = 0.0
-            out[start:last] = row[start - delay : last - delay]
-            out[last:] = 0.0
-    return delayed
-
-
-def _gather_rows(
-    signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
-) -> Tensor:
-    device = signal.device
-    target = torch.arange(size, device=device)
+    target = torch.arange(size, device=signal.device)
     source = target - delays.unsqueeze(-1)
-    end, stop = (integers(limits, device)[:, None, None] for limits in (ends, stops))
-    inside = (source >= 0) & (source < end) & (target < stop)
-    return torch.where(inside, signal.gather(-1, source.clamp(0, signal.shape[-1] - 1)), 0.0)
+    end, stop = (
+        integers(limits, signal.device).view(-1, *[1] * (signal.ndim - 1))
+        for limits in (ends, stops)
+    )
+    is_inside = (source >= 0) & (source < end) & (target < stop)
+    samples = signal.gather(-1, source.clamp(0, signal.shape[-1] - 1))
+    return torch.where(is_inside, samples, 0.0)
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:

@@ -10,8 +10,7 @@ the exact output of the filter, fast on a GPU, too, and differentiable.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, wraps
-from typing import NamedTuple, ParamSpec, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.torchtools import constant, without_modes
+from hlsim.torchtools import as_tensor, compute_once, constant
 
 BLOCK = 64
 """Samples of a block. Signals are padded to a multiple of it."""
@@ -29,34 +28,25 @@ RATE = 24000
 """Sample rate in Hz at which the ear is defined."""
 
 Array = NDArray[np.float64]
-P = ParamSpec("P")
-Filter = TypeVar("Filter")
 
 
-def cached_filter(design: Callable[P, Filter]) -> Callable[P, Filter]:
-    """Decorate a function that designs a filter, so that it designs each filter once.
-
-    A filter that was first needed in inference mode can be used outside of it, too.
+def apply_filter(
+    design: Callable[[torch.device, torch.dtype], Recursion], signal: Tensor
+) -> Tensor:
+    """Filter a signal by a filter that is designed once for each device and precision.
 
     Args:
-        design: Function whose arguments are hashable.
+        design: Function that returns the filter, such as ``middle_ear``.
+        signal: Signal whose length is a multiple of 64. Shape: (..., time).
 
     Returns:
-        Function with the same arguments that returns a cached filter.
+        Output. Shape: (..., time).
 
-    >>> @cached_filter
-    ... def ones(count):
-    ...     return torch.ones(count)
-    >>> ones(2) is ones(2)
-    True
+    >>> apply_filter(gain_lowpass, torch.ones(1, 192)).shape
+    torch.Size([1, 192])
     """
-
-    @wraps(design)
-    @lru_cache(maxsize=16)
-    def call(*arguments: P.args, **settings: P.kwargs) -> Filter:
-        return without_modes(design, *arguments, **settings)
-
-    return cast(Callable[P, Filter], call)
+    filters: Recursion = compute_once(design, signal.device, signal.dtype)
+    return filters(signal).flatten(-2)
 
 
 class Recursion(NamedTuple):
@@ -100,13 +90,10 @@ class Recursion(NamedTuple):
         # These are the largest tensors of a score, therefore the addition is in place.
         return (blocks @ self.through).add_(before @ self.outward)
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> Recursion:
-        """Return the same filters with their matrices on a device, converted to ``dtype``."""
-        on_gpu = device.type != "cpu"
-        through, inward, outward, step = (
-            matrix.to(device, dtype, non_blocking=on_gpu) for matrix in self[:4]
-        )
-        return Recursion(through, inward, outward, step, self.memory)
+    @property
+    def nbytes(self) -> int:
+        """Size of the matrices in bytes."""
+        return sum(matrix.nbytes for matrix in self[:4])
 
 
 def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
@@ -133,8 +120,16 @@ def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
 # -- real filters ----------------------------------------------------------------------------------
 
 
-def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion:
-    """Return a filter in state-space form as matrices for blocks.
+def _recursion(
+    a: Array,
+    b: Array,
+    c: Array,
+    d: float,
+    memory: int,
+    device: torch.device,
+    dtype: torch.dtype,
+) -> Recursion:
+    """Return a filter in state-space form as matrices for blocks, on a device in a precision.
 
     With the input u, the output is y = c x + d u, and the next state is a x + b u. The state is
     balanced, so that single precision suffices.
@@ -152,15 +147,10 @@ def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion
     through = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
     inward = np.stack([(powers[BLOCK - 1 - i] @ b)[:, 0] for i in range(BLOCK)])
     outward = np.stack([(c @ powers[i])[0] for i in range(BLOCK)], -1)
-
-    def tensor(matrix: Array) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(matrix))
-
-    step = powers[BLOCK].T
-    return Recursion(tensor(through), tensor(inward), tensor(outward), tensor(step), memory)
+    matrices = (through, inward, outward, powers[BLOCK].T)
+    return Recursion._make([*(as_tensor(matrix, dtype, device) for matrix in matrices), memory])
 
 
-@cached_filter
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
 
@@ -175,10 +165,9 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     low = scipy.signal.butter(1, 5000 / (RATE / 2))
     high = scipy.signal.butter(2, 350 / (RATE / 2), "high")
     a, b, c, d = scipy.signal.tf2ss(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
-    return _recursion(a, b, c, float(d[0, 0]), 2048).to(device, dtype)
+    return _recursion(a, b, c, float(d[0, 0]), 2048, device, dtype)
 
 
-@cached_filter
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter that smooths the gain of the outer hair cells over 0.2 ms.
 
@@ -189,7 +178,7 @@ def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     torch.Size([1, 1])
     """
     a, b, c, d = scipy.signal.tf2ss(*scipy.signal.butter(1, 800 / (RATE / 2)))
-    return _recursion(a, b, c, float(d[0, 0]), 192).to(device, dtype)
+    return _recursion(a, b, c, float(d[0, 0]), 192, device, dtype)
 
 
 ONSET_RATIO = 2.0
@@ -199,7 +188,6 @@ RAPID_SECONDS, SHORT_TERM_SECONDS = 0.002, 0.060
 """Time constants of rapid and of short-term adaptation."""
 
 
-@cached_filter
 def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter by which inner hair cells emphasise onsets, for levels in dB at 24 kHz.
 
@@ -218,7 +206,8 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
     inverse = np.linalg.inv(np.array([[r1 + r2 + charge1, -r1], [-r3, r2 + r3 + charge2]]))
     a = inverse @ np.diag([charge1, charge2])
     b = inverse @ np.array([[r2], [0.0]])
-    return _recursion(a, b, -a[:1] / r1, (1.0 - float(b[0, 0])) / r1, 1 << 30).to(device, dtype)
+    d = (1.0 - float(b[0, 0])) / r1
+    return _recursion(a, b, -a[:1] / r1, d, 1 << 30, device, dtype)
 
 
 # -- gammatone filters -----------------------------------------------------------------------------

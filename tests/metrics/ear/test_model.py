@@ -56,8 +56,8 @@ def test_rate_and_alignment_are_those_of_pyclarity(pair: tuple[Tensor, Tensor], 
     first, last = ear_input.audible_ends(clean)
     length = int(last - first) + 1
     for signal, moved, wanted in ((clean, -first, expected[0]), (late, delay - first, expected[1])):
-        part = ear_model.shift(signal[None], moved[None], extent.ends, (length,), length)
-        np.testing.assert_allclose(part[0, 0].numpy(), wanted, rtol=0, atol=1e-12)
+        part = ear_model.shift(signal, moved, extent.ends, (length,), length)
+        np.testing.assert_allclose(part[0].numpy(), wanted, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("rate", [16000, 44100, 48000])
@@ -70,8 +70,7 @@ def test_padded_items_are_resampled_and_aligned_as_alone(rate: int) -> None:
     late = both.cut(batch.roll(40, -1))
     delays = ear_input.bulk_delays(ear_input.spectrum_for_alignment(batch, both), late, both)
     for item, end in enumerate(ends):
-        item_extent = extent[item : item + 1]
-        alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, item_extent)[0]
+        alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, Extent((end,)))[0]
         torch.testing.assert_close(batch[item, : len(alone)], alone, rtol=0, atol=1e-13)
         assert not batch[item, len(alone) :].any()
     assert (delays + 40 == ear_input.HEADROOM).all()
@@ -224,8 +223,6 @@ def test_shift_of_several_items_and_its_gradient() -> None:
             inside = 0 <= source < ends[i] and t < stops[i]
             assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
     assert torch.autograd.gradcheck(shifted, (signal,))
-    batch = ear_model._gather_rows(signal, delays, ends, stops, 45)  # as on a GPU
-    assert torch.equal(batch, output)
 
 
 def test_extent_takes_each_item_to_its_end() -> None:
@@ -238,5 +235,5 @@ def test_extent_takes_each_item_to_its_end() -> None:
 
 def test_channels_in_chunks_are_all_of_them() -> None:
     for samples in (100, 72000, 10**8):
-        chunks = list(ear_model.channel_chunks(1, samples, CPU))
+        chunks = list(ear_model.channel_chunks(torch.zeros(1).expand(1, samples)))
         assert [c for chunk in chunks for c in range(chunk.start, chunk.stop)] == list(range(32))
