@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.signal import lfilter
 from torch import Tensor
@@ -52,45 +51,16 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
         )
     if not samples.any():
         raise ValueError("expected speech, got a waveform that is silent or empty")
-    envelope = _smooth(_smooth(np.abs(samples), sample_rate), sample_rate)
-    thresholds = _THRESHOLDS * envelope.max()
-    active_samples = _count_active_samples(envelope, thresholds, round(_HANGOVER * sample_rate))
-    levels = 10.0 * np.log10(np.square(samples).sum() / np.maximum(active_samples, 1))
-    margins = levels - 20.0 * np.log10(thresholds)
-
-    # The margin falls as the threshold rises. The active speech level lies where the margin is
-    # 15.9 dB, and is interpolated between the two thresholds around this point.
-    candidates = np.flatnonzero(margins <= _MARGIN_DB)
-    if len(candidates) == 0:
-        return float(levels[-1])
-    after = int(candidates[0])
-    if after == 0:
-        return float(levels[0])
-    before = after - 1
-    fraction = (margins[before] - _MARGIN_DB) / (margins[before] - margins[after])
-    return float(levels[before] + fraction * (levels[after] - levels[before]))
-
-
-def _smooth(values: NDArray[np.float64], sample_rate: int) -> NDArray[np.float64]:
-    """Smooth values exponentially with the standard's time constant. Shape: (time,) -> (time,)."""
     pole = math.exp(-1.0 / (sample_rate * _TIME_CONSTANT))
-    smoothed: NDArray[np.float64] = lfilter([1.0 - pole], [1.0, -pole], values)
-    return smoothed
-
-
-def _count_active_samples(
-    envelope: NDArray[np.float64], thresholds: NDArray[np.float64], hangover: int
-) -> NDArray[np.int64]:
-    """Count the samples that are active at each threshold.
-
-    A sample is active if the envelope reaches the threshold there or within the hangover before it.
-
-    Shape: (time,), (thresholds,) -> (thresholds,).
-
-    Args:
-        hangover: Length of the hangover in samples.
-    """
-    width = max(1, hangover)
+    smoothed_once = lfilter([1.0 - pole], [1.0, -pole], np.abs(samples))
+    envelope = lfilter([1.0 - pole], [1.0, -pole], smoothed_once)
+    thresholds = _THRESHOLDS * envelope.max()
+    # A sample is active if the envelope reaches the threshold there or within the hangover before.
+    width = max(1, round(_HANGOVER * sample_rate))
     recent_maximum = maximum_filter1d(envelope, width, mode="constant", origin=(width - 1) // 2)
     inactive_samples = np.searchsorted(np.sort(recent_maximum), thresholds)
-    return len(envelope) - inactive_samples
+    active_samples = np.maximum(len(samples) - inactive_samples, 1)
+    levels = 10.0 * np.log10(np.square(samples).sum() / active_samples)
+    # The margin falls as the threshold rises. The active speech level lies where it is 15.9 dB.
+    margins = np.minimum.accumulate(levels - 20.0 * np.log10(thresholds))
+    return float(np.interp(_MARGIN_DB, margins[::-1], levels[::-1]))

@@ -95,19 +95,16 @@ class STFT:
         """Add frames that begin one hop apart. Shape: (items, frames, window) -> (items, time).
 
         Each frame is cut into parts of one hop. Part p of frame k belongs to hop k + p of the
-        result, so that the row of all frames' parts p is to be delayed by p hops and added. Zeros
-        behind each row, cut to rows that are one hop shorter, delay each row by one hop more than
-        the row before.
+        result.
         """
-        items, count, window = frames.shape
-        parts = -(-window // self.hop)
-        if window % self.hop:
-            frames = functional.pad(frames, (0, parts * self.hop - window))
-        rows = frames.reshape(items, count, parts, self.hop).transpose(1, 2)
-        hops = count + parts - 1
-        padded_rows = functional.pad(rows, (0, 0, 0, parts)).flatten(1, 2)
-        delayed_rows = padded_rows[:, : parts * hops].reshape(items, parts, hops, self.hop)
-        return delayed_rows.sum(1).flatten(1)
+        parts = -(-self.window // self.hop)
+        padded = functional.pad(frames, (0, parts * self.hop - self.window))
+        rows = padded.unflatten(-1, (parts, self.hop))
+        delayed = [
+            functional.pad(rows[:, :, part], (0, 0, part, parts - 1 - part))
+            for part in range(parts)
+        ]
+        return sum(delayed[1:], start=delayed[0]).flatten(1)
 
     def _hann_window(self, like: Tensor) -> Tensor:
         """Hann window in the precision and on the device of a tensor. Shape: (window,)."""

@@ -14,7 +14,6 @@ These words have one meaning in the whole package:
   filter bank and the amount of smearing.
 """
 
-from hlsim.msbg.delay import estimate_delay
-from hlsim.msbg.model import MSBG
+from hlsim.msbg.model import MSBG, estimate_delay
 
 __all__ = ["MSBG", "estimate_delay"]

@@ -4,8 +4,6 @@ The filter of the outer and middle ear turns sound in front of the listener into
 cochlea. Its inverse turns the output of the cochlea back into sound, and a low-pass follows.
 """
 
-from functools import lru_cache
-
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -40,7 +38,6 @@ _FREE_FIELD_GAIN_DB = np.array(
 )
 
 
-@lru_cache(maxsize=2)
 def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     """Design the FIR filter of the outer and middle ear, or the filter that undoes it.
 
@@ -66,7 +63,6 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     return frequency_sampling_fir(taps, hz / nyquist, gains, ("kaiser", 4.0))
 
 
-@lru_cache(maxsize=1)
 def lowpass_filter() -> NDArray[np.float64]:
     """Design the FIR low-pass that removes artefacts of the model above 18 kHz.
 

@@ -233,7 +233,6 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
     return [scipy.signal.ellip(2, 0.25, 35.0, cutoff, fs=MSBG_RATE) for cutoff in cutoffs]
 
 
-@lru_cache(maxsize=8)
 def mean_weights(samples: int = STEP) -> NDArray[np.float64]:
     """Compute the weights for ``partial_means``: how much each sample contributes to averages.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -320,6 +320,46 @@ class MSBG(nn.Module):
         return from_cochlea(
             cochlear, rate, samples, gain=gain, rate_divisor=rate_divisor, delay=delay
         )
+
+
+def estimate_delay(
+    simulator: Any, audiogram: AudiogramLike | None = None, *, level: float = 94.0
+) -> int:
+    """Measure by how many samples a simulator delays its output.
+
+    The input is an impulse: one second of zeros, except for one sample in the middle. The delay is
+    the time from the impulse to the largest magnitude of the output. The delay depends on the ear
+    and on the level, because MSBG delays low frequencies more than high ones: at 44.1 kHz it is
+    1078 samples without a hearing loss and 1237 to 1271 samples with one. To align signals, use
+    ``MSBG.delay``, which depends on the severity of the loss only.
+
+    Source: the Neuro-MSBG paper, Section III-A.
+
+    Args:
+        simulator: Simulator on the CPU with the attributes ``sample_rate`` and ``full_scale_spl``.
+            Build MSBG with ``aligned=False``, because aligned simulators have no delay.
+        audiogram: Hearing loss of one ear, by default the simulator's stored one.
+        level: Pressure of the impulse, as the level in dB SPL of a sound with this RMS pressure:
+            94 is 1 Pa.
+
+    Returns:
+        The delay in samples at the simulator's sample rate.
+
+    Raises:
+        ValueError: There is no audiogram, or it has more than one ear.
+
+    >>> estimate_delay(MSBG("NH", sample_rate=44100, aligned=False))
+    1078
+    """
+    position = simulator.sample_rate // 2
+    impulse = torch.zeros(simulator.sample_rate)
+    impulse[position] = 10.0 ** ((level - simulator.full_scale_spl) / 20.0)
+    with torch.no_grad():
+        output = simulator(impulse, audiogram)
+    ears = output.shape[:-1].numel()
+    if ears != 1:
+        raise ValueError(f"expected the audiogram of one ear, got audiograms of {ears} ears")
+    return int(output.abs().argmax()) - position
 
 
 def active_rescaling(signals: Tensor, rate: int) -> Tensor:

@@ -26,9 +26,6 @@ _LEAD_SECONDS = 0.75
 _LAG_SECONDS = 0.55
 """Duration after a block on which its output depends."""
 
-_FADE_SECONDS = 0.2
-"""Duration of the fades at the ends of a block's input."""
-
 
 def in_blocks(
     process: Callable[[Tensor, Tensor, bool], Tensor],
@@ -68,9 +65,7 @@ def in_blocks(
     outputs = []
     for block in blocks:
         is_last = block.input_stop == samples
-        cut = block.cut_input(signals)
-        cut = _fade(cut, rate, fade_in=block.input_start > 0, fade_out=not is_last)
-        outputs.append(block.cut_output(process(cut, ears, is_last)))
+        outputs.append(block.cut_output(process(block.cut_input(signals), ears, is_last)))
     return torch.cat(outputs, -1)
 
 
@@ -112,19 +107,3 @@ def _hooks_are_allowed() -> bool:
 
 def _identity(tensor: Tensor) -> Tensor:
     return tensor
-
-
-def _fade(block: Tensor, rate: int, *, fade_in: bool, fade_out: bool) -> Tensor:
-    """Fade the ends of a block over 0.2 s, because filters would ring at a sudden cut.
-
-    Shape: (items, time) -> (items, time).
-    """
-    time = round(_FADE_SECONDS * rate)
-    positions = torch.arange(1, time + 1, dtype=torch.float64, device=block.device)
-    phase = positions * (math.pi / (time + 1))
-    ramp = (0.5 - 0.5 * phase.cos()).to(block.dtype)
-    middle = block.new_ones(block.shape[-1] - 2 * time)
-    flat = ramp.new_ones(time)
-    start = ramp if fade_in else flat
-    end = ramp.flip(-1) if fade_out else flat
-    return block * torch.cat((start, middle, end))

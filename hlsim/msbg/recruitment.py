@@ -11,8 +11,6 @@ the envelope is interpolated instead.
 Source: Moore and Glasberg (1993), Journal of the Acoustical Society of America 94, 2050-2062.
 """
 
-from functools import lru_cache
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -232,7 +230,6 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     return apply_gains(channels, gains, kernel, (envelopes, ratios))
 
 
-@lru_cache(maxsize=16)
 def interpolation_kernel(
     samples: int = STEP, repeats: int = 1, steps_per_window: int = 8
 ) -> NDArray[np.float64]:

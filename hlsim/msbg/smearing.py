@@ -8,7 +8,6 @@ Source: Baer and Moore (1993), Journal of the Acoustical Society of America 94, 
 """
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -144,17 +143,11 @@ def smearing_matrix(
     (103, 103)
     """
     bins = min(FFT // 2 // rate_divisor, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
-    return _whole_matrix(severity)[:bins, :bins]
-
-
-@lru_cache(maxsize=4)
-def _whole_matrix(severity: str) -> NDArray[np.float64]:
-    """Compute the smearing matrix for all frequencies of a frame at 44.1 kHz, (256, 256)."""
     count = FFT // 2
     spacing = MSBG_RATE / FFT
     normal = roex_filters(1.0, 1.0, count, spacing)
     wide = roex_filters(*BROADENING[severity], count, spacing)
-    return smearing_from_filters(normal, wide)
+    return smearing_from_filters(normal, wide)[:bins, :bins]
 
 
 def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
@@ -231,11 +224,7 @@ def _smear_spectrum(
     """
     spectrum_power = power(spectrum)
     smeared_power = (spectrum_power @ matrix.mT).add_(_POWER_FLOOR)
-    if matrix.requires_grad:
-        # The gradient of the matrix product needs the power unchanged.
-        spectrum_power = spectrum_power + _POWER_FLOOR
-    else:
-        spectrum_power = spectrum_power.add_(_POWER_FLOOR)
+    spectrum_power = spectrum_power + _POWER_FLOOR
     ratio = smeared_power / spectrum_power
     # The square root of a negative ratio is imaginary.
     real = ratio.clamp(_MIN_POWER_RATIO, _MAX_POWER_RATIO).sqrt_()
@@ -267,13 +256,11 @@ class _SmearSpectrum(torch.autograd.Function):
     ) -> None:
         spectrum, matrix, ctx.gradient_floor = inputs
         ctx.mark_non_differentiable(*output[2:])
-        # Where only signals are smeared, the power has no gradient, which is then None.
-        ctx.set_materialize_grads(False)
         ctx.save_for_backward(spectrum, matrix, *output[1:])
 
     @staticmethod
     def backward(
-        ctx: Any, gradient: Tensor | None, power_gradient: Tensor | None, *_: None
+        ctx: Any, gradient: Tensor, power_gradient: Tensor, *_: Tensor
     ) -> tuple[Tensor | None, Tensor | None, None]:
         spectrum, matrix, *outputs = ctx.saved_tensors
         if torch.is_grad_enabled():
@@ -297,15 +284,10 @@ class _SmearSpectrum(torch.autograd.Function):
 
         # Real and imaginary parts are computed separately, because torch would first convert the
         # real factors of a complex product to complex numbers.
-        if gradient is None:
-            g_real = g_imag = torch.zeros_like(spectrum_power)
-        else:
-            g_real = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
-            g_imag = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
+        g_real = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
+        g_imag = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
         e = torch.addcmul(spectrum.real * g_real, spectrum.imag, g_imag)
-        t = e / divisor
-        if power_gradient is not None:
-            t = t + 2.0 * power_gradient
+        t = e / divisor + 2.0 * power_gradient
         weight = t @ matrix - e / spectrum_power
         matrix_gradient = None
         if ctx.needs_input_grad[1]:
@@ -353,15 +335,11 @@ def _overlap_add(frames: Tensor, hop: int) -> Tensor:
     """
     count = frames.shape[-2]
     parts = frames.unflatten(-1, (4, hop))
-    first_parts, second_parts, third_parts, fourth_parts = parts.unbind(-2)
     total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
-    total[..., :count, :].add_(first_parts)
-    total[..., 1 : count + 1, :].add_(second_parts)
-    total[..., 2 : count + 2, :].add_(third_parts)
-    if count == 1:
-        total[..., 1, :].add_(third_parts[..., 0, :])
+    for part in range(3):
+        total[..., part : part + count, :].add_(parts[..., part, :])
     if count >= 4:
-        total[..., 3:count, :].add_(fourth_parts[..., : count - 3, :])
+        total[..., 3:count, :].add_(parts[..., : count - 3, 3, :])
         # In the last three hops, smear3 adds the first three parts of the fourth last frame instead
         # of the fourth parts of the last three frames.
         total[..., count:, :].add_(parts[..., count - 4, :3, :])

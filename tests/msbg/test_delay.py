@@ -9,15 +9,6 @@ from hlsim.msbg import estimate_delay
 from tests.pyclarity import PyclarityOutputs, msbg
 
 
-@pytest.mark.parametrize("name", ["N1", "N2", "N3", "S1", "S2"])
-def test_impulse_method_depends_on_the_ear_and_the_structural_delay_does_not(name: str) -> None:
-    ear = Audiogram.standard(name)
-    simulator = MSBG(ear, aligned=False, sample_rate=44100)
-    # The range is that of pyclarity's delays. The structural delay is 1239 with any smearing.
-    assert 1170 <= estimate_delay(simulator, level=120.0) <= 1280
-    assert simulator.delay(ear.severity) == 1239
-
-
 def impulse_delay_of_reference(ear: Audiogram) -> int:
     impulse = np.zeros(44100)
     impulse[22050] = 1.0
@@ -31,20 +22,14 @@ def test_impulse_method_gives_pyclaritys_delay(pyclarity: PyclarityOutputs) -> N
         options = {"sample_rate": 44100, "aligned": False, "rescale_active": True}
         simulator = MSBG(ear, full_scale_spl=120.0, **options)
         assert estimate_delay(simulator, level=120.0) == expected
+        # The range is that of pyclarity's delays with any smearing.
+        assert name == "NH" or 1170 <= expected <= 1280
 
 
-@pytest.mark.parametrize(
-    ("simulator", "ears"),
-    [(torch.nn.Identity(), None), (MSBG(aligned=False, sample_rate=44100), torch.zeros(2, 8))],
-)
-def test_bad_input_raises_value_error(simulator: torch.nn.Module, ears: torch.Tensor) -> None:
-    with pytest.raises(ValueError):
-        estimate_delay(simulator, ears)
-
-
-def test_one_ear_may_have_any_shape() -> None:
+def test_one_ear_may_have_any_shape_and_several_are_rejected() -> None:
     ear = Audiogram.standard("N2")
-    simulator = MSBG(aligned=False, sample_rate=16000)
+    simulator = MSBG(aligned=False)
     delay = estimate_delay(simulator, ear)
-    assert estimate_delay(simulator, [ear]) == delay
     assert estimate_delay(simulator, torch.tensor([[ear.thresholds]])) == delay
+    with pytest.raises(ValueError, match="one ear"):
+        estimate_delay(simulator, [ear, ear])
