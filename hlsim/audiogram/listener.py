@@ -31,9 +31,8 @@ class Listener:
 
     Args:
         left: Audiogram of the left ear, in any form in which an ear is accepted (a name such as
-            ``"N3"``, thresholds, a dictionary), or ``None`` if it is unknown. Losses and the
-            metrics ``HASPI`` and ``HASQI`` leave an unknown ear out; everything else needs both
-            ears.
+            ``"N3"``, thresholds, a dictionary), or ``None`` if it is unknown, as in some files.
+            Models, losses and metrics need both ears.
         right: Audiogram of the right ear, likewise.
 
     Raises:

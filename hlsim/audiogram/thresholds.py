@@ -27,7 +27,6 @@ def as_thresholds(
     audiogram: AudiogramLike,
     *,
     highest: float = HIGHEST_SIMULATED,
-    allow_missing: bool = False,
 ) -> Tensor:
     """Convert any description of one or more ears into a tensor of thresholds in dB HL.
 
@@ -42,8 +41,6 @@ def as_thresholds(
         audiogram: One or more ears: an ``Audiogram``, a name such as ``"N3"``, a ``Listener``, a
             sequence of these, a tensor or an array.
         highest: Highest level allowed, in dB HL.
-        allow_missing: Whether listeners with one ear are accepted. The thresholds of the other ear
-            are NaN.
 
     Returns:
         Thresholds in dB HL: (8,) for one ear, (2, 8) for a ``Listener``, (batch, 8) and
@@ -62,25 +59,16 @@ def as_thresholds(
     if listed is None:
         return _check_tensor(audiogram, highest)
     ears, shape = listed
-    rows = []
-    for index, ear in enumerate(ears):
-        if ear is not None:
-            check_range(ear.thresholds, highest)
-        elif not allow_missing:
-            channel = 1 - index % 2
-            raise ValueError(
-                f"the listener has no {EARS[index % 2]} ear; pass listener.{EARS[channel]} with "
-                f"waveform[..., {channel}, :]"
-            )
-        rows.append((math.nan,) * len(FREQUENCIES) if ear is None else ear.thresholds)
-    return torch.tensor(rows).reshape(*shape, len(FREQUENCIES))
+    for ear in ears:
+        check_range(ear.thresholds, highest)
+    return torch.tensor([ear.thresholds for ear in ears]).reshape(*shape, len(FREQUENCIES))
 
 
-def _list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] | None:
+def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None:
     """Return the audiograms of a value, and the leading shape of their thresholds.
 
-    The missing ear of a listener is ``None``. The result is ``None`` for a tensor, a sequence of
-    tensors, and a value that does not describe ears.
+    The result is ``None`` for a tensor, a sequence of tensors, and a value that does not describe
+    ears.
     """
     if isinstance(audiogram, Tensor):
         return None
@@ -88,10 +76,17 @@ def _list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]]
     if ear is not None:
         return [ear], ()
     if isinstance(audiogram, Listener):
-        return [audiogram.left, audiogram.right], (len(EARS),)
+        known = audiogram.ears()
+        if len(known) < len(EARS):
+            (name,) = known
+            raise ValueError(
+                f"expected a listener with two ears, got the {name} ear only; pass listener.{name} "
+                f"with the {name} channel of the waveform"
+            )
+        return [*known.values()], (len(EARS),)
     if not isinstance(audiogram, Sequence):
         return None
-    ears: list[Audiogram | None] = []
+    ears: list[Audiogram] = []
     shapes = set()
     for part in audiogram:
         listed = _list_ears(part)
@@ -121,22 +116,23 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
     [None, Audiogram({500: 20})]
     """
     ears, _ = _list_ears(audiogram) or ([], ())
-    grids = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
+    grids = [None if ear.frequencies == FREQUENCIES else ear for ear in ears]
     for ear in grids:
         if ear is not None:
             check_range(ear.levels, HIGHEST_SIMULATED, ear.frequencies)
     return grids if any(grids) else []
 
 
-def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor | None:
+def store_thresholds(
+    audiogram: AudiogramLike | None, highest: float = HIGHEST_SIMULATED
+) -> Tensor | None:
     """Convert ears into thresholds, (..., 8) in dB HL, for a module to store.
 
-    The result is a copy, because the caller may write into a tensor later. A tensor that requires a
-    gradient is returned as it is, so that it can be trained.
+    The result is a copy without a gradient, because the caller may write into a tensor later.
 
     Args:
         audiogram: One or more ears; None gives None.
-        options: ``highest`` and ``allow_missing`` of ``as_thresholds``.
+        highest: Highest level allowed, in dB HL.
 
     >>> store_thresholds("N3").shape
     torch.Size([8])
@@ -146,8 +142,7 @@ def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor 
     with torch.inference_mode(False):  # the module may be trained later
         if isinstance(audiogram, Tensor):
             on_host(audiogram)  # so that its values are validated
-        levels = as_thresholds(audiogram, **options)
-        return levels if levels.requires_grad else levels.clone()
+        return as_thresholds(audiogram, highest=highest).detach().clone()
 
 
 def resolve_thresholds(
@@ -156,7 +151,7 @@ def resolve_thresholds(
     waveform: Tensor,
     *,
     two_ears: bool = False,
-    **options: Any,
+    highest: float = HIGHEST_SIMULATED,
 ) -> Tensor:
     """Return the thresholds with which a module processes a waveform, on its device.
 
@@ -168,7 +163,7 @@ def resolve_thresholds(
         audiogram: Ears that were passed with the call, or None.
         waveform: Signals, (..., time).
         two_ears: Whether the stored thresholds are those of listeners.
-        options: ``highest`` and ``allow_missing`` of ``as_thresholds``.
+        highest: Highest level allowed, in dB HL.
 
     Returns:
         Thresholds in dB HL that broadcast with the leading dimensions of the waveform, (..., 8).
@@ -186,7 +181,7 @@ def resolve_thresholds(
             "expected an audiogram, got None; pass one, such as 'N3', after the signal or to the "
             "module's constructor"
         )
-    thresholds = stored if audiogram is None else as_thresholds(audiogram, **options)
+    thresholds = stored if audiogram is None else as_thresholds(audiogram, highest=highest)
     assert thresholds is not None
     if two_ears if audiogram is None else has_listeners(audiogram):
         check_two_channels(waveform)

@@ -101,8 +101,8 @@ class _MeanScore(_Metric):
             processed: Outputs of the compensator. Shape: (time,), (batch, time) or, for two ears,
                 (batch, 2, time).
             clean: Clean speech of the same shape.
-            audiogram: One ear, or one per item. For two channels a ``Listener``, whose missing ear
-                is left out, a pair of left and right ear, or one of these per item.
+            audiogram: One ear, or one per item. For two channels a ``Listener``, a pair of left
+                and right ear, or one of these per item.
             lengths: Number of samples of each item, or its share of the time, for a padded batch.
                 Shape: (batch,).
 
@@ -247,11 +247,11 @@ class HAAQI(_MeanScore):
 
 
 def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
-    """Return the thresholds of each item's ears on the CPU, NaN for missing ears.
+    """Return the thresholds of each item's ears on the CPU.
 
     Shape: (items, sides, 8) dB HL.
     """
-    levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL, allow_missing=sides == 2)
+    levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL)
     one_for_all = (2, len(FREQUENCIES)) if sides == 2 else (len(FREQUENCIES),)
     fits = levels.shape in (one_for_all, (items, *one_for_all))
     if not fits or (sides == 1 and has_listeners(audiogram)):

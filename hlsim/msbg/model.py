@@ -146,9 +146,7 @@ class MSBG(nn.Module):
         self.aligned = aligned
         self.rescale_active = rescale_active
         self.checkpoint = False
-        levels = store_thresholds(audiogram)
-        stored = None if levels is None else levels.detach()
-        self.register_buffer("thresholds", stored, persistent=False)
+        self.register_buffer("thresholds", store_thresholds(audiogram), persistent=False)
         self._two_ears = has_listeners(audiogram)
         self._other_grids = ears_on_other_grids(audiogram)
 

@@ -232,14 +232,11 @@ def test_batch_is_the_mean_of_its_items(options: Options, clean: Tensor) -> None
 
 
 @each_simulator
-def test_ear_can_be_trained(simulator: str, clean: Tensor) -> None:
+def test_ear_of_a_call_can_be_trained(simulator: str, clean: Tensor) -> None:
     ear = nn.Parameter(torch.tensor(N3.thresholds))
     loss = HearingLossLoss(ear, simulator=simulator)
-    loss(3.0 * clean, clean).backward()
-    leaf = torch.tensor(N3.thresholds, requires_grad=True)
-    HearingLossLoss(simulator=simulator)(3.0 * clean, clean, leaf).backward()
-    assert ear.grad is not None and leaf.grad is not None and bool(ear.grad.any())
-    close(ear.grad, leaf.grad)
+    loss(3.0 * clean, clean, ear).backward()
+    assert ear.grad is not None and bool(ear.grad.any())
     assert list(loss.parameters()) == [] and loss.state_dict() == {}
     assert torch.equal(copy.deepcopy(loss)(3.0 * clean, clean), loss(3.0 * clean, clean))
 
