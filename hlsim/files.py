@@ -66,6 +66,29 @@ def write_atomically(path: str | Path, data: str | bytes) -> None:
         temporary.write_bytes(contents)
 
 
+def path_below(root: str | Path, name: str) -> Path:
+    """Return the path of a file that a manifest names, with links resolved.
+
+    Args:
+        root: Folder that contains all files of the manifest.
+        name: Path of the file relative to the folder.
+
+    Raises:
+        ValueError: The name is empty, or the path leads out of the folder.
+
+    >>> path_below("/corpus", "clean/../1.wav").as_posix()
+    '/corpus/1.wav'
+    """
+    folder = os.path.realpath(root)
+    path = Path(os.path.realpath(os.path.join(folder, name)))
+    if not name or not path.is_relative_to(folder):
+        raise ValueError(
+            f"expected the path of a file below {root}, got {name!r}; move the file there, or pass "
+            "the folder that contains all files as root"
+        )
+    return path
+
+
 def sha256(path: Path) -> str:
     """Compute the SHA-256 hash of the contents of a file, in hexadecimal.
 

@@ -35,7 +35,7 @@ from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
-from hlsim.files import read_table, sha256
+from hlsim.files import path_below, read_table, sha256
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -480,8 +480,8 @@ def _read_row(
         ) from None
     return Recording(
         utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
-        clean=root / row["clean"],
-        outputs={row["condition"]: root / row["processed"]},
+        clean=path_below(root, row["clean"]),
+        outputs={row["condition"]: path_below(root, row["processed"])},
         audiogram=audiogram,
         listener=listener,
         ear=ear,

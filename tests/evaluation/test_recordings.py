@@ -165,6 +165,7 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         ("N3\nL2", "N4\nL2", r"line 3: expected the audiogram .* got Audiogram\('N4'\)"),
         (",5,N3", ",x,N3", "line 2: expected a number of dB in the column snr, got 'x'"),
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
+        ("before/a", "../a", "line 2: expected the path of a file below"),
         ("condition,", "treatment,", "line 2: expected a value in the column condition"),
         (",snr,", ",spl,", "expected no column spl, .* pass the option --spl"),
         (",audiogram\n", ",ear_of\n", "line 2: there is no audiogram of listener 'L1'"),

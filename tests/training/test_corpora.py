@@ -169,6 +169,8 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         "path,split\n",
         "file\n1.wav\n",
         "path,split\n1.wav,dev\n",
+        "path\n1.wav\n../2.wav\n",
+        "path,noisy\n1.wav,/2.wav\n",
         "path,noisy\n1.wav,1.wav\n",
         "path,noisy,split\n1.wav,2.wav,train\n1.wav,3.wav,test\n",
         "path,speaker,split\n1.wav,ann,train\n2.wav,ann,test\n",

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from hlsim.files import read_table, write_atomically
+from hlsim.files import path_below, read_table, write_atomically
 
 SPLITS = ("train", "valid", "test")
 """Names of the splits."""
@@ -51,8 +51,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
-        ValueError: The file is not such a table, its rows contradict each other, see
-            ``check_utterances``, or its first file is not in the root.
+        ValueError: The file is not such a table, a path leads out of the root, the rows contradict
+            each other, see ``check_utterances``, or the first file is not in the root.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -61,6 +61,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     ...     read_manifest(f"{folder}/manifest.csv")
     [Utterance(path='1.wav', noisy='', speaker='ann', split='train')]
     """
+    folder = Path(path).parent if root is None else Path(root)
     utterances = []
     for line, row in read_table(path, "the manifest"):
         values = {name: row[name] for name in COLUMNS if name in row}
@@ -70,8 +71,12 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
                 f"{path}, line {line}: expected a file in the column 'path', and train, valid or "
                 f"test in the column 'split', got {values}; correct the row"
             )
+        for name in filter(None, (utterance.path, utterance.noisy)):
+            try:
+                path_below(folder, name)
+            except ValueError as error:
+                raise ValueError(f"{path}, line {line}: {error}") from error
         utterances.append(utterance)
-    folder = Path(path).parent if root is None else Path(root)
     try:
         check_utterances(utterances)
     except ValueError as error:
