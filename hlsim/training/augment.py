@@ -4,6 +4,9 @@ A Neuro-MSBG later guides the training of hearing aids, which amplify and compre
 therefore be accurate on amplified and compressed speech, not only on recordings as they are.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -16,7 +19,7 @@ from hlsim.neuro.config import NEURO_RATE
 HIGHEST_LEVEL = 115.0
 """Highest RMS level of a training signal in dB SPL."""
 
-_EQUALISER_FREQUENCIES = torch.tensor([100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0])
+_EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
 """Frequencies in Hz for which the random equaliser has gains."""
 
 _POWER_FLOOR = 1e-20
@@ -85,7 +88,9 @@ def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None =
     return speech + set_level(noise, level - snr_db, full_scale_spl=0.0)
 
 
-def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rate: int) -> Tensor:
+def equalise(
+    waveform: Tensor, gains_db: Tensor, frequencies: Sequence[float], sample_rate: int
+) -> Tensor:
     """Filter signals without a delay, with gains that are stated at a few frequencies.
 
     The gains in dB are interpolated over log frequency. Below the lowest and above the highest
@@ -94,26 +99,21 @@ def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rat
     Args:
         waveform: Signals with shape (items, time).
         gains_db: Gains in dB with shape (items, frequencies).
-        frequencies: Frequencies in Hz with shape (frequencies,).
+        frequencies: Frequencies in Hz, in ascending order.
         sample_rate: Sample rate in Hz.
 
     Returns:
         Filtered signals with shape (items, time).
 
-    >>> gains_db, frequencies = torch.tensor([[20.0, 20.0]]), torch.tensor([250.0, 4000.0])
-    >>> equalise(torch.ones(1, 3), gains_db, frequencies, 16000)
+    >>> equalise(torch.ones(1, 3), torch.tensor([[20.0, 20.0]]), (250.0, 4000.0), 16000)
     tensor([[10., 10., 10.]])
     """
     time = waveform.shape[-1]
     points = 2 * time
-    log_hz = torch.fft.rfftfreq(points, 1.0 / sample_rate).clamp_min(1.0).log()
-    knots = frequencies.log()
-    right = torch.bucketize(log_hz, knots).clamp(1, len(knots) - 1)
-    left = right - 1
-    weight = ((log_hz - knots[left]) / (knots[right] - knots[left])).clamp(0.0, 1.0)
-    gain_db = gains_db[:, left] * (1.0 - weight) + gains_db[:, right] * weight
-    spectrum = torch.fft.rfft(waveform, points) * 10.0 ** (gain_db / 20.0)
-    return torch.fft.irfft(spectrum, points)[..., :time]
+    log_hz = np.log(np.fft.rfftfreq(points, 1.0 / sample_rate).clip(1.0))
+    gain_db = np.stack([np.interp(log_hz, np.log(frequencies), gains) for gains in gains_db])
+    gain = torch.from_numpy(10.0 ** (gain_db / 20.0)).to(waveform.dtype)
+    return torch.fft.irfft(torch.fft.rfft(waveform, points) * gain, points)[..., :time]
 
 
 def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
@@ -204,7 +204,7 @@ def augment_speech(
     if treated:
         signal = equalise_share(signal, 0.4, generator)
         gains_db = ears * uniform(0.2, 0.8, 1)
-        amplified = equalise(signal, gains_db, torch.tensor(FREQUENCIES), NEURO_RATE)
+        amplified = equalise(signal, gains_db, FREQUENCIES, NEURO_RATE)
         signal = replace_share(signal, amplified, 0.4, generator)
         signal = set_level(signal, level_spl(signal).clamp_max(HIGHEST_LEVEL))
     return signal

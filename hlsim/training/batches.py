@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import set_level
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import (
     augment_speech,
@@ -35,11 +35,11 @@ from hlsim.training.tones_and_clicks import draw_sounds
 Batch = dict[str, Tensor]
 """Tensors by name.
 
-- ``clean``: clean speech in pascals with shape (items, time)
 - ``signal``: input of the network in pascals with shape (items, time)
 - ``thresholds``: ears in dB HL with shape (items, 8)
-- ``impaired``: output of the teacher in pascals with shape (items, time), computed on the device
-- ``noise_reduction``: strength of an aid's noise reduction, 0 or 1, with shape (items,)
+- ``impaired`` (simulators): output of the teacher in pascals with shape (items, time)
+- ``clean`` (compensators): clean speech in pascals with shape (items, time)
+- ``noise_reduction`` (compensators): strength of noise reduction, 0 or 1, with shape (items,)
 """
 
 MAX_DEVICES = 64
@@ -167,8 +167,8 @@ class _RandomBatches(Dataset[Batch]):
             generator: Source of the random numbers.
 
         Returns:
-            ``clean`` and ``signal`` in pascals with shape (count, time), and ``thresholds`` in dB
-            HL with shape (count, 8); see ``Batch``.
+            ``signal`` in pascals with shape (count, time), ``thresholds`` in dB HL with shape
+            (count, 8), and others of ``Batch``.
         """
         raise NotImplementedError
 
@@ -195,9 +195,9 @@ class _SimulatorBatches(_RandomBatches):
         ears = self.draw_ears(count, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
         clips = self.replace_by_sounds(self.speech.draw(count, generator), generator)
-        treatment: dict[str, Any] = {"levels": self.recipe.levels, "treated": self.recipe.treated}
-        signal = augment_speech(clips, noise, ears, generator, **treatment)
-        return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
+        levels, treated = self.recipe.levels, self.recipe.treated
+        signal = augment_speech(clips, noise, ears, generator, levels=levels, treated=treated)
+        return {"signal": signal, "thresholds": ears}
 
 
 class _CompensatorBatches(_RandomBatches):
@@ -320,7 +320,7 @@ def simulator_data(data: TrainingData, recipe: SimulatorRecipe, teacher: Teacher
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe(), MSBG())
     >>> list(batches.training[0])
-    ['clean', 'signal', 'thresholds']
+    ['signal', 'thresholds']
     """
     levels = (50.0, 80.0) if recipe.treated else recipe.levels
     plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False)

@@ -33,7 +33,7 @@ def test_mix_has_the_ratio_asked_for_without_pauses_if_a_rate_is_stated() -> Non
 
 @pytest.mark.parametrize("rate", [16000, 44100])
 def test_equalise_has_the_gains_at_and_between_the_frequencies(rate: int) -> None:
-    knots, gains = torch.tensor([200.0, 800.0, 3200.0]), torch.tensor([[-12.0, 6.0, 0.0]])
+    knots, gains = (200.0, 800.0, 3200.0), torch.tensor([[-12.0, 6.0, 0.0]])
     expected = {100: -12.0, 200: -12.0, 400: -3.0, 800: 6.0, 1600: 3.0, 3200: 0.0, 6000: 0.0}
     tone = tones(*expected, rate=rate)
     out = equalise(tone, gains.expand(len(tone), -1), knots, rate)

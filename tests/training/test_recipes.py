@@ -70,8 +70,6 @@ def test_the_help_describes_every_setting(recipe: Any) -> None:
         (SimulatorRecipe, {"weights": {}}),
         (SimulatorRecipe, {"weights": {"snr": -1.0}}),
         (SimulatorRecipe, {"average": 1.0}),
-        (SimulatorRecipe, {"levels": [80, 60]}),
-        (SimulatorRecipe, {"levels": [80]}),
         (SimulatorRecipe, {"sounds": 1.1}),
         (CompensatorRecipe, {"noisy": 1.5}),
         (CompensatorRecipe, {"weights": {"bands": 0.0}}),

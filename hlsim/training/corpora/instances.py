@@ -34,6 +34,9 @@ _SEVERITIES = ("mild", "moderate", "severe")
 _EARS_PER_UTTERANCE = 2
 """Number of ears per utterance."""
 
+_LEVEL = 65.0
+"""Active level of the clean speech in dB SPL (ITU-T P.56)."""
+
 
 class Instances(Dataset[dict[str, Tensor]]):
     """Data set of the paper's training instances at 16 kHz, computed on access.
@@ -50,7 +53,6 @@ class Instances(Dataset[dict[str, Tensor]]):
         utterances: Rows of a manifest, usually those of one split.
         root: Folder to which their paths are relative.
         ears: Ears, which are assigned to the utterances in turn, such as those of ``draw_ears``.
-        level: Active level of the clean speech in dB SPL (ITU-T P.56).
 
     >>> speech = Path(__file__).parents[2] / "data" / "speech"
     >>> rows = [Utterance("train/flite-slt-01.flac")]
@@ -64,11 +66,8 @@ class Instances(Dataset[dict[str, Tensor]]):
         utterances: Sequence[Utterance],
         root: str | Path,
         ears: Sequence[Audiogram],
-        *,
-        level: float = 65.0,
     ) -> None:
         self.root = Path(root)
-        self.level = level
         self.msbg = MSBG(sample_rate=NEURO_RATE)
         self.items: list[tuple[Utterance, Audiogram, _Input]] = []
         turns = cycle(ears)
@@ -103,7 +102,7 @@ class Instances(Dataset[dict[str, Tensor]]):
         noisy = clean
         if utterance.noisy:
             noisy = read_noisy(self.root / utterance.noisy, clean, rate)
-        gain_db = self.level - PASCAL_SPL - active_level_db(clean[0], rate)
+        gain_db = _LEVEL - PASCAL_SPL - active_level_db(clean[0], rate)
         pair = torch.stack((clean[0], noisy[0])) * 10.0 ** (gain_db / 20.0)
         clean, noisy = resample(pair, rate, NEURO_RATE)
         return clean, noisy
