@@ -133,7 +133,7 @@ def _find_folder(name: str | Path) -> Path:
             return folder
     raise ValueError(
         f"no checkpoint {str(name)!r}; expected {', '.join(list_pretrained())}, or a folder with "
-        f"{CONFIG}"
+        f"{CONFIG}; models without a checkpoint are msbg, nalr and wdrc"
     )
 
 

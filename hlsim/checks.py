@@ -144,12 +144,7 @@ def is_finite(value: Any) -> bool:
     >>> is_finite(1.5), is_finite(True), is_finite(math.nan)
     (True, False, False)
     """
-    if not isinstance(value, Real) or isinstance(value, bool):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond the range of floats
-        return False
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def describe(value: Any) -> str:
@@ -297,9 +292,8 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
     """Validate the lengths of the items of a padded batch, and return them in samples on the CPU.
 
     Args:
-        lengths: Whole numbers of samples from 1 to ``time``, or shares of ``time`` above 0 and up
-            to 1, as SpeechBrain defines them. The shape is that of the batch without time;
-            (batch,) also serves a batch of shape (batch, 1, time).
+        lengths: Whole numbers of samples from 1 to ``time``. The shape is that of the batch without
+            time; (batch,) also serves a batch of shape (batch, 1, time).
         shape: Shape of the batch, (..., time).
 
     Returns:
@@ -308,24 +302,18 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
     Raises:
         ValueError: The numbers, their type or their shape are not as described.
 
-    >>> check_lengths([0.5, 1.0], torch.Size([2, 100]))
+    >>> check_lengths([50, 100], torch.Size([2, 100]))
     tensor([ 50, 100])
     """
     *items, time = shape
-    try:
-        ends = torch.as_tensor(lengths, device="cpu")
-    except (TypeError, ValueError, RuntimeError):
-        ends = torch.empty(0)
-    if ends.is_floating_point() and bool(((ends > 0.0) & (ends <= 1.0)).all()):
-        ends = (ends.double() * time).round().long().clamp_min(1)
+    ends = torch.as_tensor(lengths, device="cpu")
     if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
         ends = ends.unsqueeze(-1)
-    is_whole = not (ends.is_floating_point() or ends.is_complex() or ends.dtype == torch.bool)
-    has_shape = ends.shape == shape[:-1]
-    if not is_whole or not has_shape or not bool(((ends >= 1) & (ends <= time)).all()):
+    is_whole = ends.dtype in (torch.int32, torch.int64)
+    if not is_whole or ends.shape != shape[:-1] or not bool(((ends >= 1) & (ends <= time)).all()):
         raise ValueError(
-            f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}, or "
-            f"shares from 0 to 1, got {describe(lengths)}"
+            f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}, got "
+            f"{describe(lengths)}"
         )
     return ends.long()
 

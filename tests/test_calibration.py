@@ -79,7 +79,7 @@ NO_NUMBERS = [math.nan, math.inf, -math.inf, None, "a", "65", True, [65.0, 70.0]
 BAD_SHAPES = [torch.zeros(3, 1), torch.zeros(3), torch.zeros(2, 100)]
 NO_WAVEFORMS: list[Any] = [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]]
 BAD_CALLS: list[tuple[Callable[..., Any], Any]] = [
-    *((check_full_scale, (value,)) for value in [*NO_NUMBERS, -0.1, 200.1, 10**400]),
+    *((check_full_scale, (value,)) for value in [*NO_NUMBERS, -0.1, 200.1]),
     *((set_level, (torch.randn(2, 100), spl)) for spl in [*NO_NUMBERS, *BAD_SHAPES]),
     *((level_spl, (waveform,)) for waveform in NO_WAVEFORMS),
     *((set_level, (waveform, 65.0)) for waveform in NO_WAVEFORMS),

@@ -13,60 +13,15 @@ import numpy as np
 import pytest
 import soundfile
 import torch
-from torch import Tensor
 
 import hlsim
 from compensators import NALR, WDRC
-from hlsim import checks
 from hlsim.audio import read_audio, write_audio
-from hlsim.calibration import set_level
 from hlsim.dsp.resample import resample
-from hlsim.metrics import HASPI, haspi, hasqi
+from hlsim.metrics import haspi
 
 SPEECH = hlsim.example_speech()[8000:24000].clone()
 ARRAY = SPEECH.numpy()
-MAPPING, LIGHT = "compensator-general", "neuro-msbg-light"
-
-
-LEVEL_ENTRANCES: dict[str, Callable[[Tensor], object]] = {
-    "MSBG": hlsim.MSBG("N3"),
-    "NeuroMSBG": lambda wave: hlsim.load_pretrained(LIGHT)(wave, "N3"),
-    "loss": lambda wave: hlsim.HearingLossLoss("N3", simulator=LIGHT)(wave, wave),
-    "NAL-R": NALR("N3"),
-    "WDRC": lambda wave: WDRC()(wave, "N3"),
-    "mapping": lambda wave: hlsim.load_compensator(MAPPING)(wave, "N3"),
-    "stream": lambda wave: WDRC().stream("N3")(wave),
-    "haspi": lambda wave: haspi(wave, SPEECH, "N3"),
-    "hasqi": lambda wave: hasqi(wave, wave, "N3"),
-    "HASPI": lambda wave: HASPI()(wave, wave, "N3"),
-    "simulate": lambda wave: hlsim.simulate(wave.numpy(), "N3"),
-    "compensate": lambda wave: hlsim.compensate(wave, "N3"),
-}
-
-
-@pytest.mark.parametrize("entrance", LEVEL_ENTRANCES)
-def test_samples_that_are_no_pascals_cause_one_warning(
-    entrance: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(checks, "_has_warned_of_level", False)
-    call = LEVEL_ENTRANCES[entrance]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        call(SPEECH)
-        call(set_level(SPEECH, 119.0))
-    with pytest.warns(UserWarning, match=r"1\d\d dB SPL.*set_level.*full_scale_spl") as caught:
-        for _ in range(2):
-            call(SPEECH * 32768.0)  # 16-bit integers that were only converted to float
-    assert len(caught) == 1
-
-
-def test_the_warning_follows_full_scale_spl(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "_has_warned_of_level", False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        NALR("N3", full_scale_spl=0.0)(SPEECH * 32768.0)
-    with pytest.warns(UserWarning, match="did you forget calibration"):
-        NALR("N3", full_scale_spl=180.0)(SPEECH)
 
 
 ARRAYS = {

@@ -34,10 +34,10 @@ def compensate(parser: Parser) -> None:
         parser,
         _compensate,
         "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
-        "speech aided --audiogram N4 --compensator nal-r",
+        "speech aided --audiogram N4 --compensator nalr",
     )
     text = (
-        "nal-r (a prescription), wdrc (compression in bands), or a checkpoint's name or folder; a "
+        "nalr (a prescription), wdrc (compression in bands), or a checkpoint's name or folder; a "
         "checkpoint that was trained for one ear causes a warning if it is used for another"
     )
     parser.option("--compensator", str, text, "hearing-aid")

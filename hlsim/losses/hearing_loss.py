@@ -188,10 +188,9 @@ class HearingLossLoss(nn.Module):
             audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions; by
                 default the ears of the constructor. With (batch, 1, time), (batch, 8) is accepted,
                 too. A ``Listener`` goes with (..., 2, time), left first.
-            lengths: Number of samples of each item of a padded batch, (...), or its share of the
-                longest, above 0 and up to 1, as SpeechBrain defines it. Samples after the end of an
-                item are ignored, so that its value is the one that it has alone (within 1e-4 for
-                the exact MSBG, which simulates the padded batch at once).
+            lengths: Number of samples of each item of a padded batch, (...). Samples after the end
+                of an item are ignored, so that its value is the one that it has alone (within 1e-4
+                for the exact MSBG, which simulates the padded batch at once).
 
         Shape: (..., time) twice -> (), or with ``reduction="none"`` the leading dimensions. With
             ``ears="better"`` the result has no dimension of ears.

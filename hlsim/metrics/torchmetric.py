@@ -103,7 +103,7 @@ class _MeanScore(_Metric):
             clean: Clean speech of the same shape.
             audiogram: One ear, or one per item. For two channels a ``Listener``, a pair of left
                 and right ear, or one of these per item.
-            lengths: Number of samples of each item, or its share of the time, for a padded batch.
+            lengths: Number of samples of each item of a padded batch.
                 Shape: (batch,).
 
         Raises:

@@ -73,6 +73,7 @@ train-simulator --manifest {missing} --out {out} | --manifest
 train-simulator --manifest {folder}/.. --out {out} | cannot read the manifest
 train-compensator --speech {folder} --audiogram N3 --audiograms {text} --out {out} | one ear
 train-compensator --speech {folder} --recipe {folder} --out {out} | folder
+prepare {folder} --out {out} | no audio in it
 simulate {text} {out} --audiogram N3 | text.wav: cannot be read
 simulate {speech} {folder}/o.mp3 --audiogram N3 | o.mp3: expected the extension
 simulate {speech} {speech} --audiogram N3 | refusing to overwrite
@@ -132,7 +133,7 @@ OUTPUTS: dict[str, Callable[[Tensor, int], Tensor]] = {
     "compensate --audiogram N3 --compensator nalr": (
         lambda wave, rate: NALR(N3, sample_rate=rate)(wave)
     ),
-    "compensate --audiogram N7 --compensator Nal-R": (
+    "compensate --audiogram N7 --compensator nalr": (
         lambda wave, rate: NALR(N7, sample_rate=rate)(wave)
     ),
     "compensate --audiogram N3 --noise-reduction 0.5 --amplification 0": (

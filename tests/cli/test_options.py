@@ -3,12 +3,10 @@
 import inspect
 from importlib import import_module
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
 from hlsim.cli.main import COMMANDS, main, make_parser
-from hlsim.losses.criteria import CRITERIA, CriterionName
 
 FUNCTIONS = {
     "simulate": "hlsim.shortcuts",
@@ -54,10 +52,6 @@ def test_defaults_of_a_command_are_those_of_its_function(command: str) -> None:
         assert default == expected, name
         compared += 1
     assert compared or command.startswith("train")
-
-
-def test_names_that_are_written_twice_agree() -> None:
-    assert tuple(CRITERIA) == get_args(CriterionName)
 
 
 def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
