@@ -30,7 +30,7 @@ import pandas as pd
 from scipy.optimize import minimize
 from scipy.special import betaln, digamma, expit, polygamma
 
-from hlsim.metrics.words import Curve, simulate_changes
+from hlsim.metrics.words import Curve, simulate_proportions
 
 START = (0.4, 3.2, 5.0, 0.5, -0.6, -1.0, -1.0)
 """Initial values: fixed coefficients, and logarithms of the dispersion and of three deviations."""
@@ -160,7 +160,8 @@ def differences_between_aids(
                 continue
             pair = [(aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)]
             measured = aids[after].correctness.mean() - aids[before].correctness.mean()
-            yield measured / 100.0, simulate_changes(curve, pair)
+            first, second = simulate_proportions(curve, pair)
+            yield measured / 100.0, second - first
 
 
 def cross_validate(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]:

@@ -16,6 +16,7 @@ import sys
 from itertools import pairwise
 
 import torch
+from scipy.stats import spearmanr
 from torch import Tensor
 
 from hlsim import MSBG, Audiogram, HearingLossLoss
@@ -23,7 +24,6 @@ from hlsim.calibration import set_level
 from hlsim.dsp.stft import STFT
 from hlsim.losses.band_levels import band_edges, band_levels
 from hlsim.metrics import HaspiReference, HasqiReference
-from hlsim.metrics.fidelity import rank_correlation
 from hlsim.training.clips import Clips
 
 RATE, SECONDS, SPL = 16000, 3.0, 65.0
@@ -138,7 +138,7 @@ def compare(
     loss = scores[criterion]
     negative_loss = -torch.stack(list(loss.values()))
     haspi, hasqi = (
-        rank_correlation(negative_loss.numpy(), torch.stack(list(scores[name].values())).numpy())
+        spearmanr(negative_loss, torch.stack(list(scores[name].values())))[0]
         for name in ("HASPI", "HASQI")
     )
     ordered = all(bool(loss[less] < loss[more]) for less, more in pairwise(NOISY))

@@ -46,14 +46,9 @@ def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: 
     return {name: float(score(output.double(), item.clean.double(), item.ear, **options))}
 
 
-def _score_signal(
-    name: str, score: Callable[..., fidelity.Score], item: Item, output: Tensor
-) -> Values:
+def _score_signal(name: str, score: Callable[..., float], item: Item, output: Tensor) -> Values:
     """Compute STOI or PESQ, which do not depend on the ear."""
-    value, reason = score(item.clean, output, item.sample_rate)
-    if value is None:
-        raise ValueError(f"{name.upper()} is not defined: {reason}")
-    return {name: value}
+    return {name: score(item.clean, output, item.sample_rate)}
 
 
 # NumPy draws the noise of the scores for an ear.

@@ -6,12 +6,15 @@ The teacher is the simulator whose output others should match: the exact MSBG, o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from scipy import stats
 from torch import Tensor, nn
 
 from hlsim.evaluation.comparison import compare
@@ -133,7 +136,7 @@ def _teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
     return output
 
 
-def _fidelity_to(name: str) -> Measure:
+def _fidelity_to(teacher_name: str) -> Measure:
     """Return the measure that compares a simulator's output with that of a teacher.
 
     Its values are the SNR, the scaled mean squared error, the error of third-octave bands, and STOI
@@ -141,9 +144,9 @@ def _fidelity_to(name: str) -> Measure:
     out if pesq is not installed.
 
     Args:
-        name: Name of the teacher, see ``evaluate_simulators``.
+        teacher_name: Name of the teacher, see ``evaluate_simulators``.
     """
-    teacher = find_teacher(name)
+    teacher = find_teacher(teacher_name)
     scores = {"stoi": fidelity.stoi}
     if is_installed("pesq"):
         scores["pesq"] = fidelity.pesq_wb
@@ -155,12 +158,12 @@ def _fidelity_to(name: str) -> Measure:
             "raw_mse": fidelity.raw_mse(expected, output),
             "band_error": fidelity.third_octave_error_db(expected, output, item.sample_rate),
         }
-        for score, function in scores.items():
-            score_teacher = partial(function, item.clean, expected, NEURO_RATE)
-            of_teacher = item.once(score, score_teacher).value
-            of_simulator = function(item.clean, output, NEURO_RATE).value
-            if of_teacher is not None and of_simulator is not None:
-                values |= {f"{score}_teacher": of_teacher, f"{score}_simulator": of_simulator}
+        for name, score in scores.items():
+            with suppress(ValueError):  # the score of one of the two outputs is not defined
+                score_teacher = partial(score, item.clean, expected, NEURO_RATE)
+                of_teacher = item.once(name, score_teacher)
+                of_simulator = score(item.clean, output, NEURO_RATE)
+                values |= {f"{name}_teacher": of_teacher, f"{name}_simulator": of_simulator}
         return values
 
     settings = "msbg" if teacher is None else fingerprint(teacher.plugin)
@@ -185,11 +188,12 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
     1.0
     """
     columns = [f"{score}_teacher", f"{score}_simulator"]
-    pairs = rows.reindex(columns=columns).astype(float).dropna().to_numpy().T
+    x, y = rows.reindex(columns=columns).astype(float).dropna().to_numpy().T
+    is_defined = len(x) >= 2 and np.ptp(x) > 0.0 and np.ptp(y) > 0.0
     return {
-        "lcc": fidelity.linear_correlation(*pairs),
-        "srcc": fidelity.rank_correlation(*pairs),
-        "mse": fidelity.mean_squared_error(*pairs),
+        "lcc": float(stats.pearsonr(x, y)[0]) if is_defined else None,
+        "srcc": float(stats.spearmanr(x, y)[0]) if is_defined else None,
+        "mse": float(np.mean((x - y) ** 2)) if len(x) else None,
     }
 
 

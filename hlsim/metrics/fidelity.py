@@ -1,4 +1,4 @@
-"""Errors and scores that compare two signals, or two lists of scores.
+"""Errors and scores that compare two signals.
 
 They show how closely a network agrees with the hearing-loss simulator that it has learned.
 """
@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
 from hlsim.dsp.resample import resample
@@ -34,21 +32,6 @@ _MIN_BAND_RATIO = 1e-12
 
 _MIN_ERROR_POWER = 1e-20
 """Smallest relative power of an error, so that the SNR is finite, as JSON requires."""
-
-
-class Score(NamedTuple):
-    """Score of one signal, or the reason why the signal has none.
-
-    Attributes:
-        value: Score, or None.
-        reason: Reason why there is no score, or None.
-
-    >>> Score(None, "output is silent").value is None
-    True
-    """
-
-    value: float | None
-    reason: str | None = None
 
 
 def snr_db(reference: Signal, estimate: Signal) -> float:
@@ -140,10 +123,8 @@ def _band_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarra
     return np.diff(cumulative_power[edges])
 
 
-def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
+def stoi(clean: Signal, output: Signal, sample_rate: int) -> float:
     """Compute the short-time objective intelligibility (STOI), about 0 to 1, with pystoi.
-
-    Silence and less than 0.4 s of speech have no score, but a reason instead.
 
     Source: Taal, Hendriks, Heusdens and Jensen (2011).
 
@@ -153,24 +134,24 @@ def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The shapes differ.
+        ValueError: The shapes differ, or STOI is not defined: a signal is silent, has a sample that
+            is not finite, or has less than 0.4 s of speech.
         MissingExtraError: pystoi is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
-    >>> round(stoi(noise, noise, 16000).value)
+    >>> round(stoi(noise, noise, 16000))
     1
     """
     pystoi = require("pystoi", "eval")
-    return _score(lambda x, y: pystoi.stoi(x, y, sample_rate), clean, output)
+    return _score("STOI", lambda x, y: pystoi.stoi(x, y, sample_rate), clean, output)
 
 
-def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
+def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> float:
     """Compute wide-band PESQ, the quality of speech from about 1 to 4.6, with the package pesq.
 
-    Signals are resampled to 16 kHz. Silence and signals without detectable speech have no score,
-    but a reason instead. Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts, which ends
-    the process. If you score minutes of speech, use ``run_study`` or an evaluation command with
-    ``jobs`` of 2 or more: only the scores of the item that crashes are then missing.
+    Signals are resampled to 16 kHz. Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts,
+    which ends the process. If you score minutes of speech, use ``run_study`` or an evaluation
+    command with ``jobs`` of 2 or more: only the scores of the item that crashes are then missing.
 
     Source: ITU-T P.862.2.
 
@@ -180,11 +161,13 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The shapes differ.
+        ValueError: The shapes differ, or PESQ is not defined: a signal is silent, has a sample that
+            is not finite, or has no speech that pesq detects.
         MissingExtraError: pesq is not installed.
 
-    >>> pesq_wb(np.zeros(16000), np.ones(16000), 16000).reason
-    'clean is silent'
+    >>> noise = np.random.default_rng(0).standard_normal(16000)
+    >>> pesq_wb(noise, noise, 16000) > 4.0
+    True
     """
     pesq = require("pesq", "pesq")
 
@@ -193,137 +176,31 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
         y_at_16_khz = resample(torch.from_numpy(y), sample_rate, _PESQ_RATE).numpy()
         return float(pesq.pesq(_PESQ_RATE, x_at_16_khz, y_at_16_khz, "wb"))
 
-    return _score(score_at_16_khz, clean, output)
-
-
-def linear_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
-    """Compute Pearson's correlation of scores (LCC).
-
-    Args:
-        expected_scores: Scores to predict. Shape: (items,).
-        scores: Scores that predict them. Shape: (items,).
-
-    Returns:
-        Correlation, or None for fewer than two scores or scores that are all equal.
-
-    Raises:
-        ValueError: The numbers of scores differ, or a score is not finite.
-
-    >>> round(linear_correlation([0.1, 0.2, 0.4], [0.2, 0.4, 0.8]), 6)
-    1.0
-    """
-    return _correlate(stats.pearsonr, expected_scores, scores)
-
-
-def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
-    """Compute Spearman's rank correlation of scores (SRCC), with mean ranks for equal scores.
-
-    Args:
-        expected_scores: Scores to predict. Shape: (items,).
-        scores: Scores that predict them. Shape: (items,).
-
-    Returns:
-        Correlation, or None for fewer than two scores or scores that are all equal.
-
-    Raises:
-        ValueError: The numbers of scores differ, or a score is not finite.
-
-    >>> round(rank_correlation([0.1, 0.2, 0.4], [0.1, 0.3, 0.9]), 6)
-    1.0
-    """
-    return _correlate(stats.spearmanr, expected_scores, scores)
-
-
-def mean_squared_error(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
-    """Compute the mean squared difference of two lists of scores, or None if they are empty.
-
-    Args:
-        expected_scores: Scores to predict. Shape: (items,).
-        scores: Scores that predict them. Shape: (items,).
-
-    Raises:
-        ValueError: The numbers of scores differ, or a score is not finite.
-
-    >>> mean_squared_error([0.5], [0.75])
-    0.0625
-    """
-    x, y = _check_scores(expected_scores, scores)
-    return float(np.mean((x - y) ** 2)) if len(x) else None
-
-
-def _correlate(
-    correlation: Callable[..., Any], expected_scores: Iterable[float], scores: Iterable[float]
-) -> float | None:
-    x, y = _check_scores(expected_scores, scores)
-    is_defined = len(x) >= 2 and np.ptp(x) != 0.0 and np.ptp(y) != 0.0
-    return float(correlation(x, y)[0]) if is_defined else None
-
-
-def _check_scores(
-    expected_scores: Iterable[float], scores: Iterable[float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Convert scores to arrays of equal length.
-
-    Raises:
-        ValueError: The numbers of scores differ, or a score is not finite.
-    """
-    x = np.array(list(expected_scores), dtype=np.float64)
-    y = np.array(list(scores), dtype=np.float64)
-    if x.shape != y.shape or x.ndim != 1:
-        raise ValueError(
-            f"expected as many scores as expected scores, got {y.size} and {x.size}; pass both of "
-            "each item"
-        )
-    for name, array in (("expected_scores", x), ("scores", y)):
-        if not np.isfinite(array).all():
-            item = int(np.isfinite(array).argmin())
-            raise ValueError(
-                f"expected finite numbers in {name}, got {array[item]} for item {item}; leave the "
-                "item out of both"
-            )
-    return x, y
+    return _score("PESQ", score_at_16_khz, clean, output)
 
 
 def _score(
-    compute: Callable[[np.ndarray, np.ndarray], float], clean: Signal, output: Signal
-) -> Score:
-    """Compute a score, and turn any error of the measure into the reason why there is none."""
-    arrays = _as_equal_length(clean, output)
-    for name, samples in zip(("clean", "output"), arrays, strict=True):
-        if not np.isfinite(samples).all():
-            return Score(None, f"{name} has samples that are NaN or infinite")
-        if not samples.any():
-            return Score(None, f"{name} is silent")
+    name: str,
+    compute: Callable[[np.ndarray, np.ndarray], float],
+    clean: Signal,
+    output: Signal,
+) -> float:
+    """Compute a score by an outside package, whose errors become ValueError."""
+    x, y = _check_signals(clean, output)
+    if not y.any():
+        raise ValueError(f"{name} is not defined: the output is silent")
     try:
         with warnings.catch_warnings():
             # pystoi warns about too little speech, and returns 1e-5.
             warnings.filterwarnings("error", message="Not enough STFT frames")
-            value = float(compute(*arrays))
+            value = float(compute(x, y))
     except Exception as error:  # because an external measure may raise anything
         message = error.args[0] if error.args else error
-        return Score(None, message.decode() if isinstance(message, bytes) else str(message))
-    return Score(value) if math.isfinite(value) else Score(None, f"the score is {value}")
-
-
-def _as_equal_length(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndarray]:
-    """Convert two signals to arrays of float64.
-
-    Raises:
-        ValueError: The signals are not of one shape (time,).
-    """
-    x = _as_array(first)
-    y = _as_array(second)
-    if x.ndim != 1 or x.shape != y.shape or not len(x):
-        raise ValueError(
-            "expected two one-dimensional signals of equal length, not empty, got shapes "
-            f"{x.shape} and {y.shape}"
-        )
-    return x, y
-
-
-def _as_array(signal: Signal) -> np.ndarray:
-    array = signal.detach().cpu().numpy() if isinstance(signal, Tensor) else np.asarray(signal)
-    return array.astype(np.float64)
+        reason = message.decode() if isinstance(message, bytes) else message
+        raise ValueError(f"{name} is not defined: {reason}") from error
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is not defined: its value is {value}")
+    return value
 
 
 def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
@@ -332,14 +209,20 @@ def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.
     Raises:
         ValueError: The shapes differ, a sample is not finite, or the reference is silent.
     """
-    x, y = _as_equal_length(reference, estimate)
+    x, y = (
+        np.asarray(signal.detach().cpu() if isinstance(signal, Tensor) else signal, np.float64)
+        for signal in (reference, estimate)
+    )
+    if x.ndim != 1 or x.shape != y.shape or not len(x):
+        raise ValueError(
+            "expected two one-dimensional signals of equal length, not empty, got shapes "
+            f"{x.shape} and {y.shape}"
+        )
     for name, samples in (("reference", x), ("estimate", y)):
         if not np.isfinite(samples).all():
             raise ValueError(
                 f"expected finite samples of the {name}, got NaN or infinity; remove them"
             )
     if not x.any():
-        raise ValueError(
-            "expected a reference that is not silent, because errors are relative to it"
-        )
+        raise ValueError("expected a reference, such as clean speech, that is not silent")
     return x, y

@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 DRAWS = 4000
 """Number of listeners that are simulated."""
 
+INTERVAL = 0.9
+"""Proportion of listeners whose change lies in the interval."""
+
 
 class Curve(NamedTuple):
     """Parameters of the model that predicts the share of words that a listener understands.
@@ -72,7 +75,7 @@ class WordsChange(NamedTuple):
         after: Mean proportion with the second aid, 0 to 1.
         change: ``after`` minus ``before``.
         low: Lower end of the interval in which the change of a new listener lies with a probability
-            of 90 %, or of the ``interval`` that was passed.
+            of 90 %.
         high: Upper end of this interval.
 
     >>> WordsChange(0.5, 0.7, 0.2, -0.1, 0.5).change
@@ -99,36 +102,28 @@ def load_curve() -> Curve:
     return Curve(**json.loads(path.read_text(encoding="utf-8")))
 
 
-def words_change(
-    before: ArrayLike, after: ArrayLike, *, interval: float = 0.9, seed: int = 0
-) -> WordsChange:
+def words_change(before: ArrayLike, after: ArrayLike) -> WordsChange:
     """Predict from HASPI how many words a new listener understands with two aids.
 
-    In a test with listeners that were left out of the fit, 88 to 92 of 100 changes lay in the
-    interval of 0.9.
+    The interval of 90 % contains the differences between listeners, aids and sentences, and the
+    uncertainty of the coefficients. In a test with listeners that were left out of the fit, 88 to
+    92 of 100 changes lay in it. The listeners are simulated, always with the same random numbers.
 
     Args:
         before: HASPI v2 of each sentence with the first aid, from 0 to 1. Shape: (items,).
         after: HASPI v2 of each sentence with the second aid, from 0 to 1. Shape: (items,), whose
             length may differ.
-        interval: Proportion of listeners whose change lies between ``low`` and ``high``. The
-            interval contains the differences between listeners, aids and sentences, and the
-            uncertainty of the coefficients.
-        seed: Seed of the simulated listeners.
 
     Raises:
-        ValueError: There are no scores, they have another shape or are outside 0 to 1, or the
-            interval is outside 0 to 1.
+        ValueError: There are no scores, or they have another shape or are outside 0 to 1.
 
     >>> words_change([0.3] * 20, [0.8] * 20).change > 0.3
     True
     """
-    if not 0.0 < interval < 1.0:
-        raise ValueError(f"expected interval between 0 and 1, got {interval!r}")
     aids = [_check_scores("before", before), _check_scores("after", after)]
-    proportion_before, proportion_after = _simulate_proportions(load_curve(), aids, seed)
+    proportion_before, proportion_after = simulate_proportions(load_curve(), aids)
     change = proportion_after - proportion_before
-    low, high = np.quantile(change, [0.5 - interval / 2.0, 0.5 + interval / 2.0])
+    low, high = np.quantile(change, [0.5 - INTERVAL / 2.0, 0.5 + INTERVAL / 2.0])
     return WordsChange(
         before=float(proportion_before.mean()),
         after=float(proportion_after.mean()),
@@ -160,38 +155,22 @@ def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
     return array, float(array.mean())
 
 
-def simulate_changes(curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0) -> Array:
-    """Simulate how the share of words that listeners understand changes from one aid to another.
+def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> list[Array]:
+    """Simulate the proportion of words that listeners understand with each of several aids.
 
     Args:
         curve: Parameters of the model.
-        aids: For the first and the second aid, a pair: HASPI of each sentence with shape (items,),
-            and their mean.
-        seed: Seed of the simulated listeners.
+        aids: For each aid a pair: HASPI of each sentence with shape (items,), and their mean.
 
     Returns:
-        Proportion of words with the second aid minus that with the first, for each simulated
-        listener. Shape: (4000,).
+        Proportion of words for each simulated listener, with each aid. Shape: (4000,) each.
 
     >>> scores = np.full(20, 0.6)
-    >>> simulate_changes(load_curve(), [(scores, 0.6), (scores, 0.6)]).shape
+    >>> [proportion] = simulate_proportions(load_curve(), [(scores, 0.6)])
+    >>> proportion.shape
     (4000,)
     """
-    before, after = _simulate_proportions(curve, aids, seed)
-    return after - before
-
-
-def _simulate_proportions(
-    curve: Curve, aids: Sequence[tuple[Array, float]], seed: int
-) -> list[Array]:
-    """Simulate the proportion of words that listeners understand with each aid.
-
-    The arguments are those of ``simulate_changes``.
-
-    Returns:
-        Proportion for each listener, with each aid. Shape: (4000,) each.
-    """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     coefficients = random.multivariate_normal(curve.coefficients, curve.covariance, DRAWS)
     listener_intercept = curve.listener * random.standard_normal(DRAWS)
     listener_slope = curve.listener_slope * random.standard_normal(DRAWS)
