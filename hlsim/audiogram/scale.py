@@ -19,9 +19,6 @@ SEVERITIES = ("none", "mild", "moderate", "severe")
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
 """Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""
 
-STEPS_PER_DB = 1e4
-"""Resolution of levels for the severity: 19.7 dB HL in single precision counts as 19.7."""
-
 # Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609,
 # Tables 1 and 2, at the frequencies above. The tables end at 6 kHz; 8 kHz repeats that threshold.
 STANDARD = {

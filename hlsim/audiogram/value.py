@@ -22,7 +22,6 @@ from hlsim.audiogram.scale import (
     SEVERITIES,
     SEVERITY_LIMITS,
     STANDARD,
-    STEPS_PER_DB,
     EarName,
 )
 from hlsim.extras import require
@@ -322,13 +321,13 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     >>> SEVERITIES[severity_index(torch.full((8,), 40.0))]
     'moderate'
     """
-    # Tensors, because CUDA multiplies by the reciprocal of a number, which changes the last bit.
-    steps_per_db = levels.new_full((), STEPS_PER_DB, dtype=torch.float64)
-    rounded = ((levels.double() * STEPS_PER_DB).round() / steps_per_db).unbind(-1)
+    # rounded, so that 19.7 dB HL in single precision counts as 19.7
+    rounded = levels.double().round(decimals=4).unbind(-1)
     pairs = zip(rounded, frequencies, strict=True)
     high = [level for level, hz in pairs if 2000.0 <= hz <= 8000.0]
-    zero = steps_per_db.new_zeros(levels.shape[:-1])
-    mean = sum(high, start=zero) / steps_per_db.new_full((), max(1, len(high)))
+    total = sum(high, start=torch.zeros_like(rounded[0]))
+    # A tensor, because CUDA multiplies by the reciprocal of a number, which changes the last bit.
+    mean = total / torch.full_like(total, max(1, len(high)))
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
