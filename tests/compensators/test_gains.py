@@ -40,33 +40,25 @@ def test_nalr_has_the_gains_of_the_published_formula_and_compression_about_the_s
     assert float(below.max()) < 2.5
 
 
-def speech_shaped_noise(level: float) -> Tensor:
-    """Draw 4 s of noise with the spectrum of speech."""
-    phases = 2.0 * np.pi * np.random.default_rng(1).random(32000)
-    spectrum = np.concatenate([[0.0], np.sqrt(speech_density(64000)) * np.exp(1j * phases)])
-    return set_level(torch.tensor(np.fft.irfft(spectrum)).float(), level)
-
-
 def levels_in_thirds_of_octave(signal: Tensor) -> Tensor:
     """Measure the levels after the first second in dB. Shape: (64000,) -> (8,)."""
     powers = torch.fft.rfft(signal[16000:]).abs().square()
-    distance = (
-        torch.fft.rfftfreq(48000, 1.0 / 16000.0)[:, None] / torch.tensor(FREQUENCIES)
-    ).log2()
-    return 10.0 * (powers @ (distance.abs() < 1.0 / 6.0).float()).log10()
+    hertz = torch.fft.rfftfreq(48000, 1.0 / 16000.0)[:, None]
+    is_near = (hertz / torch.tensor(FREQUENCIES)).log2().abs() < 1.0 / 6.0
+    return 10.0 * (powers @ is_near.float()).log10()
 
 
 @pytest.mark.parametrize("name", ["wdrc", "hearing-aid", "compensator-general"])
 @pytest.mark.parametrize("level", [50.0, 65.0])
 def test_gains_are_those_of_the_output_for_other_noise(name: str, level: float) -> None:
+    phases = 2.0 * np.pi * np.random.default_rng(1).random(32000)
+    spectrum = np.concatenate([[0.0], np.sqrt(speech_density(64000)) * np.exp(1j * phases)])
+    noise = set_level(torch.tensor(np.fft.irfft(spectrum)).float(), level)
     aid: Any = load_compensator(name)
     options = {"noise_reduction": 0.0} if name == "hearing-aid" else {}
-    noise = speech_shaped_noise(level)
-    with torch.no_grad():
-        output = aid(noise, "N3", **options)
-    gains = levels_in_thirds_of_octave(output) - levels_in_thirds_of_octave(noise)
-    difference = aid.gains("N3", level) - gains
-    assert float(difference.abs().max()) < 1.0
+    gains = levels_in_thirds_of_octave(aid(noise, "N3", **options))
+    gains -= levels_in_thirds_of_octave(noise)
+    assert float((aid.gains("N3", level) - gains).abs().max()) < 1.0
 
 
 def test_gains_have_the_shape_of_the_ears_and_need_valid_ones() -> None:
@@ -75,9 +67,7 @@ def test_gains_have_the_shape_of_the_ears_and_need_valid_ones() -> None:
         both = aid.gains([listener, listener])
         assert both.shape == (2, 2, 8)
         torch.testing.assert_close(both[0, 1], aid.gains("N4"))
-        for arguments in ((None,), ("N9",)):
-            with pytest.raises(ValueError):
-                aid.gains(*arguments)
-    for level in (-1.0, 121.0, "65"):
         with pytest.raises(ValueError):
-            WDRC().gains("N3", level)
+            aid.gains(None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError):
+        WDRC().gains("N3", 121.0)

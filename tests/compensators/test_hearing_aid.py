@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from compensators import WDRC, HearingAid, HearingAidConfig, load_compensator
+from compensators import WDRC, HearingAid, load_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.aid_properties import measure_steady_tones
@@ -78,25 +78,15 @@ def test_sliders_of_a_stream_are_tensors_or_numbers_by_name() -> None:
             setattr(stream, name, 0.0)
 
 
-@pytest.mark.parametrize(
-    "slider", [1.5, -0.1, float("nan"), "loud", torch.tensor([0.0, 2.0])], ids=str
-)
-def test_a_bad_slider_raises_value_error(slider: Any) -> None:
+def test_a_bad_slider_raises_value_error() -> None:
     aid: Any = varied_hearing_aid()
-    with pytest.raises(ValueError):
-        aid(torch.randn(2, 100), EAR, 1.0, slider)
-    stream = aid.stream(EAR)
-    stream.amplification = slider
-    with pytest.raises(ValueError):
-        stream(torch.randn(2, 100))
-
-
-def test_the_gain_has_a_cap() -> None:
-    quiet = set_level(torch.randn(32000), 42.0)
-    for cap in (20.0, 45.0):
-        aid = HearingAid(HearingAidConfig(cap_db=cap)).eval().requires_grad_(False)
-        gain = float(level_spl(aid(quiet, torch.full((8,), 100.0), 0.0)[16000:]) - 42.0)
-        assert cap - 12.0 < gain < cap + 0.5
+    for slider in (1.5, float("nan"), "loud", torch.tensor([0.0, 2.0])):
+        for call in (
+            lambda x, y: aid(x, EAR, 1.0, y),
+            lambda x, y: aid.stream(EAR, amplification=y)(x),
+        ):
+            with pytest.raises(ValueError):
+                call(torch.randn(2, 100), slider)
 
 
 def test_gradients_reach_every_weight(utterance: Tensor) -> None:
@@ -105,8 +95,7 @@ def test_gradients_reach_every_weight(utterance: Tensor) -> None:
     aid(signal, draw_thresholds(4)).square().mean().backward()
     for name, tensor in [*aid.named_parameters(), ("signal", signal)]:
         assert tensor.grad is not None, name
-        assert tensor.grad.isfinite().all(), name
-        assert tensor.grad.any(), name
+        assert tensor.grad.isfinite().all() and tensor.grad.any(), name
 
 
 def test_noise_reduction_attenuates_noise_and_spares_tones() -> None:
@@ -116,8 +105,6 @@ def test_noise_reduction_attenuates_noise_and_spares_tones() -> None:
     changes = [float(level_spl(aid(sound, "NH", 1.0)[16000:]) - 65.0) for sound in sounds]
     assert -12.0 < changes[0] < -6.0
     assert max(map(abs, changes[1:])) < 1.0
-    samples = noise[:6400].expand(2, -1)
-    assert -12.0 <= float(aid.attenuation(samples).mean()) < -4.0
 
 
 @pytest.mark.parametrize(("name", "largest_error"), [("N2", 2.5), ("N3", 4.9)])

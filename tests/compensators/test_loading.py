@@ -26,12 +26,6 @@ def test_aids_without_training_have_names() -> None:
         assert (aid.sample_rate, aid.full_scale_spl, aid.training) == (44100, 100.0, False)
 
 
-def test_gains_are_linked_by_name() -> None:
-    for name in ("wdrc", "hearing-aid"):
-        aid: Any = load_compensator(name, linked=True)
-        assert aid.linked
-
-
 def test_a_checkpoint_names_the_ear_that_it_was_trained_for(tmp_path: Path) -> None:
     model = MappingCompensator(SMALL)
     records = {"one": {"audiogram": EAR.to_dict()}, "all": {"audiogram": None}, "old": {}}

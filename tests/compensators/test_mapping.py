@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 from torch import Tensor
 
 from compensators import NALR, MappingCompensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl
-from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_levels
 from hlsim.training.ears import draw_thresholds
 from tests.compensators.aids import EAR, SMALL, tone, varied_mapping
@@ -31,12 +29,6 @@ def test_starts_as_nalr(utterance: Tensor) -> None:
     assert (level_spl(output) - level_spl(prescribed)).abs().max() < 0.5
     correlation = torch.fft.rfft(output, 48000) * torch.fft.rfft(utterance, 48000).conj()
     assert not torch.fft.irfft(correlation).argmax(-1).any()  # aligned
-
-
-def test_the_gain_depends_on_the_level(utterance: Tensor) -> None:
-    model = varied_mapping()
-    louder = model(10.0 * utterance, EAR) / 10.0
-    assert (louder - model(utterance, EAR)).norm() > 0.01 * louder.norm()
 
 
 def test_the_correction_is_linear_between_the_centres_of_bands() -> None:
@@ -63,16 +55,6 @@ def test_gradients_reach_every_weight_and_are_finite_for_silence(utterance: Tens
                 output.square().sum() + output.sum(), [*model.parameters()]
             )
             assert all(gradient.isfinite().all() for gradient in gradients)
-
-
-@pytest.mark.parametrize("rate", [22050, 44100, 48000])
-def test_other_rates_give_the_same_band(rate: int, utterance: Tensor) -> None:
-    faster = resample(utterance, 16000, rate)
-    output = varied_mapping(sample_rate=rate)(faster, EAR)
-    assert output.shape == faster.shape
-    back = resample(output, rate, 16000)[: len(utterance)]
-    difference = bands_db(back) - bands_db(varied_mapping()(utterance, EAR))
-    assert difference[:22].abs().max() < 0.2
 
 
 def sideband_ratio(model: MappingCompensator) -> float:

@@ -48,45 +48,28 @@ def options(request: pytest.FixtureRequest) -> Options:
     return dict(zip(("simulator", "criterion"), request.param, strict=True))
 
 
-class Host(nn.Module):
-    """A compensator, with or without the loss inside."""
-
-    def __init__(self, loss: nn.Module | None = None) -> None:
-        super().__init__()
-        self.filter = nn.Conv1d(1, 1, 9, padding=4)
-        if loss is not None:
-            self.loss = loss
-
-    def forward(self, waveform: Tensor) -> Tensor:
-        filtered: Tensor = self.filter(waveform.unsqueeze(1)).squeeze(1)
-        return waveform + filtered
-
-
 class Function(nn.Module):
-    """A simulator that applies a function of the waveform."""
+    """A simulator that is a function of the waveform and the ear."""
 
-    def __init__(self, function: Callable[[Tensor], Any] = lambda waveform: waveform) -> None:
+    def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__()
         self.function = function
 
     def forward(self, waveform: Tensor, audiogram: Tensor) -> Any:
-        return self.function(waveform)
+        return self.function(waveform, audiogram)
 
 
-class Wrapper(nn.Module):
-    """A simulator around another, with the attributes of a Neuro-MSBG at 44.1 kHz."""
+class Msbg(Function):
+    """A simulator with the attributes of a Neuro-MSBG at 44.1 kHz."""
 
     emulates_msbg = True
     highest_frequency = 8000.0
     needs_exact_lengths = True
 
-    def __init__(self, inner: nn.Module) -> None:
-        super().__init__()
-        self.inner = inner
 
-    def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
-        perceived: Tensor = self.inner(waveform, audiogram)
-        return perceived
+def make_host(*loss: nn.Module) -> Any:
+    """Build a compensator, with or without the loss inside."""
+    return nn.Sequential(nn.Conv1d(1, 1, 9, padding=4), *loss)
 
 
 def compute(loss: HearingLossLoss, output: Tensor, clean: Tensor, *arguments: object) -> Result:
@@ -109,16 +92,15 @@ def assert_same(first: Result, second: Result) -> None:
 def test_host_trains_without_the_simulator(simulator: str, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, simulator=simulator)
     assert isinstance(loss.simulator, SIMULATORS[simulator])
-    host, bare = Host(loss).train().requires_grad_(True), Host()
+    host, bare = make_host(loss).train().requires_grad_(True), make_host()
     assert loss.training and not any(module.training for module in loss.simulator.modules())
     assert not any(parameter.requires_grad for parameter in loss.simulator.parameters())
     assert list(loss.parameters()) == [] and list(loss.buffers()) == [] and loss.state_dict() == {}
     # A state dict of either host loads into the other.
     bare.load_state_dict(host.state_dict(), strict=True)
     host.load_state_dict(bare.state_dict(), strict=True)
-    loss(host(clean), clean).backward()
-    for parameter in host.filter.parameters():
-        assert parameter.grad is not None
+    loss(host[0](clean.unsqueeze(1)).squeeze(1), clean).backward()
+    for parameter in host.parameters():
         assert bool(parameter.grad.isfinite().all()) and bool(parameter.grad.any())
 
 
@@ -145,13 +127,12 @@ def test_loss_from_inference_mode_trains_later(simulator: str, clean: Tensor) ->
 def test_simulator_moves_with_its_host_but_never_to_half_precision(
     simulator: str, clean: Tensor
 ) -> None:
-    host = Host(HearingLossLoss(N3, simulator=simulator, criterion="bands"))
-    value, slope = compute(host.loss, 3.0 * clean, clean)
-    host.to(torch.bfloat16)
-    assert host.filter.weight.dtype == torch.bfloat16
-    assert_same(compute(host.loss, 3.0 * clean, clean), (value, slope))
+    loss = HearingLossLoss(N3, simulator=simulator, criterion="bands")
+    host, (value, slope) = make_host(loss), compute(loss, 3.0 * clean, clean)
+    assert host.to(torch.bfloat16)[0].weight.dtype == torch.bfloat16
+    assert_same(compute(loss, 3.0 * clean, clean), (value, slope))
     host.double()
-    precise_value, precise_slope = compute(host.loss, 3.0 * clean.double(), clean.double())
+    precise_value, precise_slope = compute(loss, 3.0 * clean.double(), clean.double())
     assert precise_value.dtype == precise_slope.dtype == torch.float64
     # In another precision, only the direction of the gradient is the same.
     assert float(precise_value) == pytest.approx(float(value), rel=1e-3)
@@ -160,16 +141,13 @@ def test_simulator_moves_with_its_host_but_never_to_half_precision(
 
 
 @each_simulator
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
-def test_copies_have_simulators_of_their_own(
-    simulator: str, copied: Callable[[nn.Module], Host], clean: Tensor
-) -> None:
-    host = Host(HearingLossLoss(N3, simulator=simulator))
-    twin = copied(host)
-    assert twin.loss.simulator is not host.loss.simulator and list(twin.loss.parameters()) == []
-    assert_same(compute(host.loss, 3.0 * clean, clean), compute(twin.loss, 3.0 * clean, clean))
-    twin.double()
-    assert all(t.dtype != torch.float64 for t in host.loss.simulator.parameters())
+def test_copies_have_simulators_of_their_own(simulator: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator)
+    for twin in (copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
+        assert twin.simulator is not loss.simulator
+        assert_same(compute(loss, 3.0 * clean, clean), compute(twin, 3.0 * clean, clean))
+        twin.double()
+    assert all(t.dtype != torch.float64 for t in loss.simulator.parameters())
 
 
 @pytest.mark.slow
@@ -180,12 +158,10 @@ def test_caller_can_be_compiled(clean: Tensor) -> None:
         value: Tensor = loss((1.0 + gain).square() * signal, signal) * 0.5
         return value
 
-    results = []
-    for function in (step, torch.compile(step, backend="aot_eager")):
-        gain = torch.tensor(0.5, requires_grad=True)
-        value = function(gain, clean)
-        results.append((value.detach(), torch.autograd.grad(value, gain)[0]))
-    assert_same(results[0], results[1])
+    gain, compiled = torch.tensor(0.5, requires_grad=True), torch.compile(step, backend="aot_eager")
+    values = [function(gain, clean) for function in (step, compiled)]
+    slopes = [torch.autograd.grad(value, gain)[0] for value in values]
+    assert_same((values[0], slopes[0]), (values[1], slopes[1]))
 
 
 @pytest.mark.parametrize("simulator", [*SIMULATORS, "neuro-msbg-light"])
@@ -278,22 +254,14 @@ def test_samples_after_the_end_do_not_count(options: Options, clean: Tensor) -> 
     assert torch.equal(result[0], expected[0]) and torch.equal(result[1], expected[1])
     mono = loss(3.0 * clean[:, None], clean[:, None], lengths=torch.tensor([1.0, 0.625]))
     close(mono, expected[0])
+    values = HearingLossLoss([N3, S2], **options, reduction="none")
+    assert values(clean[0], clean[0], lengths=4000).shape == (2,)  # one clip in two ears
+    assert values(clean[:, None], clean[:, None], N3, [[4800], [99]]).shape == (2, 1)
+    close(values(3.0 * clean, clean, None, [4800, 3000]).mean(), expected[0])
     # Items that are as long as the batch need no lengths.
     full = loss(3.0 * clean, clean)
     assert float(expected[0]) != float(full)
     assert torch.equal(loss(3.0 * clean, clean, lengths=[4800, 4800]), full)
-
-
-def test_reduction_none_gives_a_value_per_item(options: Options, clean: Tensor) -> None:
-    mean = HearingLossLoss([N3, S2], **options)
-    loss = HearingLossLoss([N3, S2], **options, reduction="none")
-    for lengths in (None, [1, 4800]):
-        values = loss(3.0 * clean, clean, lengths=lengths)
-        assert values.shape == (2,) and values[0] != values[1]
-        close(values.mean(), mean(3.0 * clean, clean, lengths=lengths))
-    # one clip in two ears, and leading dimensions of two
-    assert loss(clean[0], clean[0], lengths=4000).shape == (2,)
-    assert loss(clean[:, None], clean[:, None], N3, lengths=[[4800], [99]]).shape == (2, 1)
 
 
 # Criteria and references
@@ -367,7 +335,7 @@ def test_function_gets_the_signals_of_heard(simulator: str, clean: Tensor) -> No
 
 def test_several_criteria_share_one_simulation(clean: Tensor) -> None:
     calls = []
-    simulator = Function(lambda waveform: calls.append(1) or 0.5 * waveform)
+    simulator = Function(lambda waveform, _: calls.append(1) or 0.5 * waveform)
     options: Options = {"simulator": simulator, "normal": lambda waveform: waveform}
     loss = HearingLossLoss(N3, criterion={"bands": 0.1, "paper": 2.0}, **options)
     value = loss(2.1 * clean, clean)
@@ -375,22 +343,22 @@ def test_several_criteria_share_one_simulation(clean: Tensor) -> None:
     bands, paper = (HearingLossLoss(N3, criterion=name, **options) for name in ("bands", "paper"))
     expected = 0.1 * bands(2.1 * clean, clean) + 2.0 * paper(2.1 * clean, clean)
     close(value, expected)
-    assert set(loss.weights) == set(loss.parts(clean, clean)) == {"band_levels", *WEIGHTS["paper"]}
     unweighted = HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.0})
     assert list(unweighted.criteria) == ["coherent-bands"]
 
 
 @each_criterion
 def test_output_of_an_unknown_simulator_is_compared_as_it_is(criterion: str, clean: Tensor) -> None:
-    loss = HearingLossLoss(N3, simulator=Function(), criterion=criterion)
+    unknown = Function(lambda waveform, _: waveform)
+    loss = HearingLossLoss(N3, simulator=unknown, criterion=criterion)
     assert float(loss(clean, clean)) == pytest.approx(0.0, abs=1e-6)
     expected = HearingLossLoss(N3, simulator="msbg", criterion=criterion)(3.0 * clean, clean)
-    wrapped = HearingLossLoss(N3, simulator=Wrapper(MSBG()), criterion=criterion)
+    wrapped = HearingLossLoss(N3, simulator=Msbg(MSBG()), criterion=criterion)
     close(wrapped(3.0 * clean, clean), expected)
 
 
 def test_simulator_has_a_normal_ear(clean: Tensor) -> None:
-    softer = Function(lambda waveform: 0.1 * waveform)
+    softer = Function(lambda waveform, _: 0.1 * waveform)
     # At 0 dB HL, the simulator makes the reference softer, too.
     value = float(HearingLossLoss(N3, simulator=softer)(clean, clean))
     assert value == pytest.approx(0.0, abs=1e-6)
@@ -402,7 +370,7 @@ def test_simulator_has_a_normal_ear(clean: Tensor) -> None:
     loss.double()
     assert ear.weight.dtype == torch.float64
     # The normal ear of another teacher has a phase of its own, not that of MSBG.
-    learned = Wrapper(Function(lambda waveform: waveform * 1.0))
+    learned = Msbg(lambda waveform, _: waveform * 1.0)
     options: Options = {"normal": nn.Identity(), "reference": "clean", "criterion": "paper"}
     loss = HearingLossLoss(N4, simulator=learned, **options)
     assert float(loss(clean, clean)) == pytest.approx(0.0, abs=1e-6)
@@ -436,16 +404,15 @@ def test_speech_is_closer_than_inverted_speech_and_silence(
 
 @each_simulator
 @pytest.mark.parametrize("ear", ["N2", "N4", "S2"])
-@pytest.mark.parametrize("gain", [0.0, 0.5, 1.0])
-def test_less_noise_costs_less(simulator: str, ear: str, gain: float, clean: Tensor) -> None:
+def test_less_noise_costs_less(simulator: str, ear: str, clean: Tensor) -> None:
     """Without an aid, too, where noise fills the bands that are too soft."""
-    prescription = NALR(Audiogram.standard(ear))
-    loss = HearingLossLoss(Audiogram.standard(ear), simulator=simulator)
-    costs = []
-    for snr in (100.0, 20.0, 10.0, 0.0, -5.0):
-        noisy = add_noise(clean, snr)
-        costs.append(float(loss((1.0 - gain) * noisy + gain * prescription(noisy), clean)))
-    assert costs == sorted(costs) and costs[0] < costs[1]
+    loss, noisy = (
+        HearingLossLoss(ear, simulator=simulator),
+        [add_noise(clean, snr) for snr in (100.0, 20.0, 10.0, 0.0, -5.0)],
+    )
+    for aid in (nn.Identity(), NALR(ear)):
+        costs = [float(loss(aid(signal), clean)) for signal in noisy]
+        assert costs == sorted(costs) and costs[0] < costs[1]
 
 
 # Levels and rates
@@ -511,15 +478,11 @@ def test_pauses_do_not_dominate_the_gradient(
     assert float(speech) > 0.0 and float(pause) < 0.1 * float(speech)
 
 
-@pytest.mark.parametrize(
-    ("criterion", "weights", "gain"),
-    # The phase has a faded gradient, and the weights of bands do not change in soft signals.
-    [("paper", {"magnitude": 0.9, "complex": 0.1, "time": 0.2}, 8.0), ("bands", None, 1.0)],
-)
-def test_gradient_is_that_of_the_value(
-    criterion: str, weights: dict[str, float] | None, gain: float, clean: Tensor
-) -> None:
-    loss = HearingLossLoss(N3, simulator="msbg", criterion=criterion, weights=weights)
+@pytest.mark.parametrize(("criterion", "gain"), [("paper", 8.0), ("bands", 1.0)])
+def test_gradient_is_that_of_the_value(criterion: str, gain: float, clean: Tensor) -> None:
+    weights = {"magnitude": 0.9, "complex": 0.1, "time": 0.2}  # the phase has a faded gradient
+    options: Options = {"weights": weights} if criterion == "paper" else {}
+    loss = HearingLossLoss(N3, simulator="msbg", criterion=criterion, **options)
     signal = clean.double()
     factor = torch.tensor(gain, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(loss(signal * factor, signal), factor)
@@ -534,13 +497,11 @@ def test_torch_func_gives_the_same_gradients(options: Options, clean: Tensor) ->
     expected = torch.autograd.grad(loss(output, reference), (output, reference))
     slopes = tuple(torch.func.grad(loss, argnums=n)(3.0 * clean, clean) for n in (0, 1))
     close(slopes, expected)
-    with torch.no_grad():
-        assert not loss(output, reference).requires_grad
 
 
 def test_limited_gradient_has_no_derivative(clean: Tensor) -> None:
     for criterion in WEIGHTS:
-        sine = Function(lambda waveform: 0.5 * waveform.sin())
+        sine = Function(lambda waveform, _: 0.5 * waveform.sin())
         loss = HearingLossLoss(N3, simulator=sine, criterion=criterion)
         output = (3.0 * clean).requires_grad_()
         (slope,) = torch.autograd.grad(loss(output, clean), output, create_graph=True)
@@ -554,21 +515,13 @@ def test_limited_gradient_has_no_derivative(clean: Tensor) -> None:
 
 def test_autocast_does_not_change_the_loss(options: Options, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, **options)
-    results, parts = [], []
-    for autocast in (False, True):
-        for output in (3.0 * clean, (3.0 * clean).bfloat16()):
-            output.requires_grad_()
-            with torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast):
-                value = loss(output, clean)
-                parts.append(loss.parts(output, clean))
-            (slope,) = torch.autograd.grad(value, output)
-            assert value.dtype == torch.float32 and slope.dtype == output.dtype
-            results.append((value.detach(), slope))
-    assert_same(results[0], results[2])
-    assert_same(results[1], results[3])
-    # The phase of nearly silent bands is rounding of the input, and nothing is louder here.
-    for name in set(parts[0]) - {"phase", "louder"}:
-        assert float(parts[3][name]) == pytest.approx(float(parts[0][name]), rel=0.01), name
+    for signal in (3.0 * clean, (3.0 * clean).bfloat16()):
+        expected = compute(loss, signal, clean)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            value = loss(signal.requires_grad_(), clean)
+        (slope,) = torch.autograd.grad(value, signal)
+        assert value.dtype == torch.float32 and slope.dtype == signal.dtype
+        assert_same(expected, (value.detach(), slope))
 
 
 # Errors
@@ -599,11 +552,10 @@ BAD_CALLS: list[tuple[Any, ...]] = [
     (SIGNAL, SIGNAL, 3),
     (SIGNAL, SIGNAL, N3, [1601, 1600]),
 ]
-BAD_OUTPUTS: list[Callable[[Tensor], Any]] = [
-    lambda wave: nn.functional.pad(wave, (0, 100)),
-    lambda wave: (wave, wave),
-    lambda wave: wave.mean(0),
-    lambda wave: wave.expand(2, 2, -1),
+BAD_OUTPUTS: list[Callable[..., Any]] = [
+    lambda wave, ear: nn.functional.pad(wave, (0, 100)),
+    lambda wave, ear: (wave, wave),
+    lambda wave, ear: wave.mean(0),
 ]
 
 
