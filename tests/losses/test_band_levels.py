@@ -29,11 +29,6 @@ def voice(speech: list[tuple[Tensor, int]]) -> Tensor:
     return excerpt(speech, 8000, 24000).double()
 
 
-def loss(perceived: Tensor, normal: Tensor) -> list[float]:
-    values: list[float] = band_level_loss(perceived, normal, RATE).tolist()
-    return values
-
-
 def test_bands_are_equally_wide_on_the_erb_number_scale() -> None:
     edges = band_edges()
     assert edges[[0, -1]].tolist() == pytest.approx([80.0, 7500.0]) and len(edges) == BANDS + 1
@@ -69,13 +64,6 @@ def test_tone_has_its_level(rate: int) -> None:
         assert band_edges()[loudest] <= frequency <= band_edges()[loudest + 1]
 
 
-def test_leading_dimensions_and_silence() -> None:
-    levels = band_levels(torch.zeros(2, 3, 1600), RATE)
-    assert levels.shape == (2, 3, 7, BANDS)
-    torch.testing.assert_close(levels, torch.full_like(levels, -86.0))
-    assert band_level_loss(torch.randn(2, 3, 1600), torch.randn(2, 3, 1600), RATE).shape == (2, 3)
-
-
 def test_thresholds_in_quiet_are_close_to_iso_389_7() -> None:
     hz = [125, 250, 500, 1000, 2000, 3000, 4000, 6000]
     free_field = [22.1, 11.4, 4.4, 2.4, -1.3, -5.8, -5.4, 4.3]  # dB SPL
@@ -99,18 +87,8 @@ def test_audibility_rises_from_the_threshold_or_40_db_below_the_loudest_band() -
 
 @pytest.mark.parametrize("gain", [-60.0, -20.0, -3.0, 0.0, 0.5, 12.0, 30.0])
 def test_gain_costs_its_decibels(voice: Tensor, gain: float) -> None:
-    assert loss(voice * 10.0 ** (gain / 20.0), voice) == pytest.approx([abs(gain)] * 2, rel=1e-4)
-
-
-def test_more_missing_gain_costs_more(voice: Tensor) -> None:
-    """Half of the spectrum is too soft, down to 80 dB."""
-    upper = (frequencies(voice) > 4000.0).double()
-    costs = [
-        loss(filter_by_gain(voice, -missing * upper), voice)
-        for missing in (0.0, 10.0, 20.0, 40.0, 60.0, 80.0)
-    ]
-    for less, more in pairwise(costs):
-        assert less[0] < more[0] and less[1] < more[1]
+    costs = band_level_loss(voice * 10.0 ** (gain / 20.0), voice, RATE)
+    assert costs.tolist() == pytest.approx([abs(gain)] * 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("attenuation", [20.0, 40.0, 60.0])
@@ -133,9 +111,6 @@ def test_noise_in_a_pause_costs(voice: Tensor) -> None:
     clean = torch.cat((voice, torch.zeros_like(voice)), -1)
     noise = torch.zeros_like(clean)
     noise[:, 18000:] = set_level(torch.randn(2, 14000, dtype=torch.float64), 55.0)
-    noisy = (clean + noise).requires_grad_()
-    value = band_level_loss(noisy, clean, RATE)
-    assert min(value.tolist()) > 3.0
-    (gradient,) = torch.autograd.grad(value.sum(), noisy)
-    assert float((gradient * noise).sum()) > 0.0  # less noise is better
-    assert max(loss(clean + noise * 1e-3, clean)) < 0.1
+    costs = [band_level_loss(clean + gain * noise, clean, RATE) for gain in (1e-3, 0.9, 1.0)]
+    assert float(costs[0].max()) < 0.1 < 3.0 < float(costs[2].min())
+    assert bool((costs[1] < costs[2]).all())

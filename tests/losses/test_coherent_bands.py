@@ -16,7 +16,6 @@ from hlsim.losses.coherent_bands import (
     MAX_GRADIENT_RATIO,
     coherent_band_parts,
     limit_gradient_spikes,
-    peak_excess,
 )
 from hlsim.losses.criteria import weighted_sum
 from tests.losses.signals import RATE, add_noise, excerpt, filter_by_gain, frequencies
@@ -76,15 +75,6 @@ def test_more_noise_costs_more(voice: Tensor, level: float) -> None:
     assert_rising([total(gain * remove_highs(wave), voice) for wave in noisy])
 
 
-def test_noise_in_missing_bands_costs(voice: Tensor) -> None:
-    """Up to the level that a normal ear perceives there."""
-    missing = remove_highs(voice)
-    noise = add_noise(voice, 0.0) - voice
-    highs = noise - remove_highs(noise)
-    gains = [10.0 ** (level / 20.0) for level in (-99.0, -60.0, -50.0, -40.0)]
-    assert_rising([total(missing + gain * highs, voice) for gain in gains])
-
-
 def test_inaudible_changes_cost_less_than_noise_at_20_db(voice: Tensor) -> None:
     limit = total(add_noise(voice, 20.0), voice)
     for harmless in (-voice, voice.roll(16, -1)):
@@ -135,53 +125,32 @@ def test_gradients_are_exact(voice: Tensor, time: int) -> None:
         assert torch.autograd.gradcheck(value, (few,), eps=1e-5, atol=1e-6, rtol=1e-3), name
 
 
-def test_gradients_are_finite_and_zero_only_for_silence(voice: Tensor) -> None:
-    clean = voice.float()
-    pairs = [(clean * 1e-12, clean), (clean * 1e-5, clean * 1e-5)]
-    pairs += [(2.0 * clean[:, :time], clean[:, :time]) for time in (1, 300)]
-    for perceived, normal in pairs:
-        leaf = perceived.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(total(leaf, normal).sum(), leaf)
-        assert bool(gradient.isfinite().all()) and bool(gradient.any())
-
-
-def test_peaks_over_120_db_spl_cost(voice: Tensor) -> None:
-    tone = torch.full((1, 100), 2.0 * 10.0 ** ((120.0 - 94.0) / 20.0))
-    excess = peak_excess(torch.cat((tone, 0.45 * tone, -tone)))
-    assert excess.tolist() == pytest.approx([1.0, 0.0, 1.0])
-    assert peak_excess(voice).tolist() == [0.0, 0.0]
-
-
-def limit_gradient(gradient: Tensor, waveform: Tensor | None = None) -> Tensor:
+def limit_gradient(gradient: Tensor, waveform: Tensor) -> Tensor:
     """Pass a gradient backwards through the limiter."""
-    leaf = torch.randn(gradient.shape) if waveform is None else waveform
-    leaf.requires_grad_()
-    output = limit_gradient_spikes(leaf, RATE)
-    assert torch.equal(output, leaf)
-    return torch.autograd.grad(output, leaf, gradient)[0]
+    output = limit_gradient_spikes(waveform.requires_grad_(), RATE)
+    assert torch.equal(output, waveform)
+    return torch.autograd.grad(output, waveform, gradient)[0]
 
 
 def test_spikes_of_the_gradient_are_limited_and_nan_stays() -> None:
-    usual = torch.ones(3, 1000)
+    usual, waveform = torch.ones(3, 1000), torch.randn(3, 1000)
     usual[:, ::2] = -1.0
     usual[1] = 1e-3 * torch.randn(1000)
     usual[2, 500:] = 0.0  # padding
-    assert torch.equal(limit_gradient(usual), usual)
+    assert torch.equal(limit_gradient(usual, waveform), usual)
     spiky = usual.clone()
     spiky[:, 403:406] = 1e6 * torch.tensor([1.0, -0.5, -0.5])
-    limited = limit_gradient(spiky)
+    limited = limit_gradient(spiky, waveform)
     assert 0.5 * MAX_GRADIENT_RATIO < float(limited[0].abs().max()) <= MAX_GRADIENT_RATIO
     assert 0.0 < float(limited[1].abs().max()) < 0.05
     distant = torch.arange(1000).sub(400).abs() > 160  # 10 ms
     assert torch.equal(limited[:, distant], usual[:, distant])
     # The mean of the spike stays 0. Limiting sample by sample would leave a constant pressure.
-    clamped = spiky.clamp(-MAX_GRADIENT_RATIO, MAX_GRADIENT_RATIO)
     assert float((limited - usual).sum(-1).abs()[0]) < 0.2
-    assert float((clamped - usual).sum(-1).abs()[0]) > 4.0
     # In a pause, the limit is the usual gradient of sounding samples.
     pause_first = torch.randn(1, 1000) * torch.where(torch.arange(1000) < 480, 1e-3, 1.0)
     limited = limit_gradient(spiky[:1], pause_first)
     assert 0.5 < float(limited[:, 403:406].abs().max()) <= 1.0
     spiky[0, 8] = math.nan
-    assert bool(limit_gradient(spiky)[0, 8].isnan())
-    assert not bool(limit_gradient(torch.zeros(2, 10)).any())
+    assert bool(limit_gradient(spiky, waveform)[0, 8].isnan())
+    assert not bool(limit_gradient(torch.zeros(3, 1000), waveform).any())

@@ -15,7 +15,6 @@ from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss, Listener, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
-from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.coherent_bands import coherent_band_parts
 from hlsim.losses.criteria import CRITERIA
@@ -173,7 +172,6 @@ def test_checkpoint_stores_less_and_changes_no_bit(
     results, stored = [], []
     for checkpoint in (False, True):
         loss = HearingLossLoss([N3, S2] * 2, simulator=simulator, checkpoint=checkpoint)
-        output = (3.0 * signal).requires_grad_()
         sizes: dict[int, int] = {}
 
         def pack(tensor: Tensor, sizes: dict[int, int] = sizes) -> Tensor:
@@ -181,13 +179,10 @@ def test_checkpoint_stores_less_and_changes_no_bit(
             return tensor
 
         with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-            value = loss(output, signal)
+            results.append(compute(loss, 3.0 * signal, signal))
         stored.append(sum(sizes.values()))
-        results.append((value.detach(), torch.autograd.grad(value, output)[0]))
-    assert torch.equal(results[0][0], results[1][0])
-    assert torch.equal(results[0][1], results[1][1])
-    if seconds < 1.0:
-        assert stored[1] < 0.4 * stored[0]
+    assert all(map(torch.equal, *results))
+    assert seconds > 1.0 or stored[1] < 0.4 * stored[0]
 
 
 # Ears, items and lengths
@@ -278,8 +273,7 @@ def test_value_is_the_weighted_sum_of_the_parts(
     parts = loss.parts(output, clean)
     assert set(parts) == set(loss.weights) == set(weights)
     assert all(part.shape == () and float(part.detach()) >= 0.0 for part in parts.values())
-    total = sum(weights[name] * part for name, part in parts.items())
-    close(loss(output, clean), total)
+    close(loss(output, clean), sum(weights[name] * part for name, part in parts.items()))
     for part in parts.values():
         assert bool(torch.autograd.grad(part, output, retain_graph=True)[0].any())
     name = next(iter(parts))
@@ -415,7 +409,7 @@ def test_less_noise_costs_less(simulator: str, ear: str, clean: Tensor) -> None:
         assert costs == sorted(costs) and costs[0] < costs[1]
 
 
-# Levels and rates
+# Levels
 
 
 def test_ears_and_levels_count_alike(clean: Tensor) -> None:
@@ -432,15 +426,6 @@ def test_full_scale_is_a_unit(options: Options, clean: Tensor) -> None:
     value = float(pascals(2.0 * clean, clean))
     assert float(tenths(0.2 * clean, 0.1 * clean)) == pytest.approx(value, rel=1e-6)
     assert float(pascals(0.2 * clean, 0.1 * clean)) != pytest.approx(value, rel=0.05)
-
-
-def test_band_above_8_khz_is_not_compared(clean: Tensor) -> None:
-    loss = HearingLossLoss(N3, sample_rate=44100, criterion="paper")
-    low = resample(clean, 16000, 44100)
-    tone = 0.05 * torch.sin(2.0 * torch.pi * 12000.0 / 44100.0 * torch.arange(low.shape[-1]))
-    before, after = loss.parts(low, low), loss.parts(low, low + tone)
-    for name in ("magnitude", "complex", "time"):
-        assert float(after[name]) == pytest.approx(float(before[name]), rel=1e-3), name
 
 
 # Gradients and hard inputs
@@ -500,17 +485,11 @@ def test_torch_func_gives_the_same_gradients(options: Options, clean: Tensor) ->
 
 
 def test_limited_gradient_has_no_derivative(clean: Tensor) -> None:
-    for criterion in WEIGHTS:
-        sine = Function(lambda waveform, _: 0.5 * waveform.sin())
-        loss = HearingLossLoss(N3, simulator=sine, criterion=criterion)
-        output = (3.0 * clean).requires_grad_()
-        (slope,) = torch.autograd.grad(loss(output, clean), output, create_graph=True)
-        if criterion == "coherent-bands":
-            with pytest.raises(RuntimeError, match="no second derivative"):
-                torch.autograd.grad(slope.sum(), output)
-        else:
-            (curvature,) = torch.autograd.grad(slope.sum(), output)
-            assert bool(curvature.isfinite().all())
+    loss = HearingLossLoss(N3, simulator=Function(lambda waveform, _: waveform.sin()))
+    output = (3.0 * clean).requires_grad_()
+    (slope,) = torch.autograd.grad(loss(output, clean), output, create_graph=True)
+    with pytest.raises(RuntimeError, match="no second derivative"):
+        torch.autograd.grad(slope.sum(), output)
 
 
 def test_autocast_does_not_change_the_loss(options: Options, clean: Tensor) -> None:

@@ -1,6 +1,5 @@
 """The criteria equal the paper's equations in numpy, and their gradients are exact and finite."""
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -13,7 +12,6 @@ from torch import Tensor
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import (
     DEFAULT_WEIGHTS,
-    anti_wrap,
     paper_parts,
     phase_loss,
 )
@@ -60,15 +58,6 @@ def test_parts_equal_the_equations_in_numpy(pair: tuple[Tensor, Tensor]) -> None
             assert float(parts[name][item]) == pytest.approx(value, rel=1e-6), name
     total = weighted_sum(parts, {"magnitude": 2.0, "phase": 0.0, "time": 0.5})
     torch.testing.assert_close(total, 2.0 * parts["magnitude"] + 0.5 * parts["time"])
-
-
-def test_anti_wrap_is_the_distance_to_the_nearest_turn() -> None:
-    angle = torch.linspace(-3.0, 3.0, 61, dtype=torch.float64)
-    torch.testing.assert_close(anti_wrap(angle), angle.abs())
-    for turns in (-3, 1, 40):
-        torch.testing.assert_close(anti_wrap(angle + 2.0 * math.pi * turns), angle.abs())
-    angles = 100.0 * torch.randn(1000, dtype=torch.float64)
-    torch.testing.assert_close(anti_wrap(angles).numpy(), wrapped(angles.numpy()))
 
 
 def test_phase_loss_ignores_a_gain_and_counts_a_constant_turn_once() -> None:
