@@ -86,6 +86,7 @@ def _write_corpus(folder: Path) -> None:
         "recordings/train": clean[:2],
         "recordings/valid": clean[2:],
         **{f"VoxCeleb/id{number:02}/session": clean[:1] for number in range(20)},
+        **{f"TIMIT/{split}/DR1/{split.lower()}1": clean[:1] for split in ("TRAIN", "TEST")},
         **{f"collection/set/clean/{speaker}": clean[:1] for speaker in ("a", "b")},
         **{f"collection/set/noisy/{speaker}": clean[:1] for speaker in ("a", "b")},
     }

@@ -1,14 +1,11 @@
 """The examples of training through the loss run as they stand, a few steps."""
 
-import importlib
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from hlsim.cli.main import main
-from tests.helpers import EXAMPLES, load_example, write_ears
+from tests.helpers import EXAMPLES, load_example
 
 TRAINING = EXAMPLES / "training"
 
@@ -112,51 +109,6 @@ def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
     assert set(aid.state_dict()) == {"weight", "bias"}
-
-
-@pytest.mark.slow
-def test_an_aid_learns_through_a_network_that_learned_another_simulator(
-    tmp_path: Path,
-    speech_dir: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """docs/guide/any-teacher.md, a few steps."""
-    for module in ("lightning", "yaml", "pystoi", "pesq", "pandas", "matplotlib"):
-        pytest.importorskip(module)
-    monkeypatch.chdir(EXAMPLES.parent)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    train, valid, out = speech_dir / "train", speech_dir / "valid", tmp_path / "ear"
-    teacher = ("--teacher", "examples.training.dead_region:DeadRegion")
-    recipe = tmp_path / "recipe.yaml"
-    shorter = ("steps: 2", "batch: 2", "seconds: 0.3", "validate_every: 2", "validation_items: 8")
-    lines = (EXAMPLES / "any-teacher.yaml").read_text().splitlines()
-    for change in shorter:
-        lines = [change if line.startswith(change.split()[0]) else line for line in lines]
-    recipe.write_text("\n".join(lines))
-
-    def run(command: str, *options: object) -> None:
-        assert main([*command.split(), *map(str, options)]) == 0
-
-    run(
-        "train-simulator --device cpu",
-        *teacher,
-        "--recipe",
-        recipe,
-        "--speech",
-        train,
-        "--out",
-        out,
-    )
-    ears = write_ears(tmp_path / "ears.csv", "S2")
-    options = (*teacher, "--speech", valid, "--audiograms", ears, "--out", tmp_path / "of")
-    run("evaluate-simulator --items 2 --seconds 0.5", *options, "--", out / "checkpoint")
-    assert "examples.training.dead_region:DeadRegion" in capsys.readouterr().out
-    example = importlib.import_module("examples.training.dead_region_aid")
-    for simulator in (str(out / "checkpoint"), ""):
-        example.main(str(train), str(valid), simulator, "S2", "2")
-        text = capsys.readouterr().out
-        assert text.count(" dB ") == 9 and text.startswith("perceived without the aid: -")
 
 
 def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:

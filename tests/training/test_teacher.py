@@ -14,9 +14,6 @@ class Quieter:
     def __call__(self, waveform, audiogram):
         return 0.5 * waveform * 10 ** (-audiogram[:, :1] / 20)
 
-class TooFast(Quieter):
-    sample_rate = 96000
-
 def late(waveform, audiogram):
     return waveform.roll(320, -1)
 """
@@ -35,10 +32,10 @@ def test_a_plug_in_is_called_at_its_own_rate(tmp_path: Path) -> None:
     assert str(teacher) == f"{tmp_path}/plugin.py:Quieter"
 
 
-def test_unknown_late_and_too_fast_teachers_are_rejected(tmp_path: Path) -> None:
+def test_unknown_and_late_teachers_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "plugin.py").write_text(PLUGIN)
     with pytest.raises(ValueError, match="pyclarty"):
         find_teacher("pyclarty")
-    for name, words in (("late", "delays by"), ("TooFast", "96000"), ("nobody", "nobody")):
+    for name, words in (("late", "delays by"), ("nobody", "nobody")):
         with pytest.raises(ValueError, match=words):
             PluginTeacher(f"{tmp_path}/plugin.py:{name}")
