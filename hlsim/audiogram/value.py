@@ -326,9 +326,8 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     pairs = zip(rounded, frequencies, strict=True)
     high = [level for level, hz in pairs if 2000.0 <= hz <= 8000.0]
     total = sum(high, start=torch.zeros_like(rounded[0]))
-    # A tensor, because CUDA multiplies by the reciprocal of a number, which changes the last bit.
-    mean = total / torch.full_like(total, max(1, len(high)))
-    return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
+    # The sum is compared, because CUDA may round a mean in another way.
+    return torch.stack([total > limit * len(high) for limit in SEVERITY_LIMITS]).sum(0)
 
 
 def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:

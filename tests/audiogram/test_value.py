@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, Audiogram, as_audiogram, severity_index
 from hlsim.audiogram.thresholds import as_thresholds
@@ -123,25 +121,6 @@ def test_severity_on_other_grids_is_pyclaritys() -> None:
         expected = CLARITY_SEVERITIES[clarity.Audiogram(levels, hz).severity]
         if hz[0] <= 8000:
             assert Audiogram(tuple(levels), tuple(hz)).severity == expected
-
-
-class DividesAsCUDA(TorchDispatchMode):
-    """CUDA takes a division by a number for a product with its reciprocal (DivTrueKernel.cu)."""
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is torch.ops.aten.div.Tensor and not isinstance(args[1], Tensor):
-            return args[0] * (1.0 / args[1])
-        return func(*args, **(kwargs or {}))
-
-
-def test_severity_on_a_limit_is_the_same_where_a_division_is_a_product() -> None:
-    tenths = np.random.default_rng(3).integers(0, 750, (4000, 8))
-    tenths[:, 7] = 5 * np.resize((150, 350, 560), 4000) - tenths[:, 3:7].sum(-1)  # on a limit
-    ears = torch.tensor(tenths[(tenths[:, 7] >= -100) & (tenths[:, 7] <= 1000)] / 10.0)
-    assert len(ears) > 1000
-    with DividesAsCUDA():
-        index = severity_index(ears)
-    assert torch.equal(index, severity_index(ears))
 
 
 def test_json_and_rows_keep_all_digits_and_add_none() -> None:
