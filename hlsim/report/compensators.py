@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
 from hlsim.evaluation.compensators import COMPRESSION, HARD, NAL_R, UNAIDED, UTTERANCES
 from hlsim.evaluation.result import Evaluation
@@ -37,7 +35,6 @@ _GROUPS = {
 }
 
 _COLUMNS: Columns = {
-    "Output level (dB SPL)": (statistic("level"), ".1f"),
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
     "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     "Mean absolute loudness error (dB)": (statistic("loudness_error", "mean absolute"), ".1f"),
@@ -45,9 +42,6 @@ _COLUMNS: Columns = {
     "Band error (dB)": (statistic("band_error"), ".1f"),
 }
 """Columns beside the scores, by title."""
-
-_LOWEST_ERROR_DB = -60.0
-"""Loudness error of a tone in dB below which it is drawn as this value, because it is inaudible."""
 
 _GAP_COLUMNS: Columns = {
     "Neuro-MSBG (dB)": (statistic("loss_neuro"), ".2f"),
@@ -132,9 +126,9 @@ def _about(evaluation: Evaluation) -> str:
     levels = ", ".join(f"{level:g}" for level in settings["levels"])
     ears = evaluation.table["ear"].nunique()
     return (
-        f"{settings['items']} items of {settings['seconds']:g} s; {ears} "
-        f"{'ear' if ears == 1 else 'ears in turn'}; speech at {levels} dB SPL in turn; seed "
-        f"{settings['seed']}. {VERSION_NOTE} Both compare with the clean speech, in noise too."
+        f"{settings['items']} items of {settings['seconds']:g} s; ears: {ears}; speech at "
+        f"{levels} dB SPL in turn; seed {settings['seed']}. {VERSION_NOTE} Both compare with the "
+        "clean speech, in noise too."
     )
 
 
@@ -194,11 +188,12 @@ def _tone_pictures(evaluation: Evaluation) -> list[Picture]:
     for row in evaluation.details["steady_tones"]:
         middle = len(row["levels"]) // 2
         title = f"Tones of {row['levels'][middle]:g} dB SPL, ear {row['ear']}"
-        errors = np.maximum(row["loudness_error_db"][middle], _LOWEST_ERROR_DB)
+        errors = row["loudness_error_db"][middle]
         style = {"color": colours[row["aid"]]}
-        curves.setdefault(title, {})[row["aid"]] = (row["frequencies"], list(errors), style)
+        curves.setdefault(title, {})[row["aid"]] = (row["frequencies"], errors, style)
     return [
-        curves_picture(of_ear, title, "loudness error (dB)") for title, of_ear in curves.items()
+        curves_picture(of_ear, title, "loudness error (dB)", axis_range=(-60.0, None))
+        for title, of_ear in curves.items()
     ]
 
 

@@ -15,7 +15,6 @@ from hlsim.report.players import listening_sections
 from hlsim.report.plots import scores_pictures
 from hlsim.report.results import (
     GAIN_NOTE,
-    LEVEL,
     Columns,
     comparison_table,
     score_columns,
@@ -77,8 +76,8 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     >>> report_page(evaluation).title
     'STOI: after'
     """
-    columns = {**score_columns(evaluation), **LEVEL}
-    tables = [summary_table("Means of all items", split_rows(evaluation.table), columns)]
+    rows, columns = split_rows(evaluation.table), score_columns(evaluation)
+    tables = [summary_table("Means of all items", rows, columns)]
     texts = [GAIN_NOTE] if "haspi" in evaluation.scores else []
     headline = evaluation.headline
     verdict = _mean_verdict(evaluation)
@@ -192,7 +191,7 @@ def _conditions_table(evaluation: Evaluation) -> Table:
     table = evaluation.table[evaluation.table["item"].map(scored)]
     scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
     columns: Columns = {title: (statistic(score), ".3f") for title, score in scores.items()}
-    columns |= LEVEL
+    columns["Level (dB SPL)"] = (statistic("level"), ".1f")
     shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
     caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
     look_ahead = evaluation.details["look_ahead_ms"]

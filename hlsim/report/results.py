@@ -62,23 +62,20 @@ def statistic(column: str, name: str = "mean") -> Callable[[DataFrame], Any]:
     return lambda rows: compute(rows[column])
 
 
-LEVEL: Columns = {"Level (dB SPL)": (statistic("level"), ".1f")}
-"""Column with the mean output level."""
-
-
 def score_columns(evaluation: Evaluation) -> Columns:
-    """Return the columns of a table of scores: number of items, and mean of each score.
+    """Return the columns of a table of scores: number of items, and means of scores and levels.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES, Condition
     >>> table = pandas.DataFrame({"item": [0], "condition": ["aid"], "haspi": [0.5]})
     >>> evaluation = Evaluation([], [Condition("aid")], [MEASURES["haspi"]], table)
     >>> list(score_columns(evaluation))
-    ['n', 'HASPI (mean ± std)']
+    ['n', 'HASPI (mean ± std)', 'Output level (dB SPL)']
     """
     columns: Columns = {"n": (statistic(evaluation.scores[0], "count"), "d")}
     for score in evaluation.scores:
         columns[f"{column_title(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
+    columns["Output level (dB SPL)"] = (statistic("level"), ".1f")
     return columns
 
 
