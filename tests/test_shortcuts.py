@@ -2,7 +2,6 @@
 
 import inspect
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,14 +31,6 @@ def test_simulate_is_the_exact_model_and_compensate_the_hearing_aid() -> None:
         assert torch.equal(hlsim.compensate(SPEECH, ear), aid(SPEECH, ear))
 
 
-def test_an_ear_may_be_written_in_several_ways() -> None:
-    ear = hlsim.Audiogram.standard("N3")
-    levels, by_frequency = list(ear.levels), dict(zip(ear.frequencies, ear.levels, strict=True))
-    expected = hlsim.simulate(SPEECH, ear)
-    for other in ("N3", "n3", levels, np.array(levels), by_frequency):
-        assert torch.equal(hlsim.simulate(SPEECH, other), expected)
-
-
 def test_one_gain_calibrates_all_channels_of_a_file(tmp_path) -> None:
     left = SPEECH.numpy()
     stereo = np.stack([left, 0.1 * left], axis=1)
@@ -58,26 +49,6 @@ def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
     page = (tmp_path / "page.html").read_text()
     assert page.count("<audio controls") == page.count("<img") == 2
     assert "hlsim-player" in players._repr_html_()
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: hlsim.simulate((SPEECH * 32768).numpy().astype(np.int16), "N3"),
-        lambda: hlsim.simulate(SPEECH, "N9"),
-        lambda: hlsim.simulate("speech.wav", "N3"),
-        lambda: hlsim.simulate(hlsim.load_audio(EXAMPLE_FILE), "N3"),
-        lambda: hlsim.simulate(SPEECH, {"250 Hz": 20}),
-        lambda: hlsim.compensate(SPEECH, "N3", compensator="none"),
-        lambda: hlsim.load_audio("missing.wav"),
-        lambda: hlsim.listen(),
-        lambda: hlsim.listen(original=SPEECH, sample_rate="16000"),
-        lambda: hlsim.listen(batch=torch.stack([SPEECH, SPEECH, SPEECH])),
-    ],
-)
-def test_bad_input_is_rejected(call) -> None:
-    with pytest.raises(ValueError):
-        call()
 
 
 def test_info_names_the_versions_for_a_bug_report() -> None:
@@ -102,15 +73,6 @@ def test_all_modules_and_functions_have_the_same_default_rate() -> None:
                 defaults[name] = parameter.default
     assert {"MSBG", "NALR", "HearingLossLoss", "NeuroMSBG", "simulate"} <= defaults.keys()
     assert set(defaults.values()) == {16000}
-
-
-@pytest.mark.parametrize("process", [hlsim.simulate, hlsim.compensate])
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_samples_that_are_not_finite_are_rejected(process: Any, value: float) -> None:
-    speech = hlsim.example_speech()[:8000].clone()
-    speech[100] = value
-    with pytest.raises(ValueError, match="1 of 8000"):
-        process(speech, "N3")
 
 
 def test_a_stereo_file_can_be_played_beside_a_mono_one(tmp_path) -> None:

@@ -91,6 +91,16 @@ REJECTED: dict[str, tuple[Callable[[Path], object], str]] = {
     "samples as object": (lambda _: hlsim.simulate(np.array([None, 1.0]), "N3"), "floating-point"),
     "no samples": (lambda _: hlsim.simulate(None, "N3"), "expected a tensor or an array"),
     "16-bit integers": (lambda _: hlsim.simulate([1, 2], "N3"), "divide 16-bit samples by 32768"),
+    "path": (lambda path: hlsim.simulate(path, "N3"), "got the path .*load_audio"),
+    "samples with their rate": (
+        lambda path: hlsim.simulate(hlsim.load_audio(path), "N3"),  # type: ignore[type-var]
+        "got a tuple; write: speech, rate = hlsim.load_audio",
+    ),
+    "NaN": (lambda _: hlsim.compensate(SPEECH * torch.nan, "N3"), "NaN or infinity in 16000 of"),
+    "infinity": (lambda _: hlsim.simulate(SPEECH / 0.0, "N3"), "NaN or infinity in 1"),
+    "no player": (lambda _: hlsim.listen(), "pass signals by name"),
+    "a batch to play": (lambda _: hlsim.listen(batch=torch.ones(3, 99)), "got .3, 99. for 'batch'"),
+    "unknown aid": (lambda _: hlsim.compensate(SPEECH, "N3", compensator="none"), "'none'"),
     "URL": (lambda _: hlsim.load_audio("https://a.wav"), "there is no such audio file"),
     "rate as text": (lambda path: hlsim.load_audio(path, sample_rate="16000"), r"'16000' \(str\)"),
     "rate of 0": (lambda path: hlsim.load_audio(path, sample_rate=0), "got 0"),
