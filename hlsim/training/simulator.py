@@ -59,7 +59,6 @@ class SimulatorTraining(TrainingModule):
         perceived = perceived * scale
         weights = self.recipe.weights
         parts = {"snr": noise_to_signal_db(perceived, target) / 10.0}
-        self.log("snr", -10.0 * parts["snr"].mean(), prog_bar=True)
         if weights.get("log_spectrum"):
             parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
         if set(weights) - {"snr", "log_spectrum"}:

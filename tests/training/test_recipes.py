@@ -48,17 +48,14 @@ def test_python_yaml_and_the_command_line_agree(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.yaml")), ids=str)
 def test_every_example_is_a_recipe_that_states_its_steps(path: Path) -> None:
     pytest.importorskip("jsonargparse")
-    is_simulator = path.parent.name == "paper" or path.name.startswith(
-        ("neuro-msbg", "any-teacher")
-    )
-    is_simulator = is_simulator and path.name != "compensator.yaml"
-    recipe: Any = SimulatorRecipe if is_simulator else CompensatorRecipe
+    is_aid = path.name.startswith(("compensator", "hearing-aid"))
+    recipe: Any = CompensatorRecipe if is_aid else SimulatorRecipe
     assert f"\nsteps: {make_recipe(recipe, path, []).steps}" in path.read_text()
 
 
-@pytest.mark.parametrize("recipe", [SimulatorRecipe, CompensatorRecipe])
-def test_the_help_describes_every_setting(recipe: Any) -> None:
-    assert describe_settings(recipe).keys() >= {setting.name for setting in fields(recipe)}
+def test_the_help_describes_every_setting() -> None:
+    for recipe in (SimulatorRecipe, CompensatorRecipe):
+        assert describe_settings(recipe).keys() >= {setting.name for setting in fields(recipe)}
 
 
 @pytest.mark.parametrize(
@@ -68,10 +65,8 @@ def test_the_help_describes_every_setting(recipe: Any) -> None:
         (SimulatorRecipe, {"learning_rate": -1.0}),
         (SimulatorRecipe, {"weights": {"loudness": 1.0}}),
         (SimulatorRecipe, {"weights": {}}),
-        (SimulatorRecipe, {"weights": {"snr": -1.0}}),
         (SimulatorRecipe, {"average": 1.0}),
         (SimulatorRecipe, {"sounds": 1.1}),
-        (CompensatorRecipe, {"noisy": 1.5}),
         (CompensatorRecipe, {"weights": {"bands": 0.0}}),
         (CompensatorRecipe, {"weights": {"denoising": 1.0}}),  # There is no noise reduction.
         (CompensatorRecipe, {"unreduced": 0.5}),
