@@ -467,7 +467,7 @@ def comparison(pairs: int, decimals: int | None = None) -> Arrays:
     before, after = before_and_after(pairs)
     if decimals is not None:
         before, after = before.round(decimals), after.round(decimals)
-    result = statistics.paired_comparison(before, after).to_dict()
+    result = vars(statistics.paired_comparison(before, after))
     return {name: np.nan if value is None else float(value) for name, value in result.items()}
 
 

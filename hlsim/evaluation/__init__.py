@@ -4,12 +4,6 @@ from hlsim.evaluation.comparison import Comparison, compare
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.recordings import haspi_report
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.statistics import (
-    PairedComparison,
-    bootstrap_interval,
-    holm,
-    paired_comparison,
-)
 from hlsim.evaluation.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
 
@@ -20,12 +14,8 @@ __all__ = [
     "Evaluation",
     "Item",
     "Measure",
-    "PairedComparison",
     "ScoreStore",
-    "bootstrap_interval",
     "compare",
     "haspi_report",
-    "holm",
-    "paired_comparison",
     "run_study",
 ]

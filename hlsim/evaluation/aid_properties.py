@@ -225,25 +225,24 @@ def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, A
     """
     speech = set_level(speech, 65.0)
     noise = torch.randn(len(speech), generator=torch.Generator().manual_seed(0))
-    other, *quiet = (set_level(noise, level) for level in (65.0, *QUIET_LEVELS))
-
-    def process(signal: Tensor, ear: Audiogram) -> Tensor:
-        return _aid_outputs(aid, [signal], ear)[0]
-
+    quiet = torch.stack([set_level(noise, level) for level in QUIET_LEVELS])
     with one_thread():
         start = time.process_time()
-        samples = measure_look_ahead(process, ear, speech, other, CHANGE_POSITIONS)
-        aided = [process(signal, ear) for signal in quiet]
+        samples = measure_look_ahead(
+            lambda signal, ear: _aid_outputs(aid, [signal], ear)[0],
+            ear,
+            speech,
+            set_level(noise, 65.0),
+            CHANGE_POSITIONS,
+        )
+        aided = _aid_outputs(aid, quiet, ear)
         seconds = time.process_time() - start
-    gains = [
-        float(level_spl(after[_MIDDLE]) - level_spl(before[_MIDDLE]))
-        for after, before in zip(aided, quiet, strict=True)
-    ]
-    signals = 1 + len(CHANGE_POSITIONS) + len(quiet)
+    processed_seconds = (1 + len(CHANGE_POSITIONS) + len(quiet)) * len(speech) / NEURO_RATE
+    gains = level_spl(aided[:, _MIDDLE]) - level_spl(quiet[:, _MIDDLE])
     return {
         "look_ahead_ms": 1000.0 * samples / NEURO_RATE,
-        "quiet_gain_db": gains,
-        "cpu_ms": 1000.0 * seconds * NEURO_RATE / (signals * len(speech)),
+        "quiet_gain_db": gains.tolist(),
+        "cpu_ms": 1000.0 * seconds / processed_seconds,
     }
 
 

@@ -203,11 +203,12 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
         names: ``package.module:name`` or ``path/to/file.py:name`` of each function.
 
     Returns:
-        The enhancers, each under the name of its function, the part of its name after the colon.
+        The enhancers, each under the name of its function, the part of its name after the colon, or
+        under its whole name if another function has this name.
 
     Raises:
-        ValueError: An enhancer cannot be loaded, its output for speech is not a waveform or not
-            time-aligned, or two functions have the same name.
+        ValueError: An enhancer cannot be loaded, or its output for speech is not a waveform or not
+            time-aligned.
 
     >>> load_enhancers([])
     {}
@@ -218,10 +219,5 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
         enhancer = WaveformPlugin(name, "enhancer")
         enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
         label = name.rpartition(":")[2]
-        if label in enhancers:
-            raise ValueError(
-                f"two enhancers are called {label} ({enhancers[label].name} and {name}); rename "
-                "one of the functions, or leave one out"
-            )
-        enhancers[label] = enhancer
+        enhancers[name if label in enhancers else label] = enhancer
     return enhancers

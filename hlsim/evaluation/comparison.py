@@ -78,7 +78,9 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes, and ``verdict`` and ``limits`` as text, for ``report.json``."""
-        return asdict(self) | {"in_words": f"{self.verdict()} {self.limits()}"}
+        level_change = None if math.isnan(self.level_change) else self.level_change
+        words = f"{self.verdict()} {self.limits()}"
+        return asdict(self) | {"level_change": level_change, "in_words": words}
 
     def verdict(self, subject: str = "", rival: str = "") -> str:
         """Return a sentence that says which condition is better, with scores and p values.
@@ -210,15 +212,19 @@ def _adjust(
     comparisons: Sequence[Comparison], planned: Collection[PlannedComparison]
 ) -> list[Comparison]:
     """Mark the planned comparisons of a measure, and adjust the p values of all others."""
-    if len(comparisons) == 1:
-        return list(comparisons)
-    pairs = {(c.measure, c.before, c.after): c for c in comparisons}
-    family = [pair for pair in pairs if pair not in planned]
-    p_t, p_w = (holm(getattr(pairs[pair], name) for pair in family) for name in ("p_t", "p_w"))
-    adjusted = {pair: replace(c, planned=True) for pair, c in pairs.items()}
-    for pair, t, w in zip(family, p_t, p_w, strict=True):
-        adjusted[pair] = replace(pairs[pair], p_t=t, p_w=w, family=len(family))
-    return list(adjusted.values())
+    is_planned = [
+        len(comparisons) > 1 and (c.measure, c.before, c.after) in planned for c in comparisons
+    ]
+    family = [c for c, p in zip(comparisons, is_planned, strict=True) if not p]
+    p_t, p_w = iter(holm(c.p_t for c in family)), iter(holm(c.p_w for c in family))
+    adjusted = []
+    for comparison, p in zip(comparisons, is_planned, strict=True):
+        if p:
+            adjusted.append(replace(comparison, planned=True))
+        else:
+            changes = replace(comparison, p_t=next(p_t), p_w=next(p_w), family=len(family))
+            adjusted.append(changes)
+    return adjusted
 
 
 def _compare_pair(
@@ -235,15 +241,14 @@ def _compare_pair(
     first, second = (rows[measure].to_numpy(float) for rows in (first_rows, second_rows))
     level_change = math.nan
     if "level" in table:
-        levels = [math.fsum(rows["level"]) / len(rows) for rows in (first_rows, second_rows)]
-        level_change = levels[1] - levels[0]
-    by_severity = {}
-    for name in SEVERITIES:
-        chosen = first_rows.get("severity", np.array([])) == name
-        if chosen.any():
-            by_severity[name] = paired_comparison(first[chosen], second[chosen])
+        level_change = float((second_rows["level"] - first_rows["level"]).mean())
+    degrees, units = (np.array(first_rows.get(column, [])) for column in ("severity", unit))
+    by_severity = {
+        name: paired_comparison(first[degrees == name], second[degrees == name])
+        for name in SEVERITIES
+        if name in degrees
+    }
     overall = paired_comparison(first, second)
-    units = first_rows[unit].to_numpy() if unit in table else np.array([])
     return Comparison(
         measure=measure,
         before=before,

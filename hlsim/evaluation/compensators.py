@@ -172,23 +172,20 @@ def _make_conditions(
     conditions = [Condition(UNAIDED, Unaided(), kind="unaided")]
     for name, aid in aids.items():
         enhanced = [
-            Condition(f"{prefix} + {name}", Enhanced(enhancer, aid), "enhanced", name, [name])
+            Condition(f"{prefix} + {name}", Enhanced(enhancer, aid), "enhanced", name)
             for prefix, enhancer in enhancers.items()
         ]
         if name not in equalisers:
-            rivals = [UNAIDED] if name == NAL_R else [UNAIDED, NAL_R]
-            conditions += [Condition(name, aid, "prescription", rivals=rivals), *enhanced]
+            conditions += [Condition(name, aid, "prescription"), *enhanced]
             continue
         nal_r = AtLevelOf(aids[NAL_R], aid)
         equaliser = AtLevelOf(equalisers[name], aid)
-        same_level = [
+        conditions += [
             Condition(f"{NAL_R} at {name}'s level", nal_r, "same level", name),
             Condition(f"equaliser at {name}'s level", equaliser, "equaliser", name),
+            *enhanced,
+            Condition(name, aid),
         ]
-        rivals = [condition.name for condition in same_level] + [UNAIDED, NAL_R, COMPRESSION]
-        rivals += [condition.name for condition in conditions if condition.of == NAL_R]
-        rivals += [condition.name for condition in enhanced]
-        conditions += [*same_level, *enhanced, Condition(name, aid, "aid", rivals=rivals)]
     return conditions
 
 

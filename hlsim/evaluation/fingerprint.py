@@ -1,7 +1,7 @@
 """Fingerprints: hashes that show whether a stored score is still valid.
 
 A fingerprint covers everything that decides the outputs of a module: class names, settings and
-tensors. Source code is not read, so that moving a class or editing a comment invalidates nothing.
+tensors, and the version of hlsim. Source code is not read, so that editing it invalidates nothing.
 Authors of modules outside hlsim add an attribute ``fingerprint``, such as a version, and change it
 when the outputs change.
 """
@@ -11,18 +11,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 
 from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
-
-_HLSIM_PACKAGES = ("hlsim", "compensators")
-"""Packages whose classes include the version of hlsim in their fingerprints."""
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 """Attributes of every module, which say nothing about its outputs."""
@@ -50,16 +45,17 @@ def fingerprint(processing: Any) -> str | None:
         processing = processing.function
     stated = getattr(processing, "fingerprint", None)
     if stated is not None:
-        return value_hash(f"{_name(processing)} {stated}")
+        return value_hash([_name(processing), str(stated)])
     if not isinstance(processing, nn.Module):
         return None
     tensors = dict([*processing.named_parameters(), *processing.named_buffers()])
-    if not (_is_from_hlsim(type(processing)) or tensors or hasattr(processing, "config")):
+    is_from_hlsim = type(processing).__module__.startswith(("hlsim.", "compensators."))
+    if not (is_from_hlsim or tensors or hasattr(processing, "config")):
         return None
     modules = processing.named_modules()
     parts = {name: [_name(module), _public_attributes(module)] for name, module in modules}
     try:
-        return value_hash([parts, tensors])
+        return value_hash([__version__, parts, tensors])
     except TypeError:
         return None
 
@@ -90,15 +86,10 @@ def _public_attributes(module: nn.Module) -> dict[str, Any]:
     }
 
 
-def _is_from_hlsim(kind: Any) -> bool:
-    return kind.__module__.split(".")[0] in _HLSIM_PACKAGES
-
-
 def _name(thing: Any) -> str:
-    """Return the name of a function or of an object's class, with the version if it is hlsim's."""
+    """Return the name of a function, of a class, or of the class of another object."""
     kind = thing if hasattr(thing, "__qualname__") else type(thing)
-    version = f" of hlsim {__version__}" if _is_from_hlsim(kind) else ""
-    return f"{kind.__qualname__}{version}"
+    return str(kind.__qualname__)
 
 
 def _describe(value: Any) -> Any:
@@ -112,8 +103,6 @@ def _describe(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         samples = np.ascontiguousarray(value).tobytes()
         return [str(value.dtype), value.shape, hashlib.sha256(samples).hexdigest()]
-    if isinstance(value, Path | torch.dtype | torch.device):
-        return str(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return [_name(value), vars(value)]
     if hasattr(value, "__qualname__") and "<" not in value.__qualname__:

@@ -6,7 +6,7 @@ column of the study's table.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
-from hlsim.checks import loud_outputs
+from hlsim.checks import check_names, loud_outputs
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
@@ -31,6 +31,7 @@ from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
+from hlsim.version import __version__
 
 NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
@@ -62,30 +63,23 @@ MEASURES = {
 """The scores of ``--measures``, each under its name. Higher is better for all of them."""
 
 
-def find_measures(names: Iterable[str]) -> list[Measure]:
-    """Return the measures of some names, without duplicates.
+def find_measures(names: Sequence[str]) -> list[Measure]:
+    """Return the measures of some names.
 
     Args:
         names: Names in ``MEASURES``, or ``package.module:name`` of your own functions.
 
     Raises:
-        ValueError: There is no such measure, or no name at all.
+        ValueError: There is no such measure.
         MissingExtraError: pesq is not installed.
 
-    >>> [measure.name for measure in find_measures(["haspi", "hasqi", "haspi"])]
+    >>> [measure.name for measure in find_measures(["haspi", "hasqi"])]
     ['haspi', 'hasqi']
     """
-    unique = list(dict.fromkeys(names))
-    unknown = [name for name in unique if name not in MEASURES and ":" not in name]
-    if unknown or not unique:
-        problem = f"got {', '.join(unknown) or 'none'}"
-        raise ValueError(
-            f"expected measures among {', '.join(MEASURES)} or package.module:name, {problem}; "
-            "pass one or more of these"
-        )
-    if "pesq" in unique:
+    check_names([name for name in names if ":" not in name], MEASURES, "measures")
+    if "pesq" in names:
         require("pesq", "pesq")
-    return [MEASURES[name] if name in MEASURES else load_measure(name) for name in unique]
+    return [MEASURES[name] if name in MEASURES else load_measure(name) for name in names]
 
 
 class _PluginMeasure:
@@ -174,27 +168,24 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
     normal_input = item.once("normal input", lambda: perceive(item.signal, NORMAL, rate))
     perceived = perceive(output, item.ear, rate)
     peak = 20.0 * output.abs().max().clamp_min(1e-10).log10()
-    level = float(level_spl(perceived))
     return {
         "peak": float(peak) + PASCAL_SPL,
-        "loudness_error": level - float(level_spl(normal_input)),
-        "loudness_error_clean": level - float(level_spl(reference)),
+        "loudness_error": float(level_spl(perceived)) - float(level_spl(normal_input)),
         "band_error": _band_error_db(perceived, reference, rate),
         "loss_msbg": float(band_level_loss(perceived, reference, rate)),
     }
 
 
-PERCEPTION = Measure("perception", _measure_perception, packages=["hlsim"])
+PERCEPTION = Measure("perception", _measure_perception, settings=__version__)
 """Errors of an output as perceived through the exact MSBG, in dB, and its peak in dB SPL.
 
-``loudness_error`` and ``loudness_error_clean`` are the perceived level minus that of the input
-(with its noise) and of the clean speech for a normal ear. ``band_error`` and ``loss_msbg`` compare
-with the clean speech for a normal ear, by the median difference of levels in 24 bands, and by
-``HearingLossLoss(criterion="bands")``.
+``loudness_error`` is the perceived level minus that of the input, with its noise, for a normal ear.
+``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by the median
+difference of levels in 24 bands, and by ``HearingLossLoss(criterion="bands")``.
 """
 
 OTHER_COLUMNS = (
-    *("level", "clean_level", "full_scale_spl", "peak", "loudness_error", "loudness_error_clean"),
+    *("level", "clean_level", "full_scale_spl", "peak", "loudness_error"),
     *("band_error", "loss_msbg", "loss_neuro", "gap", "source"),
 )
 """Columns that the measures of hlsim return beside scores."""
@@ -218,7 +209,7 @@ def network_loss(simulator: nn.Module) -> Measure:
         perceived = simulator(output, item.ear)
         return {"loss_neuro": float(band_level_loss(perceived, reference, item.sample_rate))}
 
-    return Measure("network loss", compute, packages=["hlsim"], settings=fingerprint(simulator))
+    return Measure("network loss", compute, settings=fingerprint(simulator))
 
 
 def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:

@@ -16,10 +16,10 @@ and so on, in a column ``audiogram`` by its standard name, or in a second file b
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -35,6 +35,7 @@ from hlsim.evaluation.fingerprint import value_hash
 from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
+from hlsim.extras import require
 from hlsim.files import path_below, read_table, sha256
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class Recording:
     def digest(self, condition: str) -> str:
         """Return a hash of both files, the ear, the level and the seed, which decide all scores."""
         files = [sha256(self.clean), sha256(self._output_file(condition))]
-        level = [self.full_scale_spl if self.spl is None else None, self.spl]
+        level = [self.full_scale_spl, self.spl]
         return value_hash([files, level, self.ear, self.audiogram.thresholds, self.seed])
 
     def load(self) -> Item:
@@ -179,7 +180,7 @@ def haspi_report(
     audiograms: str | Path | None = None,
     manifest: str | Path | None = None,
     root: str | Path | None = None,
-    measures: Iterable[str] = ("haspi",),
+    measures: Sequence[str] = ("haspi",),
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,
@@ -266,7 +267,7 @@ def haspi_report(
 def score_recordings(
     recordings: Sequence[Recording],
     conditions: Sequence[Condition],
-    measures: Iterable[str],
+    measures: Sequence[str],
     *,
     baseline: str | None = None,
     better_ear: bool = False,
@@ -302,7 +303,14 @@ def score_recordings(
     ['unaided']
     """
     if better_ear:
-        _check_both_ears(recordings)
+        facts = require("pandas", "eval").DataFrame([recording.facts for recording in recordings])
+        ears = facts.groupby(_UTTERANCE_COLUMNS, dropna=False)["ear"].nunique()
+        if (ears < 2).any():
+            raise ValueError(
+                "expected one left and one right ear of each utterance for the better ear, but "
+                f"{_join_name(*ears.idxmin())} lacks one; add the missing rows, or leave out "
+                "better_ear (--better-ear)"
+            )
     settings = {"seed": recordings[0].seed, "baseline": baseline, "better_ear": better_ear}
     columns = [*find_measures(measures), LEVELS]
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
@@ -312,19 +320,6 @@ def score_recordings(
     planned = planned or [(scores[0], evaluation.names[0], evaluation.names[-1])]
     comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
     return replace(evaluation, comparisons=comparisons)
-
-
-def _check_both_ears(recordings: Iterable[Recording]) -> None:
-    """Raise ValueError unless each utterance of each listener has one left and one right ear."""
-    ears: dict[str, list[str]] = {}
-    for r in recordings:
-        ears.setdefault(_join_name(r.listener, r.utterance, r.snr), []).append(r.ear)
-    for name, names in ears.items():
-        if sorted(names) != [*EARS]:
-            raise ValueError(
-                f"expected one left and one right ear of {name} for the better ear, got "
-                f"{names}; add the missing rows, or leave out better_ear (--better-ear)"
-            )
 
 
 def _better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
@@ -416,21 +411,23 @@ def _read_manifest(
     """
     folder = Path(path).parent if root is None else Path(root)
     rows = read_table(path, "the manifest")
-    if "spl" in rows[0][1]:
-        raise ValueError(
-            f"{path}: expected no column spl, because all files have one level; remove it, and "
-            "pass the option --spl (spl in Python)"
-        )
     listeners: dict[str, Listener] = {}
     if audiograms is not None:
         listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})
-    recordings: dict[tuple[str, Path], Recording] = {}
+    recordings: dict[tuple[str, Path, Audiogram], Recording] = {}
     for line, row in rows:
         place = f"{path}, line {line}"
         recording = convert_at(place, _read_row, row, folder, listeners, audiogram, settings)
-        key = recording.name, recording.clean
-        if key in recordings:
-            recording = convert_at(place, _merge, recordings[key], recording)
+        key = recording.name, recording.clean, recording.audiogram
+        earlier = recordings.get(key)
+        if earlier is not None:
+            if row["condition"] in earlier.outputs:
+                raise ValueError(
+                    f"{place}: expected one row of {recording.name} under condition "
+                    f"{row['condition']}, got a second one; remove one of them, or give both "
+                    "different values in the column item"
+                )
+            recording = replace(recording, outputs={**earlier.outputs, **recording.outputs})
         recordings[key] = recording
     return list(recordings.values())
 
@@ -471,35 +468,13 @@ def _read_row(
             "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
             "ear"
         )
-    try:
-        snr = float(row.get("snr") or "nan")
-    except ValueError:
-        raise ValueError(
-            f"expected a number of dB in the column snr, got {row['snr']!r}; correct it, or leave "
-            "it empty"
-        ) from None
     return Recording(
-        utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
+        utterance=row.get("item") or str(Path(row["clean"]).with_suffix("")),
         clean=path_below(root, row["clean"]),
         outputs={row["condition"]: path_below(root, row["processed"])},
         audiogram=audiogram,
         listener=listener,
         ear=ear,
-        snr=snr,
+        snr=float(row.get("snr") or "nan"),
         **settings,
     )
-
-
-def _merge(recording: Recording, other: Recording) -> Recording:
-    """Return a recording with the output of another row of the same utterance and ear."""
-    for condition in recording.outputs.keys() & other.outputs:
-        raise ValueError(
-            f"expected one row of {recording.name} under condition {condition}, got a second one; "
-            "remove one of them, or give both different values in the column item"
-        )
-    if recording.audiogram != other.audiogram:
-        raise ValueError(
-            f"expected the audiogram of earlier rows of {recording.name}, "
-            f"{recording.audiogram}, got {other.audiogram}; write one audiogram in all its rows"
-        )
-    return replace(recording, outputs={**recording.outputs, **other.outputs})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +14,9 @@ import numpy as np
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import OTHER_COLUMNS
 from hlsim.evaluation.store import ScoreStore
-from hlsim.evaluation.study import Condition, Measure, Source, installed_versions, run_study
+from hlsim.evaluation.study import Condition, Measure, Source, run_study
 from hlsim.metrics.words import WordsChange, words_change
+from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -95,9 +97,10 @@ class Evaluation:
         """Names of the conditions."""
         return [condition.name for condition in self.conditions]
 
-    def of_kind(self, *kinds: str) -> list[str]:
-        """Return the names of the conditions with one of some kinds, such as ``"aid"``."""
-        return [condition.name for condition in self.conditions if condition.kind in kinds]
+    @property
+    def aids(self) -> list[str]:
+        """Names of the conditions that are compared with others, which are of the kind aid."""
+        return [condition.name for condition in self.conditions if condition.kind == "aid"]
 
     @property
     def scores(self) -> list[str]:
@@ -124,8 +127,9 @@ class Evaluation:
     @property
     def versions(self) -> dict[str, str]:
         """Installed versions of hlsim, of SciPy and of the packages that the measures use."""
-        packages = [package for measure in self.measures for package in measure.packages]
-        return installed_versions(["hlsim", *packages, "scipy"])
+        packages = {package for measure in self.measures for package in measure.packages}
+        versions = {package: metadata.version(package) for package in sorted(packages | {"scipy"})}
+        return {"hlsim": __version__, **versions}
 
     def wide(self, column: str) -> DataFrame:
         """Return a column of the table, such as ``"haspi"``, by item and condition.
@@ -152,13 +156,14 @@ class Evaluation:
         ``conditions``, ``comparisons``, ``groups`` with comparisons of parts of the items, the keys
         of ``details``, and ``rows``, one dictionary per row of ``table``.
         """
-        fields = ("name", "kind", "of", "rivals")
+        fields = ("name", "kind", "of")
         conditions = [{name: getattr(c, name) for name in fields} for c in self.conditions]
         groups = {
             name: [comparison.to_dict() for comparison in group.comparisons]
             for name, group in self.groups.items()
         }
-        values = {
+        rows = self.table.astype(object).where(self.table.notna(), None)
+        return {
             "settings": self.settings,
             "versions": self.versions,
             "notes": self.notes,
@@ -166,17 +171,8 @@ class Evaluation:
             "comparisons": [comparison.to_dict() for comparison in self.comparisons],
             "groups": groups,
             **self.details,
-            "rows": self.table.to_dict("records"),
+            "rows": rows.to_dict("records"),
         }
-        return {name: _without_nan(value) for name, value in values.items()}
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _without_nan(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(entry) for entry in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def predict_words(scores: Iterable[float]) -> float:

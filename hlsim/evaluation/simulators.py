@@ -27,6 +27,7 @@ from hlsim.extras import is_installed
 from hlsim.metrics import fidelity
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.teacher import PluginTeacher, find_teacher
+from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -120,20 +121,10 @@ def evaluate_simulators(
 
 
 def _teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
-    """Return the teacher's output for an item, which is computed once per item.
-
-    Args:
-        teacher: The teacher; None is the exact MSBG.
-        item: The item.
-    """
-
-    def compute() -> Tensor:
-        if teacher is None:
-            return perceive(item.signal, item.ear, item.sample_rate)
-        return teacher(item.signal[None], torch.tensor([item.ear.thresholds]))[0]
-
-    output: Tensor = item.once("teacher", compute)
-    return output
+    """Return the output of a teacher, or of the exact MSBG if it is None, for an item."""
+    if teacher is None:
+        return perceive(item.signal, item.ear, item.sample_rate)
+    return teacher(item.signal[None], torch.tensor([item.ear.thresholds]))[0]
 
 
 def _fidelity_to(teacher_name: str) -> Measure:
@@ -147,12 +138,14 @@ def _fidelity_to(teacher_name: str) -> Measure:
         teacher_name: Name of the teacher, see ``evaluate_simulators``.
     """
     teacher = find_teacher(teacher_name)
+    packages = ["pystoi"]
     scores = {"stoi": fidelity.stoi}
     if is_installed("pesq"):
+        packages.append("pesq")
         scores["pesq"] = fidelity.pesq_wb
 
     def compute(item: Item, output: Tensor) -> Values:
-        expected = _teacher_output(teacher, item)
+        expected = item.once("teacher", partial(_teacher_output, teacher, item))
         values = {
             "snr": fidelity.snr_db(expected, output),
             "raw_mse": fidelity.raw_mse(expected, output),
@@ -166,8 +159,7 @@ def _fidelity_to(teacher_name: str) -> Measure:
                 values |= {f"{name}_teacher": of_teacher, f"{name}_simulator": of_simulator}
         return values
 
-    settings = "msbg" if teacher is None else fingerprint(teacher.plugin)
-    packages = ["hlsim", "pystoi", "pesq"]
+    settings = f"msbg {__version__}" if teacher is None else fingerprint(teacher.plugin)
     return Measure("fidelity", compute, packages=packages, settings=settings)
 
 

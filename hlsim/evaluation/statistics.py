@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
 RESAMPLES = 9999
 """Number of bootstrap resamples."""
-
-_DRAWN_INDICES = 1_000_000
-"""Number of indices that the bootstrap draws at once, which limits its memory to about 16 MB."""
 
 MIN_ITEMS_FOR_INTERVAL = 6
 """Smallest number of items with an interval. With fewer, Wilcoxon's p cannot fall below 0.05."""
@@ -43,8 +40,8 @@ class PairedComparison:
             for up to 50 differences (13 if some share a rank), and a normal approximation with a
             correction for ties otherwise.
         cohens_d: ``delta`` over the standard deviation of the differences, which is t / sqrt(n).
-        ci_low, ci_high: 95 % interval of ``delta`` by ``bootstrap_interval`` with seed 0; None for
-            fewer than six items.
+        ci_low, ci_high: 95 % interval of ``delta`` by ``bootstrap_interval``; None for fewer than
+            six items.
 
     >>> paired_comparison([0.1, 0.2, 0.3], [0.2, 0.4, 0.3]).zeros
     1
@@ -62,12 +59,8 @@ class PairedComparison:
     w: float | None
     p_w: float | None
     cohens_d: float | None
-    ci_low: float | None = None
-    ci_high: float | None = None
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """Return a dictionary of the attributes' names and values."""
-        return asdict(self)
+    ci_low: float | None
+    ci_high: float | None
 
 
 def paired_comparison(before: Iterable[float], after: Iterable[float]) -> PairedComparison:
@@ -86,20 +79,13 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     0.1
     """
     first, second = (np.array(list(scores), dtype=np.float64) for scores in (before, after))
-    if not 0 < len(first) == len(second):
+    both = np.concatenate([first, second])
+    if not 0 < len(first) == len(second) or not np.isfinite(both).all():
         raise ValueError(
-            "expected scores of one or more items before and after, got "
-            f"{len(first)} before and {len(second)} after; pass both scores of each item"
+            f"expected two finite scores of each item, got {len(first)} before and {len(second)} "
+            "after, which may be NaN; leave items without a score out of both"
         )
-    for name, scores in (("before", first), ("after", second)):
-        if not np.isfinite(scores).all():
-            item = int(np.isfinite(scores).argmin())
-            raise ValueError(
-                f"expected finite scores {name}, got {scores[item]} for item {item}; leave the "
-                "item out of both"
-            )
-    largest = max(float(np.abs(first).max()), float(np.abs(second).max()))
-    tolerance = _RELATIVE_TOLERANCE * largest
+    tolerance = _RELATIVE_TOLERANCE * float(np.abs(both).max())
     difference = second - first
     difference = np.where(np.abs(difference) <= tolerance, 0.0, difference)
     n = len(first)
@@ -136,10 +122,8 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     )
 
 
-def bootstrap_interval(
-    values: Iterable[float], *, confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[float, float]:
-    """Compute an interval that contains the true mean of independent values with some confidence.
+def bootstrap_interval(values: Iterable[float]) -> tuple[float, float]:
+    """Compute a 95 % interval for the true mean of independent values.
 
     The limits are percentiles of the means of resamples (Efron 1979), expanded by Student's t
     (Hesterberg 2015, Am. Stat. 69), because plain percentiles are too narrow for few values. For
@@ -148,9 +132,6 @@ def bootstrap_interval(
 
     Args:
         values: Six values or more.
-        confidence: Probability that the interval contains the mean.
-        resamples: Number of bootstrap resamples.
-        seed: Seed of the resamples.
 
     Returns:
         The lower and the upper limit.
@@ -166,13 +147,10 @@ def bootstrap_interval(
     n = len(data)
     if n < MIN_ITEMS_FOR_INTERVAL:
         raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}; add items")
-    generator = np.random.default_rng(seed)
-    at_once = max(1, _DRAWN_INDICES // n)
-    sizes = [min(at_once, resamples - start) for start in range(0, resamples, at_once)]
-    means = [data[generator.integers(0, n, (size, n))].mean(-1) for size in sizes]
-    expanded = stats.t.ppf(0.5 + 0.5 * confidence, n - 1) * math.sqrt(n / (n - 1))
+    indices = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
+    expanded = stats.t.ppf(0.975, n - 1) * math.sqrt(n / (n - 1))
     tail = 100.0 * stats.norm.cdf(-expanded)
-    low, high = np.percentile(np.concatenate(means), [tail, 100.0 - tail])
+    low, high = np.percentile(data[indices].mean(-1), [tail, 100.0 - tail])
     return float(low), float(high)
 
 

@@ -8,8 +8,7 @@ measure scores the output. ``haspi-report``, ``evaluate-compensator``, ``evaluat
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
@@ -120,7 +119,6 @@ class Condition:
             ``Audiogram``; None if the outputs were recorded.
         kind: Role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
         of: Name of the condition to which this one belongs, such as the aid whose level it has.
-        rivals: Names of the conditions with which this one is compared, most important first.
 
     >>> Condition("unaided", lambda signal, ear: signal, "unaided").of
     ''
@@ -130,7 +128,6 @@ class Condition:
     process: Callable[[Tensor, Any], Tensor] | None = None
     kind: str = "aid"
     of: str = ""
-    rivals: Sequence[str] = ()
 
     @cached_property
     def fingerprint(self) -> str | None:
@@ -171,22 +168,7 @@ class Measure:
         """Fingerprint of everything that decides the values. If it is None, none is stored."""
         if self.settings is None:
             return None
-        return value_hash([installed_versions(self.packages), self.settings])
-
-
-def installed_versions(packages: Iterable[str]) -> dict[str, str]:
-    """Return the installed version of each package, or "not installed".
-
-    >>> installed_versions(["no-such-package"])
-    {'no-such-package': 'not installed'}
-    """
-    versions = {}
-    for package in packages:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = "not installed"
-    return versions
+        return value_hash([[metadata.version(name) for name in self.packages], self.settings])
 
 
 class _Task(NamedTuple):
@@ -218,7 +200,7 @@ def run_study(
         conditions: Conditions that process each item.
         measures: Measures that score each output.
         store: Scores of earlier runs, to which new scores are added. A score is computed again only
-            if samples, ear, condition or measure have changed.
+            if samples, ear, condition or measure have changed, or if a fingerprint is unknown.
         jobs: Number of processes; all cores by default.
         dask: Address of a Dask scheduler, whose workers replace the processes.
         progress: Function that is called with the numbers of finished scores and of all scores.
@@ -238,31 +220,18 @@ def run_study(
     >>> items = [Item("item 1", signal, signal, Audiogram.standard("N3"))]
     >>> conditions = [Condition("unaided", lambda signal, ear: signal)]
     >>> measures = [Measure("peak", lambda item, output: {"peak": float(output.abs().max())})]
-    >>> with warnings.catch_warnings(action="ignore"):  # a lambda has no fingerprint
-    ...     table = run_study(items, conditions, measures, jobs=1)
-    >>> table["peak"].tolist()
+    >>> run_study(items, conditions, measures, jobs=1)["peak"].tolist()
     [1.0]
     """
     pandas = require("pandas", "eval")
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
-    parts: list[Condition | Measure] = [*conditions, *measures]
-    unknown = [part.name for part in parts if part.fingerprint is None]
-    if unknown:
-        warnings.warn(
-            f"scores with {', '.join(unknown)} are not stored and will be computed again by the "
-            "next run; to store them, add an attribute fingerprint, such as a version, to the "
-            "object that computes them",
-            stacklevel=2,
-        )
     results: dict[tuple[int, str, str], Values | str] = {}
     tasks = []
     for number, source in enumerate(items):
         task = _Task(number, source, [])
         for condition in conditions:
-            digest = _digest(source, condition)
-            for measure in measures:
-                key = _key(digest, condition, measure)
+            for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
                 record = store.get(key)
                 if record is None:
                     task.missing.append((condition, measure, key))
@@ -284,17 +253,17 @@ def run_study(
     return table
 
 
-def _digest(source: Source, condition: Condition) -> str | None:
+def _keys(source: Source, condition: Condition, measures: Sequence[Measure]) -> list[str]:
+    """Return the key of the stored values of each measure, empty if they cannot be stored."""
     try:
-        return source.digest(condition.name)
+        digest = source.digest(condition.name)
     except (OSError, ValueError):  # Loading the item or its output fails for the same reason.
-        return None
-
-
-def _key(digest: str | None, condition: Condition, measure: Measure) -> str:
-    """Return the key of stored values, which is empty if they cannot be stored."""
-    parts = [digest, condition.fingerprint, measure.fingerprint]
-    return "" if None in parts else value_hash([*parts, measure.name])
+        return [""] * len(measures)
+    keys = []
+    for measure in measures:
+        parts = [digest, condition.fingerprint, measure.fingerprint]
+        keys.append("" if None in parts else value_hash([*parts, measure.name]))
+    return keys
 
 
 @one_thread()

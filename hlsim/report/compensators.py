@@ -38,7 +38,6 @@ _COLUMNS: Columns = {
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
     "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     "Mean absolute loudness error (dB)": (statistic("loudness_error", "mean absolute"), ".1f"),
-    "Loudness error against speech alone (dB)": (statistic("loudness_error_clean"), "+.1f"),
     "Band error (dB)": (statistic("band_error"), ".1f"),
 }
 """Columns beside the scores, by title."""
@@ -52,9 +51,8 @@ _GAP_COLUMNS: Columns = {
 
 _COLUMN_NOTES = (
     "The loudness error is the level that the impaired ear perceives after the exact MSBG minus "
-    "the level that a normal ear perceives of the same input. In noise that input contains the "
-    "noise, so that a further column compares with the speech alone. The band error is the "
-    "median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
+    "the level that a normal ear perceives of the same input, with its noise. The band error is "
+    "the median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
     "perceived by the impaired ear and, for clean speech, by a normal ear, both by the exact "
     "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0.",
     "The reference of HASQI is clean speech amplified by NAL-R, which is therefore its ceiling: "
@@ -105,11 +103,11 @@ def compensators_page(evaluation: Evaluation, listen: int = 3) -> Page:
         for c in group.comparisons
         if c.planned
     ]
-    aids = [condition for condition in evaluation.conditions if condition.kind == "aid"]
-    names = [aid.name for aid in aids]
+    names = evaluation.aids
+    same_level = [c.name for c in evaluation.conditions if c.kind == "same level"]
     tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in main.items()]
     about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE]
-    played = [UNAIDED, *aids[0].rivals[:1], *names]
+    played = [UNAIDED, same_level[0], *names]
     sections = [
         Section("Scores", about, tables),
         *listening_sections(next(iter(main.values())), listen, played),
@@ -154,9 +152,8 @@ def _details(evaluation: Evaluation) -> Section:
         if name == "hard":
             tables.insert(0, summary_table("All items", *_rows(group)))
         gaps = summary_table("Mean loss", split_rows(group.table), _GAP_COLUMNS)
-        rivals = {condition.name: condition.rivals for condition in group.conditions}
         tests = comparison_table(
-            [c for c in group.comparisons if c.before in rivals[c.after]],
+            [c for c in group.comparisons if c.after in group.aids],
             "All items; p adjusted by Holm within each measure but for a planned comparison",
         )
         inner_sections = [
@@ -175,7 +172,7 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
     curves = evaluation.details["gain_curves"]
     pictures = []
     for ear in dict.fromkeys(row["ear"] for row in curves):
-        for aid in [COMPRESSION, *evaluation.of_kind("aid")]:
+        for aid in [COMPRESSION, *evaluation.aids]:
             rows = [row for row in curves if row["ear"] == ear and row["aid"] in (NAL_R, aid)]
             pictures.append(gain_picture(f"{aid}, ear {ear}", rows, colours))
     return pictures

@@ -166,7 +166,7 @@ def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
     """
     planned = [c.verdict() for c in evaluation.comparisons if c.planned]
     verdict, *further_verdicts = planned or [f"No pair of aids could be compared with {NAL_R}."]
-    played = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
+    played = [UNAIDED, NAL_R, *evaluation.aids]
     texts = [*further_verdicts, _ABOUT_SCENES]
     tables, pictures = [_conditions_table(evaluation)], scores_pictures(evaluation)
     sections = [

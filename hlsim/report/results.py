@@ -189,7 +189,7 @@ def paired_table(caption: str, rows: Mapping[str, PairedComparison]) -> Table:
         caption: Caption of the table.
         rows: Comparisons, each under the label that begins its row.
 
-    >>> from hlsim.evaluation import paired_comparison
+    >>> from hlsim.evaluation.statistics import paired_comparison
     >>> paired_table("Ears", {"N3": paired_comparison([0.2, 0.4], [0.3, 0.5])}).rows[0][:2]
     ['N3', '2']
     """

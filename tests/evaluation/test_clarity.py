@@ -251,7 +251,7 @@ def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Ten
 
 
 @pytest.mark.usefixtures("quick_scores")
-@pytest.mark.filterwarnings("ignore:.*both are cut", "ignore:scores with")
+@pytest.mark.filterwarnings("ignore:.*both are cut")
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [

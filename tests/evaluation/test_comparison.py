@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation import Comparison, compare, holm, paired_comparison
+from hlsim.evaluation import Comparison, compare
+from hlsim.evaluation.statistics import holm, paired_comparison
 
 pandas = pytest.importorskip("pandas")
 

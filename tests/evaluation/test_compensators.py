@@ -60,10 +60,8 @@ def test_perception_is_that_of_the_exact_model_and_of_the_loss(
     losses = {"msbg": values["loss_msbg"]}
     losses[network] = network_loss(network).compute(item, output)["loss_neuro"]
     with torch.no_grad():
-        perceived = level_spl(MSBG(N3)(output))
-        for name, signal in (("loudness_error", noisy), ("loudness_error_clean", clean)):
-            error = perceived - level_spl(MSBG(NORMAL)(signal))
-            assert values[name] == pytest.approx(float(error), abs=1e-3)
+        error = level_spl(MSBG(N3)(output)) - level_spl(MSBG(NORMAL)(noisy))
+        assert values["loudness_error"] == pytest.approx(float(error), abs=1e-3)
         for simulator, loss in losses.items():
             expected = HearingLossLoss(N3, criterion="bands", simulator=simulator)(output, clean)
             assert loss == pytest.approx(float(expected), rel=1e-4)
@@ -112,15 +110,10 @@ def test_conditions_groups_and_page(
     assert "my_enhancer:half" in page.markdown() and page.html().count("<audio") == 4
 
 
-@pytest.mark.parametrize(
-    ("names", "message"), [(["late"], "delays by 20"), (["half", "half"], "two enhancers")]
-)
-def test_delayed_enhancers_and_equal_names_are_rejected(
-    tmp_path: Path, names: list[str], message: str
-) -> None:
+def test_a_delayed_enhancer_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "plugin.py").write_text(ENHANCERS)
-    with pytest.raises(ValueError, match=message):
-        load_enhancers([f"{tmp_path}/plugin.py:{name}" for name in names])
+    with pytest.raises(ValueError, match="delays by 20"):
+        load_enhancers([f"{tmp_path}/plugin.py:late"])
 
 
 def test_an_item_counts_only_if_every_condition_has_its_values(

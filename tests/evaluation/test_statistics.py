@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hlsim.evaluation import bootstrap_interval, holm, paired_comparison
-from hlsim.evaluation.statistics import MIN_ITEMS_FOR_INTERVAL
+from hlsim.evaluation.statistics import (
+    MIN_ITEMS_FOR_INTERVAL,
+    bootstrap_interval,
+    holm,
+    paired_comparison,
+)
 
 
 def draw(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -70,12 +74,8 @@ def test_interval_is_scipys_expanded(n: int) -> None:
 
 def test_intervals_of_few_values_contain_the_mean_as_often_as_stated() -> None:
     generator = np.random.default_rng(6)
-    intervals = [bootstrap_interval(generator.normal(size=8), resamples=999) for _ in range(400)]
+    intervals = [bootstrap_interval(generator.normal(size=8)) for _ in range(400)]
     hits = sum(low <= 0.0 <= high for low, high in intervals)
-    values = generator.normal(size=8)
-    wide, narrow = bootstrap_interval(values), bootstrap_interval(values, confidence=0.5)
-    assert wide[0] < narrow[0] < values.mean() < narrow[1] < wide[1]
-    assert bootstrap_interval(values, seed=1) != wide == bootstrap_interval(values)
     assert 0.91 < hits / 400 < 0.98  # plain percentiles: 0.88
 
 
@@ -131,7 +131,7 @@ SCORES = draw(12)[0].tolist()
 def test_undefined_values_are_none_and_never_nan(
     before: list[float], after: list[float], undefined: str
 ) -> None:
-    values = paired_comparison(before, after).to_dict()
+    values = vars(paired_comparison(before, after))
     assert [values[name] for name in undefined.split()] == [None] * len(undefined.split())
     assert json.loads(json.dumps(values, allow_nan=False)) == values
 
@@ -141,7 +141,7 @@ def test_undefined_values_are_none_and_never_nan(
     [([0.1, 0.2], [0.1]), ([], []), ([0.1, math.nan], [0.1, 0.2]), ([0.1, 0.2], [math.inf, 0.2])],
 )
 def test_invalid_scores_are_rejected(before: list[float], after: list[float]) -> None:
-    with pytest.raises(ValueError, match=r"expected (finite )?scores"):
+    with pytest.raises(ValueError, match="expected two finite scores"):
         paired_comparison(before, after)
     with pytest.raises(ValueError, match="expected 6 values or more"):
         bootstrap_interval(before)
