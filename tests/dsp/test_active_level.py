@@ -13,23 +13,10 @@ from hlsim.dsp.active_level import active_level_db
 Speech = list[tuple[Tensor, int]]
 
 
-def tone(seconds: float, rate: int = 16000) -> Tensor:
-    return torch.sin(2 * torch.pi * 400 * torch.arange(round(seconds * rate)) / rate)
-
-
 @pytest.mark.parametrize("rate", [16000, 48000])
 def test_a_steady_tone_is_active_throughout(rate: int) -> None:
-    assert active_level_db(tone(4.0, rate), rate) == pytest.approx(10 * math.log10(0.5), abs=0.05)
-
-
-@pytest.mark.parametrize("pause", [3.0, 6.0, 12.0])
-def test_pauses_do_not_count(pause: float) -> None:
-    """After each of four bursts of 1.5 s, only the hangover and the decay add samples."""
-    signal = torch.cat([tone(1.5), torch.zeros(round(16000 * pause))] * 4)
-    level = active_level_db(signal, 16000)
-    longest_activity = 1.5 + 0.2 + 0.15
-    assert 10 * math.log10(0.5 * 1.5 / longest_activity) < level < 10 * math.log10(0.5)
-    assert float(dbfs(signal)) < level - 3.0
+    tone = torch.sin(2 * torch.pi * 400 * torch.arange(4 * rate) / rate)
+    assert active_level_db(tone, rate) == pytest.approx(10 * math.log10(0.5), abs=0.05)
 
 
 def test_a_gain_changes_the_level_and_silence_hardly_does(speech: Speech) -> None:
@@ -52,7 +39,7 @@ def test_level_is_close_to_pyclaritys(speech: Speech) -> None:
         assert -0.5 < difference < 1.5
 
 
-@pytest.mark.parametrize("waveform", [np.zeros(100), np.zeros(0), np.ones((2, 100))])
-def test_silence_and_several_channels_are_rejected(waveform: np.ndarray) -> None:
-    with pytest.raises(ValueError):
-        active_level_db(waveform, 16000)
+def test_silence_and_several_channels_are_rejected() -> None:
+    for waveform in (np.zeros(100), np.zeros(0), np.ones((2, 100))):
+        with pytest.raises(ValueError):
+            active_level_db(waveform, 16000)

@@ -7,41 +7,27 @@ from torch import Tensor
 from hlsim.dsp.fft import power, rfft
 
 
-def gradient(output: Tensor, source: Tensor, weights: Tensor) -> Tensor:
-    return torch.autograd.grad(output, source, weights)[0]
+def assert_equal_gradients(ours: Tensor, theirs: Tensor, source: Tensor) -> None:
+    torch.testing.assert_close(ours, theirs)
+    weights = torch.randn_like(theirs)
+    gradients = [torch.autograd.grad(output, source, weights)[0] for output in (ours, theirs)]
+    torch.testing.assert_close(*gradients)
 
 
-@pytest.mark.parametrize("points", [1, 2, 4096, 4097, 12346])
+@pytest.mark.parametrize("points", [1, 2, 4096, 4097])
 @pytest.mark.parametrize("excess", [0, -100, 100])
 def test_rfft_and_its_gradient_equal_those_of_torch(points: int, excess: int) -> None:
     wave = torch.randn(3, max(1, points + excess), dtype=torch.float64, requires_grad=True)
-    ours, theirs = rfft(wave, points), torch.fft.rfft(wave, points)
-    torch.testing.assert_close(ours, theirs)
-    weights = torch.randn_like(theirs)
-    torch.testing.assert_close(gradient(ours, wave, weights), gradient(theirs, wave, weights))
+    assert_equal_gradients(rfft(wave, points), torch.fft.rfft(wave, points), wave)
 
 
 def test_power_and_its_gradient_equal_the_squared_modulus() -> None:
     spectrum = torch.randn(3, 20, dtype=torch.complex128, requires_grad=True)
-    ours, theirs = power(spectrum), spectrum.abs().square()
-    torch.testing.assert_close(ours, theirs)
-    weights = torch.randn_like(theirs)
-    slopes = [gradient(output, spectrum, weights) for output in (ours, theirs)]
-    torch.testing.assert_close(*slopes)
+    assert_equal_gradients(power(spectrum), spectrum.abs().square(), spectrum)
+    silence = torch.zeros(3, dtype=torch.complex128, requires_grad=True)
+    assert not bool(torch.autograd.grad(power(silence).sum(), silence)[0].any())
 
 
-@pytest.mark.parametrize("function", [rfft, power])
-def test_second_derivatives(function: torch.autograd.Function) -> None:
+def test_second_derivatives() -> None:
     source = torch.randn(2, 9, dtype=torch.float64, requires_grad=True)
-
-    def energy(signal: Tensor) -> Tensor:
-        spectrum = rfft(signal) if function is rfft else torch.fft.rfft(signal)
-        return power(spectrum) if function is power else spectrum
-
-    assert torch.autograd.gradgradcheck(energy, source)
-
-
-def test_the_gradient_of_the_power_of_silence_is_zero() -> None:
-    silence = torch.zeros(3, 5, dtype=torch.complex128, requires_grad=True)
-    weights = torch.ones(3, 5, dtype=torch.float64)
-    assert not bool(gradient(power(silence), silence, weights).any())
+    assert torch.autograd.gradgradcheck(lambda signal: power(rfft(signal)), source)

@@ -18,7 +18,3 @@ def test_outputs_of_all_blocks_make_up_the_signal(samples: int, unit: int) -> No
         assert block.input_start % unit == 0 and block.output_start % unit == 0
         assert block.output_start - block.input_start >= 20.5 or block.input_start == 0
         assert block.input_stop - block.output_stop >= 30 or block.input_stop == samples
-
-
-def test_a_hop_that_rounds_to_zero_gives_one_block() -> None:
-    assert split_into_blocks(1000, 6, 1, 1, unit=7) == [(0, 0, 1000, 1000)]

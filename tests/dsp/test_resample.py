@@ -1,4 +1,4 @@
-"""Resampling equals that of torchaudio and scipy, and its filter has the documented response."""
+"""Resampling equals that of torchaudio, and its filter has the documented response."""
 
 import itertools
 import math
@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import scipy.fft
-import scipy.signal
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -68,47 +67,18 @@ def test_equals_torchaudio(source: int, target: int, dtype: torch.dtype) -> None
 
 
 @pytest.mark.parametrize(("source", "target"), RATES)
-def test_equals_scipys_polyphase_filter_on_band_limited_noise(source: int, target: int) -> None:
-    low = scipy.signal.firwin(1001, 0.35 * min(source, target), fs=source)
-    noise = scipy.signal.lfilter(low, 1.0, np.random.default_rng(0).standard_normal(source // 2))
-    common = math.gcd(source, target)
-    up, down = target // common, source // common
-    taps = scipy.signal.firwin(
-        2 * 80 * max(up, down) + 1, 0.95 / max(up, down), window=("kaiser", 12.0)
-    )
-    theirs = scipy.signal.resample_poly(noise, up, down, window=taps)
-    ours = resample(torch.from_numpy(noise), source, target).numpy()
-    assert ours.shape == theirs.shape
-    middle = slice(1000, -1000)
-    error = np.sqrt(np.mean((ours - theirs)[middle] ** 2) / np.mean(theirs[middle] ** 2))
-    assert error < 1e-4
-
-
-@pytest.mark.parametrize(("source", "target"), RATES)
-@pytest.mark.parametrize("time", [1, 2, 159, 1601])
-def test_length_is_rounded_up_and_leading_dimensions_stay(
-    source: int, target: int, time: int
-) -> None:
-    waveform = torch.randn(3, 2, time).mT.contiguous().mT  # with gaps in memory
-    resampled = resample(waveform, source, target)
-    assert resampled.shape == (3, 2, math.ceil(time * target / source))
-    torch.testing.assert_close(resampled[1, 1], resample(waveform[1, 1], source, target))
-    assert resample(waveform, source, source) is waveform
+def test_length_is_rounded_up_and_leading_dimensions_stay(source: int, target: int) -> None:
+    for time in (1, 159, 1601):
+        waveform = torch.randn(3, 2, time).mT.contiguous().mT  # with gaps in memory
+        resampled = resample(waveform, source, target)
+        assert resampled.shape == (3, 2, math.ceil(time * target / source))
+        torch.testing.assert_close(resampled[1, 1], resample(waveform[1, 1], source, target))
 
 
 def test_resampling_is_differentiable() -> None:
     wave = torch.randn(2, 40, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda w: resample(w, 16000, 24000), wave)
     assert torch.autograd.gradcheck(lambda w: resample(w, 48000, 16000), wave)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
-def test_low_precision_is_as_close_as_its_type_allows(dtype: torch.dtype) -> None:
-    waveform = torch.randn(800).to(dtype)
-    resampled = resample(waveform, 44100, 16000)
-    assert resampled.dtype == dtype
-    expected = resample(waveform.float(), 44100, 16000)
-    assert float((resampled - expected).abs().max()) < 8 * torch.finfo(dtype).eps
 
 
 def test_resampling_compiles_to_one_graph() -> None:

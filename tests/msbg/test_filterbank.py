@@ -1,4 +1,4 @@
-"""The gammatone filter banks equal those of pyclarity's coefficients."""
+"""The filters of the ear and of the gammatone filter banks equal pyclarity's."""
 
 from typing import Any
 
@@ -8,9 +8,11 @@ import scipy.signal
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import MSBG_RATE
+from hlsim.dsp.fir import frequency_sampling_fir
+from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 
+msbg = pytest.importorskip("clarity.evaluator.msbg.msbg")
 msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 
@@ -54,3 +56,21 @@ def test_responses_equal_those_of_pyclaritys_coefficients(
             highpass = scipy.signal.freqz(theirs["HP_nums"][row], theirs["HP_denoms"][row], omega)
             response *= highpass[1]
         np.testing.assert_allclose(ours[i], response, atol=2e-7 * np.abs(response).max())
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_outer_and_middle_ear_filter_as_pyclarity(backward: bool) -> None:
+    noise = np.random.default_rng(0).standard_normal(5000)
+    correction = msbg.Ear.get_src_correction("ff")
+    theirs = msbg.Ear.src_to_cochlea_filt(noise, correction, 44100.0, backward)
+    ours = scipy.signal.lfilter(ear_filter(backward), 1.0, noise)
+    np.testing.assert_allclose(ours, theirs, atol=1e-12 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("taps", [141, 1015])
+def test_frequency_sampling_equals_pyclaritys_firwin2(taps: int) -> None:
+    frequencies = np.array([0.0, 0.02, 0.1, 0.101, 0.3, 0.55, 1.0])
+    gains = np.array([0.1, 1.0, 3.0, 2.5, 0.2, 1.7, 0.05])
+    ours = frequency_sampling_fir(taps, frequencies, gains, ("kaiser", 4.0))
+    theirs = msbg_utils.firwin2(taps, frequencies.copy(), gains.copy(), window=("kaiser", 4))
+    np.testing.assert_allclose(ours, theirs, atol=1e-14)

@@ -17,7 +17,7 @@ from hlsim import Listener
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.msbg import MSBG
+from hlsim.msbg import MSBG, estimate_delay
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
 from hlsim.msbg.overlapping_blocks import block_bounds
 from hlsim.msbg.smearing import HOP
@@ -127,11 +127,8 @@ def test_ears_at_other_frequencies_may_share_a_batch(speech: Speech) -> None:
     for wave, ear, perceived in zip(waves, ears, expected, strict=True):
         torch.testing.assert_close(perceived, fast_model(ear)(wave), rtol=1e-4, atol=1e-6)
     pairs = [Listener(six, "N3"), Listener(mild, six)]
-    binaural = waves.reshape(2, 2, -1)
-    for perceived in (fast_model()(binaural, pairs), fast_model(pairs)(binaural)):
-        torch.testing.assert_close(perceived.flatten(0, 1), expected, rtol=1e-4, atol=1e-6)
-    mono = fast_model()(waves.unsqueeze(1), ears)
-    torch.testing.assert_close(mono[:, 0], expected, rtol=1e-4, atol=1e-6)
+    perceived = fast_model(pairs)(waves.reshape(2, 2, -1))
+    torch.testing.assert_close(perceived.flatten(0, 1), expected, rtol=1e-4, atol=1e-6)
     assert relative_error(fast_model(six.thresholds)(waves[0]).numpy(), expected[0].numpy()) > 0.1
 
 
@@ -244,17 +241,12 @@ def test_a_mixed_batch_equals_its_items(speech: Speech, options: dict[str, Any])
 def test_ears_and_waveforms_broadcast(speech: Speech) -> None:
     wave = speech_at(speech, seconds=0.1)
     ears = ears_of_all_severities(4)
-    model = fast_model()
+    model = fast_model("S1")  # The audiogram of the call replaces the stored one.
     output_per_ear = model(wave, ears)
     assert output_per_ear.shape == (4, len(wave))
-    sequence = [Audiogram(tuple(levels)) for levels in ears.tolist()]
-    torch.testing.assert_close(model(wave.expand(4, -1), sequence), output_per_ear)
+    torch.testing.assert_close(model(wave.expand(4, -1), list(EARS.values())), output_per_ear)
     grid = model(wave.expand(2, 4, -1), ears)
     torch.testing.assert_close(grid, output_per_ear.expand(2, 4, -1))
-    single_ear = model(wave.expand(3, 2, -1), sequence[2])
-    torch.testing.assert_close(single_ear, output_per_ear[2].expand(3, 2, -1))
-    # The audiogram of the call replaces the stored one.
-    torch.testing.assert_close(fast_model("S1")(wave, ears), output_per_ear)
 
 
 @pytest.mark.parametrize("severity", EARS)
@@ -293,20 +285,6 @@ def test_without_a_loss_the_model_is_linear_and_keeps_the_level(speech: Speech) 
     assert abs(float(level_spl(model(wave)) - level_spl(wave))) < 2.0
 
 
-@pytest.mark.parametrize("severity", EARS)
-@pytest.mark.parametrize("hops", [1, 7])
-def test_a_shift_of_the_input_by_whole_hops_shifts_the_output(
-    speech: Speech, severity: str, hops: int
-) -> None:
-    """The input begins with silence, because the first frames of the smearing are irregular."""
-    wave = torch.cat((torch.zeros(512), speech_at(speech, seconds=0.3), torch.zeros(3000)))
-    model = fast_model(Audiogram.standard(EARS[severity]))
-    shift = 64 * hops
-    expected, shifted = model(torch.stack((wave, wave.roll(shift))))
-    inner = slice(1000, -shift)
-    assert relative_error(shifted.roll(-shift)[inner].numpy(), expected[inner].numpy()) < 1e-4
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("rate", [16000, 44100])
 def test_silence_gives_silence_with_finite_gradients(rate: int, dtype: torch.dtype) -> None:
@@ -342,35 +320,28 @@ def test_an_audiogram_can_be_trained() -> None:
     assert ear.grad is not None and bool(ear.grad.any())
 
 
-BAD_CALLS: list[tuple[Any, Any]] = [
-    (torch.zeros(100), None),
-    (torch.zeros(100), torch.full((8,), 100.5)),
-    (torch.zeros(100), torch.full((8,), -11.0)),
-    (torch.zeros(100), "N7"),
-    (torch.zeros(100), torch.full((8,), math.nan)),
-    (torch.zeros(100), torch.zeros(7)),
-    (torch.zeros(100), 3),
-    (torch.zeros(100, dtype=torch.int16), "N3"),
-    (torch.zeros(2, 0), "N3"),
-    (torch.tensor(1.0), "N3"),
-    (torch.zeros(3, 100), torch.zeros(2, 8)),
-    (torch.zeros(3, 100), ["N3", "N3"]),
+BAD_CALLS: list[tuple[Any, Any, str]] = [
+    (torch.zeros(100), None, "expected an audiogram"),
+    (torch.zeros(100), torch.full((8,), 100.5), "100"),
+    (torch.zeros(100), "N7", "100"),
+    (torch.zeros(100), torch.zeros(7), "shape"),
+    (torch.zeros(100, dtype=torch.int16), "N3", "floating-point"),
+    (torch.zeros(2, 0), "N3", "at least one sample"),
+    (torch.zeros(3, 100), torch.zeros(2, 8), "do not fit"),
 ]
-BAD_SETTINGS: dict[str, list[Any]] = {
-    "sample_rate": [8000, 96000],
-    "full_scale_spl": [-1.0, math.nan],
-    "audiogram": ["N7", torch.zeros(7), Audiogram((20, 40, 110), (500, 4000, 14000))],
-}
+BAD_SETTINGS: list[tuple[str, Any]] = [
+    *(("sample_rate", 8000), ("sample_rate", 96000), ("full_scale_spl", math.nan)),
+    *(("audiogram", "N7"), ("audiogram", Audiogram((20, 40, 110), (500, 4000, 14000)))),
+]
 
 
 def test_bad_calls_and_settings_raise_value_error() -> None:
-    for wave, audiogram in BAD_CALLS:
-        with pytest.raises(ValueError):
+    for wave, audiogram, words in BAD_CALLS:
+        with pytest.raises(ValueError, match=words):
             fast_model()(wave, audiogram)
-    for name, values in BAD_SETTINGS.items():
-        for value in values:
-            with pytest.raises(ValueError):
-                MSBG(**{name: value})
+    for name, value in BAD_SETTINGS:
+        with pytest.raises(ValueError):
+            MSBG(**{name: value})
     with pytest.raises(ValueError):
         fast_model().delay("Severe")
 
@@ -387,78 +358,50 @@ def test_the_number_of_threads_changes_only_rounding(rate: int, items: int) -> N
     assert relative_error(output.numpy(), expected.numpy()) <= (5e-6 if items == 1 else 0.0)
 
 
-BLOCK_BOUNDS = "hlsim.msbg.overlapping_blocks.block_bounds"
-
-
-def one_block(samples: int, _: int) -> list[tuple[int, int, int, int]]:
-    return [(0, 0, samples, samples)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rate", [16000, 44100])
-@pytest.mark.parametrize("aligned", [True, False])
-def test_processing_in_blocks_equals_processing_at_once(
+@pytest.mark.parametrize(("rate", "aligned"), [(16000, True), (44100, False)])
+def test_blocks_give_the_output_and_the_gradient_of_the_whole(
     monkeypatch: pytest.MonkeyPatch, rate: int, aligned: bool
 ) -> None:
-    samples = 14 * rate
-    time = torch.arange(samples) / rate
+    time = torch.arange(14 * rate) / rate
     # White noise with the rhythm of syllables. It has double precision, because the rounding of
     # single precision depends on the FFT grid and amounts to 1e-5.
-    noise = torch.randn(samples, dtype=torch.float64)
+    noise = torch.randn(len(time), dtype=torch.float64)
     wave = set_level(noise * (8.0 * torch.pi * time).sin().clamp_min(0.02), 65.0)
-    model = MSBG(Audiogram.standard("N2"), sample_rate=rate, aligned=aligned)
-    with torch.no_grad():
-        output = model(wave)
-        assert len(block_bounds(samples, rate)) == 2
-        monkeypatch.setattr(BLOCK_BOUNDS, one_block)
-        expected = model(wave)
+    wave.requires_grad_()
+    model = MSBG("N2", sample_rate=rate, aligned=aligned)
+    assert len(block_bounds(len(wave), rate)) == 2
+    output = model(wave)
+    (gradient,) = torch.autograd.grad(output.square().sum(), wave)
+    if aligned:
+        slope = torch.func.grad(lambda signal: model(signal).square().sum())(wave.detach())
+        torch.testing.assert_close(slope, gradient)
+    monkeypatch.setattr("hlsim.msbg.overlapping_blocks._BLOCK_SECONDS", 100.0)
+    expected = model(wave)
+    (expected_gradient,) = torch.autograd.grad(expected.square().sum(), wave)
     assert output.shape == expected.shape
-    assert relative_error(output.numpy(), expected.numpy()) < 1e-5
+    assert relative_error(output.detach().numpy(), expected.detach().numpy()) < 1e-5
+    assert relative_error(gradient.numpy(), expected_gradient.numpy()) < 1e-4
 
 
-@pytest.mark.parametrize("aligned", [True, False])
-def test_gradients_through_blocks_equal_those_at_once(
-    monkeypatch: pytest.MonkeyPatch, aligned: bool
-) -> None:
-    monkeypatch.setattr("hlsim.msbg.overlapping_blocks._BLOCK_SECONDS", 1.0)
-    wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
-    model = fast_model(Audiogram.standard("N3"), aligned=aligned)
-    assert len(block_bounds(wave.shape[-1], RATE)) > 1
-    gradients = []
-    for _ in range(2):
-        leaf = wave.clone().requires_grad_()
-        model(leaf).square().sum().backward()
-        assert leaf.grad is not None
-        gradients.append(leaf.grad.numpy())
-        if aligned:
-            slope = torch.func.grad(lambda signal: model(signal).square().sum())(wave)
-            torch.testing.assert_close(slope, leaf.grad)
-        monkeypatch.setattr(BLOCK_BOUNDS, one_block)
-    assert relative_error(gradients[0], gradients[1]) < 1e-4
+def impulse_delay_of_reference(ear: Audiogram) -> int:
+    impulse = np.zeros(44100)
+    impulse[22050] = 1.0
+    return int(np.abs(msbg(ear, impulse)).argmax()) - 22050
 
 
-@pytest.mark.parametrize("rate", [16000, 17000, 18000, 20000])
-# These are the slightest losses of each bank, at which its skirts matter most.
-@pytest.mark.parametrize(("level", "error"), [(16.0, 1e-3), (36.0, 2.5e-3), (57.0, 6e-3)])
-def test_half_the_rate_inside_changes_the_output_little(
-    monkeypatch: pytest.MonkeyPatch, rate: int, level: float, error: float
-) -> None:
-    noise = 0.02 * torch.randn(1, rate // 2, dtype=torch.float64)
-    spectrum = torch.fft.rfft(noise)
-    spectrum[:, : spectrum.shape[-1] * 88 // 100] = 0.0
-    ear, model = torch.full((8,), level, dtype=torch.float64), MSBG(sample_rate=rate)
-    for signal in (noise, torch.fft.irfft(spectrum, rate // 2))[: 1 if rate == 16000 else 2]:
-        monkeypatch.undo()
-        output = model(signal, ear)
-        monkeypatch.setattr("hlsim.msbg.model._HALF_RATE_HZ", 0)
-        expected = model(signal, ear)
-        assert 0.0 < float((output - expected).norm()) < error * float(expected.norm())
+def test_impulse_method_gives_pyclaritys_delay(pyclarity: PyclarityOutputs) -> None:
+    for name in ("NH", "N2", "S1"):
+        ear = Audiogram.standard(name)
+        expected = pyclarity(f"delay of {name}", impulse_delay_of_reference, ear)
+        assert estimate_delay(reference_model(ear), level=120.0) == expected
+        # The range is that of pyclarity's delays with any smearing.
+        assert name == "NH" or 1170 <= expected <= 1280
 
 
-@pytest.mark.parametrize("rate", [16000, 16001, 44100])
-@pytest.mark.parametrize("ears", [["N3"], ["N1", "N3"], ["NH", "NH"]])
-def test_outputs_share_no_memory_with_larger_tensors(rate: int, ears: list[str]) -> None:
-    model = MSBG([Audiogram.standard(name) for name in ears], sample_rate=rate)
-    output = model(0.01 * torch.randn(len(ears), 400))
-    assert output.is_contiguous()
-    assert output.untyped_storage().nbytes() == output.nbytes
+def test_one_ear_may_have_any_shape_and_several_are_rejected() -> None:
+    ear = Audiogram.standard("N2")
+    simulator = MSBG(aligned=False)
+    delay = estimate_delay(simulator, ear)
+    assert estimate_delay(simulator, torch.tensor([[ear.thresholds]])) == delay
+    with pytest.raises(ValueError, match="one ear"):
+        estimate_delay(simulator, [ear, ear])

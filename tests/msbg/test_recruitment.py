@@ -1,6 +1,5 @@
 """Expansion ratios and gains equal those of pyclarity's functions."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import gain_to_pascals
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
-from hlsim.msbg.filterbank import BANKS, FilterBank
+from hlsim.msbg.envelope import STEP
+from hlsim.msbg.filterbank import BANKS
 from hlsim.msbg.recruitment import (
     CATCH_UP_SPL,
     expand,
@@ -73,12 +72,10 @@ def test_expansion_ratios_are_exact_where_matrix_products_are_rounded() -> None:
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
-def test_recruitment_equals_pyclaritys(
-    name: str, band_noise: Callable[[FilterBank, int], np.ndarray]
-) -> None:
+def test_recruitment_equals_pyclaritys(name: str) -> None:
     """Our gains follow every 24th value of the envelopes that pyclarity computes."""
     bank = BANKS[name]
-    channels = band_noise(bank, TIME)
+    channels = 0.03 * np.random.default_rng(1).standard_normal((bank.channels, TIME))
     bandwidths = erb(np.array(bank.centre_frequencies))
     envelopes = np.maximum(cochlea.compute_envelope(channels, bandwidths, MSBG_RATE), 1e-7)
     levels = torch.linspace(20.0, 70.0, 8, dtype=torch.float64)
@@ -109,32 +106,15 @@ def test_limits_of_the_envelope_equal_pyclaritys(level: float) -> None:
     np.testing.assert_allclose(ours.numpy(), theirs, rtol=1e-9, atol=1e-12)
 
 
-def test_gradients_are_exact() -> None:
-    bank = BANKS["severe"]
-    channels = torch.randn(bank.channels, 4 * STEP, dtype=torch.float64, requires_grad=True)
-    response = torch.from_numpy(envelope_lowpass(bank, 4 * STEP))
-    ratios = torch.linspace(1.0, 4.0, bank.channels, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda c, r: expand(c, envelope(c, response), r), (channels, ratios), fast_mode=True
-    )
-
-
-@pytest.mark.parametrize("steps", [16, 21, 40])
-@pytest.mark.parametrize("samples", [3, 5, 6, 24])
-@pytest.mark.parametrize("steps_per_window", [5, 8])
-def test_interpolation_is_exact_for_polynomials_of_fifth_order(
-    steps: int, samples: int, steps_per_window: int
-) -> None:
-    coefficients = torch.randn(6, dtype=torch.float64)
-
-    def polynomial(position: Tensor) -> Tensor:
-        x = ((position - steps / 2) / steps).unsqueeze(-1)
-        return (coefficients * x ** torch.arange(6)).sum(-1)
-
-    values = polynomial(torch.arange(steps, dtype=torch.float64))[None]
-    kernel = torch.from_numpy(interpolation_kernel(samples, steps_per_window=steps_per_window))
-    interpolated = interpolate(values, kernel)[0]
-    expected = polynomial(torch.arange(steps * samples, dtype=torch.float64) / samples)
-    # The polynomial is not periodic, so that the values at the ends differ.
-    inner = slice(2 * samples, (steps - 3) * samples)
-    torch.testing.assert_close(interpolated[inner], expected[inner])
+@pytest.mark.parametrize("samples", [3, 24])
+@pytest.mark.parametrize("steps", [16, 21])
+def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, samples: int) -> None:
+    coefficients = np.random.default_rng(0).standard_normal(6)
+    position = np.arange(steps * samples) / samples / steps - 0.5
+    expected = torch.from_numpy(np.polynomial.Polynomial(coefficients)(position))
+    for steps_per_window in (5, 8):
+        kernel = torch.from_numpy(interpolation_kernel(samples, steps_per_window=steps_per_window))
+        interpolated = interpolate(expected[None, ::samples], kernel)[0]
+        # The polynomial is not periodic, so that the values at the ends differ.
+        inner = slice(2 * samples, (steps - 3) * samples)
+        torch.testing.assert_close(interpolated[inner], expected[inner])

@@ -59,20 +59,14 @@ def test_normal_speech_gets_the_phase_of_the_impaired_bank(utterance: Tensor) ->
     assert torch.equal(apply_bank_phase(normal, thresholds("NH"), 16000, normal=True), normal)
 
 
-@pytest.mark.parametrize("rate", [16000, 44100])
-def test_magnitude_is_unchanged(rate: int) -> None:
-    noise = torch.randn(1, rate, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    noise[:, : rate // 4] = noise[:, -rate // 4 :] = 0.0
-    for name in EARS:
-        shifted = apply_bank_phase(noise, thresholds(name), rate)
-        before = torch.fft.rfft(noise).abs()[0, 150:7500]
-        after = torch.fft.rfft(shifted).abs()[0, 150:7500]
-        assert float((after - before).norm() / before.norm()) < 0.02
-
-
-def test_each_item_has_the_phase_of_its_ear(utterance: Tensor) -> None:
+def test_magnitude_is_unchanged_and_each_item_has_the_phase_of_its_ear() -> None:
+    noise = torch.randn(1, 16000, dtype=torch.float64)
+    noise[:, :4000] = noise[:, -4000:] = 0.0
     ears = torch.cat([thresholds(name) for name in EARS])
-    batch = apply_bank_phase(utterance.expand(4, -1), ears, 16000)
-    items = torch.cat([apply_bank_phase(utterance, ear[None], 16000) for ear in ears])
-    torch.testing.assert_close(batch, items)
-    assert cosine(batch[0], batch[2]) < 0.9
+    shifted = apply_bank_phase(noise.expand(4, -1), ears, 16000)
+    items = torch.cat([apply_bank_phase(noise, ear[None], 16000) for ear in ears])
+    torch.testing.assert_close(shifted, items)
+    assert cosine(shifted[0], shifted[2]) < 0.9
+    before = torch.fft.rfft(noise).abs()[..., 150:7500]
+    after = torch.fft.rfft(shifted).abs()[..., 150:7500]
+    assert float((after - before).norm(dim=-1).max() / before.norm()) < 0.02
