@@ -103,14 +103,12 @@ def test_host_trains_without_the_simulator(simulator: str, clean: Tensor) -> Non
         assert bool(parameter.grad.isfinite().all()) and bool(parameter.grad.any())
 
 
-def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
-    expected = HearingLossLoss(N3)(2.0 * clean, clean)
+def test_simulator_by_folder_and_as_a_module() -> None:
     model = load_pretrained("neuro-msbg").train().requires_grad_(True)
     for simulator in (Path("neuro-msbg"), str(checkpoints_folder() / "neuro-msbg"), model):
         loss = HearingLossLoss(N3, simulator=simulator)
-        close(loss(2.0 * clean, clean), expected)
-    assert loss.simulator is model and not model.training
-    assert not any(parameter.requires_grad for parameter in model.parameters())
+        assert isinstance(loss.simulator, NeuroMSBG) and not loss.simulator.training
+    assert loss.simulator is model and not next(model.parameters()).requires_grad
 
 
 @each_simulator
@@ -188,20 +186,6 @@ def test_checkpoint_stores_less_and_changes_no_bit(
 # Ears, items and lengths
 
 
-def test_batch_is_the_mean_of_its_items(options: Options, clean: Tensor) -> None:
-    # In float32, the phase and the level of inaudible bands are rounding: up to 3e-5 of the value.
-    loss = HearingLossLoss(**options).double()
-    signals = torch.cat((clean, 4.0 * clean.flip(-1))).double()
-    aided = 3.0 * signals + 1e-4 * torch.randn(signals.shape)
-    ears = torch.tensor([ear.thresholds for ear in (N3, S2, N4, NH)])
-    values = [loss(aided[i], signals[i], ears[i]) for i in range(4)]
-    mean = float(torch.stack(values).mean())
-    assert float(loss(aided, signals, ears)) == pytest.approx(mean, rel=1e-9)
-    shape = (2, 2, -1)
-    folded = loss(aided.reshape(shape), signals.reshape(shape), ears.reshape(shape))
-    assert float(folded) == pytest.approx(mean, rel=1e-5)
-
-
 @each_simulator
 def test_ear_of_a_call_can_be_trained(simulator: str, clean: Tensor) -> None:
     ear = nn.Parameter(torch.tensor(N3.thresholds))
@@ -220,6 +204,8 @@ def test_ears_of_the_call_replace_those_of_the_constructor_and_pair_with_items()
     close(loss(speech, speech, ears), expected)
     levels = torch.tensor([ear.thresholds for ear in ears])
     close(loss(speech, speech, levels[:, None]), expected)
+    shape = (2, 1, 1, 2000)
+    close(loss(speech.view(shape), speech.view(shape), levels[:, None, None]), expected)
     assert bool(loss(speech[0, 0], speech[0, 0], ears).isfinite())  # one item and several ears
 
 
@@ -245,9 +231,9 @@ def test_samples_after_the_end_do_not_count(options: Options, clean: Tensor) -> 
     after[1, 3000:] = 1.0
     expected = compute(loss, 3.0 * clean, clean, None, [4800, 3000])
     assert not bool(expected[1][1, 3000:].any()) and bool(expected[1][1, :3000].any())
-    result = compute(loss, 3.0 * clean + after, clean - after, None, torch.tensor([1.0, 0.625]))
+    result = compute(loss, 3.0 * clean + after, clean - after, None, torch.tensor([4800, 3000]))
     assert torch.equal(result[0], expected[0]) and torch.equal(result[1], expected[1])
-    mono = loss(3.0 * clean[:, None], clean[:, None], lengths=torch.tensor([1.0, 0.625]))
+    mono = loss(3.0 * clean[:, None], clean[:, None], lengths=[4800, 3000])
     close(mono, expected[0])
     values = HearingLossLoss([N3, S2], **options, reduction="none")
     assert values(clean[0], clean[0], lengths=4000).shape == (2,)  # one clip in two ears
@@ -370,14 +356,6 @@ def test_simulator_has_a_normal_ear(clean: Tensor) -> None:
     assert float(loss(clean, clean)) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_normal_ear_has_no_loss(options: Options, clean: Tensor) -> None:
-    loss = HearingLossLoss(NH, **options, reference="normal-hearing")
-    # The default's normal ear is a filter, accurate to 69 dB for MSBG and 55 dB for the network.
-    assert float(loss(clean, clean)) < (1e-3 if options["criterion"] == "coherent-bands" else 1e-5)
-    if options["criterion"] == "bands":  # MSBG is linear at 0 dB HL
-        assert float(loss(clean * 10.0**0.5, clean)) == pytest.approx(10.0, abs=0.1)
-
-
 # Orders of degradations
 
 
@@ -400,11 +378,9 @@ def test_speech_is_closer_than_inverted_speech_and_silence(
 @pytest.mark.parametrize("ear", ["N2", "N4", "S2"])
 def test_less_noise_costs_less(simulator: str, ear: str, clean: Tensor) -> None:
     """Without an aid, too, where noise fills the bands that are too soft."""
-    loss, noisy = (
-        HearingLossLoss(ear, simulator=simulator),
-        [add_noise(clean, snr) for snr in (100.0, 20.0, 10.0, 0.0, -5.0)],
-    )
+    loss = HearingLossLoss(ear, simulator=simulator)
     for aid in (nn.Identity(), NALR(ear)):
+        noisy = [add_noise(clean, snr) for snr in (100.0, 20.0, 10.0, 0.0, -5.0)]
         costs = [float(loss(aid(signal), clean)) for signal in noisy]
         assert costs == sorted(costs) and costs[0] < costs[1]
 
@@ -463,18 +439,6 @@ def test_pauses_do_not_dominate_the_gradient(
     assert float(speech) > 0.0 and float(pause) < 0.1 * float(speech)
 
 
-@pytest.mark.parametrize(("criterion", "gain"), [("paper", 8.0), ("bands", 1.0)])
-def test_gradient_is_that_of_the_value(criterion: str, gain: float, clean: Tensor) -> None:
-    weights = {"magnitude": 0.9, "complex": 0.1, "time": 0.2}  # the phase has a faded gradient
-    options: Options = {"weights": weights} if criterion == "paper" else {}
-    loss = HearingLossLoss(N3, simulator="msbg", criterion=criterion, **options)
-    signal = clean.double()
-    factor = torch.tensor(gain, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(loss(signal * factor, signal), factor)
-    upper, lower = (float(loss(signal * g, signal)) for g in (gain + 1e-3, gain - 1e-3))
-    assert float(slope) == pytest.approx((upper - lower) / 2e-3, rel=1e-4)
-
-
 def test_torch_func_gives_the_same_gradients(options: Options, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, **options)
     output = (3.0 * clean).requires_grad_()
@@ -512,7 +476,7 @@ BAD_SETTINGS: Options = {
     "simulator": ["ear", 3, nn.ReLU, MSBG(aligned=False), MSBG(sample_rate=44100)],
     "sample_rate": [8000],
     "full_scale_spl": [None],
-    "reference": ["noisy", ["clean"]],
+    "reference": ["noisy"],
     "reduction": ["sum"],
     "ears": ["left"],
     "criterion": ["l1", ["paper"], {}, {"l1": 1.0}, {"bands": -1.0}, {"bands": 0.0}],
@@ -528,7 +492,6 @@ BAD_CALLS: list[tuple[Any, ...]] = [
     (SIGNAL[:, :0], SIGNAL[:, :0], N3),
     (SIGNAL, SIGNAL, [N3, N3, N3]),
     (SIGNAL, SIGNAL, N7),
-    (SIGNAL, SIGNAL, 3),
     (SIGNAL, SIGNAL, N3, [1601, 1600]),
 ]
 BAD_OUTPUTS: list[Callable[..., Any]] = [
