@@ -12,7 +12,6 @@ from hlsim.audiogram.scale import (
     HIGHEST_SIMULATED,
     LOWEST_LEVEL,
     SEVERITIES,
-    SEVERITY_LIMITS,
     STANDARD,
 )
 from hlsim.audiogram.value import Audiogram, as_audiogram, severity_index
@@ -23,7 +22,6 @@ __all__ = [
     "HIGHEST_SIMULATED",
     "LOWEST_LEVEL",
     "SEVERITIES",
-    "SEVERITY_LIMITS",
     "STANDARD",
     "Audiogram",
     "as_audiogram",

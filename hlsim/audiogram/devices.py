@@ -39,7 +39,7 @@ def _is_remembered(tensor: Tensor) -> bool:
 
 
 def on_device(levels: Tensor, device: torch.device) -> Tensor:
-    """Return thresholds on a device, without making the CPU wait for it.
+    """Return thresholds on a device, without making the CPU wait for it if they are constants.
 
     Reading them back would make the CPU wait. If they come from the CPU, the original is
     remembered, so that ``on_host`` need not wait either.
@@ -53,13 +53,13 @@ def on_device(levels: Tensor, device: torch.device) -> Tensor:
     """
     if levels.device == device:
         return levels
-    copy = None if levels.requires_grad else _find_copy(levels, device)
+    if levels.device != _HOST or levels.requires_grad:
+        return levels.to(device)
+    copy = _find_copy(levels, device)
     if copy is None:
-        copy = levels.to(device, non_blocking=device != _HOST)
-        if levels.device == _HOST and not levels.requires_grad:
-            _add_copy(levels, copy)
-    if levels.device == _HOST:
-        _add_copy(copy, levels.detach())
+        copy = levels.to(device, non_blocking=True)
+        _add_copy(levels, copy)
+        _add_copy(copy, levels)
     return copy
 
 

@@ -156,8 +156,7 @@ class EncoderLayer(nn.TransformerEncoderLayer):
     """
 
     def __init__(self, channels: int, heads: int, hidden: int) -> None:
-        options: dict[str, Any] = {"activation": "gelu", "batch_first": True, "norm_first": True}
-        super().__init__(channels, heads, hidden, dropout=0.0, **options)
+        super().__init__(channels, heads, hidden, 0.0, "gelu", batch_first=True, norm_first=True)
 
     def forward(self, src: Tensor, *args: Any, **options: Any) -> Tensor:
         # Where other layers run in bfloat16, the backward pass of attention would take four times

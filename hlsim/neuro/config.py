@@ -91,19 +91,18 @@ class NetworkConfig(ModelConfig):
     heads: int = 4
 
     def __post_init__(self) -> None:
-        for name in ("stride", "kernel"):
-            pair = getattr(self, name)
-            if not isinstance(pair, list | tuple) or len(pair) != 2:
-                raise ValueError(
-                    f"expected {name} to be two whole numbers, for time and frequency, "
-                    f"got {describe(pair)}"
-                )
-            for size in pair:
-                check_number(name, size, 1, MAX_SIZE, whole=True)
-            object.__setattr__(self, name, tuple(pair))
         for name, kind in get_type_hints(type(self)).items():
             value = getattr(self, name)
-            if kind is int:
+            if get_origin(kind) is tuple:
+                if not isinstance(value, list | tuple) or len(value) != 2:
+                    raise ValueError(
+                        f"expected {name} to be two whole numbers, for time and frequency, "
+                        f"got {describe(value)}"
+                    )
+                for size in value:
+                    check_number(name, size, 1, MAX_SIZE, whole=True)
+                object.__setattr__(self, name, tuple(value))
+            elif kind is int:
                 lowest = 0 if name == "dense_depth" else 1
                 check_number(name, value, lowest, MAX_SIZE, whole=True)
             elif kind is bool and not isinstance(value, bool):

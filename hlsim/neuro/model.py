@@ -182,8 +182,8 @@ class NeuroMSBG(EarNetwork):
         """
         size = features.shape[2], self.stft.frequencies
         device = features.device.type
-        autocast_dtype = self.autocast_dtype or torch.bfloat16
-        with torch.autocast(device, autocast_dtype, enabled=self.autocast_dtype is not None):
+        enabled = self.autocast_dtype is not None
+        with torch.autocast(device, self.autocast_dtype, enabled=enabled):
             encoded = self.encoder(features.contiguous(memory_format=torch.channels_last))
             hidden = encoded.permute(0, 2, 3, 1)
             if self.severity is not None:
