@@ -28,6 +28,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import EllipsisType
+from typing import Any
 
 import numpy as np
 import torch
@@ -470,15 +471,39 @@ def shift(
     >>> shift(signal, torch.tensor([1]), ends=(3,), stops=(3,), size=4)
     tensor([[0., 1., 2., 0.]])
     """
-    target = torch.arange(size, device=signal.device)
-    source = target - delays.unsqueeze(-1)
-    end, stop = (
-        integers(limits, signal.device).view(-1, *[1] * (signal.ndim - 1))
-        for limits in (ends, stops)
-    )
-    is_inside = (source >= 0) & (source < end) & (target < stop)
-    samples = signal.gather(-1, source.clamp(0, signal.shape[-1] - 1))
-    return torch.where(is_inside, samples, 0.0)
+    delayed: Tensor = _Shift.apply(signal, delays, ends, stops, size)
+    return delayed
+
+
+class _Shift(torch.autograd.Function):
+    """Function of ``shift``, whose gradient is the opposite shift.
+
+    The gradient of an index would store the indices, which take twice the memory of the signals.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        signal: Tensor,
+        delays: Tensor,
+        ends: tuple[int, ...],
+        stops: tuple[int, ...],
+        size: int,
+    ) -> Tensor:
+        ctx.settings = -delays, stops, ends, signal.shape[-1]
+        target = torch.arange(size, device=signal.device)
+        source = target - delays.unsqueeze(-1)
+        end, stop = (
+            integers(limits, signal.device).view(-1, *[1] * (signal.ndim - 1))
+            for limits in (ends, stops)
+        )
+        is_inside = (source >= 0) & (source < end) & (target < stop)
+        samples = signal.gather(-1, source.clamp(0, signal.shape[-1] - 1))
+        return torch.where(is_inside, samples, 0.0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None, None]:
+        return shift(gradient, *ctx.settings), None, None, None, None
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
