@@ -231,18 +231,17 @@ def _compare_pair(
     table: DataFrame, measure: str, before: str, after: str, unit: str
 ) -> Comparison | None:
     """Compare two conditions, or return None if no item has both scores."""
-    first_rows, second_rows = (
-        table[table["condition"] == name].set_index("item") for name in (before, after)
-    )
-    has_both = first_rows[measure].notna() & second_rows[measure].notna()
-    if not has_both.any():
+    scores = table.pivot(index="item", columns="condition", values=measure)[[before, after]]
+    pairs = scores.dropna()
+    if pairs.empty:
         return None
-    first_rows, second_rows = first_rows[has_both], second_rows[has_both]
-    first, second = (rows[measure].to_numpy(float) for rows in (first_rows, second_rows))
+    first, second = pairs.to_numpy(float).T
+    rows = table.drop_duplicates("item").set_index("item").loc[pairs.index]
+    degrees, units = (np.array(rows.get(column, [])) for column in ("severity", unit))
     level_change = math.nan
     if "level" in table:
-        level_change = float((second_rows["level"] - first_rows["level"]).mean())
-    degrees, units = (np.array(first_rows.get(column, [])) for column in ("severity", unit))
+        levels = table.pivot(index="item", columns="condition", values="level").loc[pairs.index]
+        level_change = float((levels[after] - levels[before]).mean())
     by_severity = {
         name: paired_comparison(first[degrees == name], second[degrees == name])
         for name in SEVERITIES
@@ -258,7 +257,7 @@ def _compare_pair(
         by_severity=by_severity,
         unit=unit,
         unit_means=_compare_units(units, first, second),
-        left_out=len(has_both) - len(first),
+        left_out=len(scores) - len(pairs),
         p_t=overall.p_t,
         p_w=overall.p_w,
     )

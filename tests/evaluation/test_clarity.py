@@ -6,7 +6,6 @@ import csv
 import hashlib
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from hlsim.audiogram.table import read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import evaluate_scenes
-from hlsim.report.recordings import _conditions_table, scenes_page
+from hlsim.report.recordings import _conditions_table
 
 RATE = 44100
 LOW_RATE = 16000
@@ -241,9 +240,6 @@ def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_pat
     scored = study.table[study.table.item != failure.item]
     assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in scored.haspi]
     assert (study.details["look_ahead_ms"]["choosy"] is None) == (peaks[0] > peaks[1])
-    without = study.table.assign(haspi=study.table.haspi.where(study.table.condition != "choosy"))
-    cells = [row[1] for row in _conditions_table(replace(study, table=without)).rows]
-    assert cells[2] == "n/a" and "n/a" not in (cells[0], cells[1], cells[3])
 
 
 def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
@@ -252,40 +248,23 @@ def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Ten
 
 @pytest.mark.usefixtures("quick_scores")
 @pytest.mark.filterwarnings("ignore:.*both are cut")
-@pytest.mark.parametrize(
-    ("kind", "change", "message"),
-    [
-        ("target_anechoic", 100, ""),
-        ("mix", -100, ""),
-        ("mix", -8000, "16000 samples"),
-    ],
-)
-def test_lengths_may_differ_by_a_tenth_of_a_second(
-    clarity: Path, tmp_path: Path, kind: str, change: int, message: str
-) -> None:
+def test_lengths_may_differ_by_a_tenth_of_a_second(clarity: Path, tmp_path: Path) -> None:
     scenes = Path(shutil.copytree(clarity / "scenes", tmp_path / "scenes"))
-    path = scenes / f"S06002_{kind}_CH1.wav"
-    signal, _ = soundfile.read(path)
-    write(path, np.concatenate((signal, signal))[: len(signal) + change])
-    settings = options(clarity, scenes=scenes, stride=2)
-    study = evaluate_scenes({"mine": f"{__name__}:longer_by_220"}, out=tmp_path, **settings)
+    settings = options(clarity, scenes=scenes, stride=2, out=tmp_path)
+
+    def change_length(kind: str, change: int) -> None:
+        path = scenes / f"S06002_{kind}_CH1.wav"
+        signal, _ = soundfile.read(path)
+        write(path, np.concatenate((signal, signal))[: len(signal) + change])
+
+    change_length("target_anechoic", 100)
+    change_length("mix", -100)
+    study = evaluate_scenes({"mine": f"{__name__}:longer_by_220"}, **settings)
     output = soundfile.info(tmp_path / "signals" / "mine" / "S06001_L0001_HA-output.wav")
-    assert output.frames == soundfile.info(scenes / "S06001_mix_CH1.wav").frames
-    assert study.failures.empty == (not message)
-    assert message in scenes_page(study, listen=0).markdown()
-
-
-@pytest.mark.usefixtures("quick_scores")
-def test_only_listeners_that_are_used_are_validated(clarity: Path, tmp_path: Path) -> None:
-    listeners, pairs = tmp_path / "listeners.json", tmp_path / "pairs.json"
-    broken = {"audiogram_cfs": CFS, "audiogram_levels_l": [10]}
-    listeners.write_text(json.dumps(LISTENERS | {"L0001": broken}))
-    settings = options(clarity, listeners=listeners, scenes_listeners=pairs)
-    pairs.write_text('{"S06001": ["L0002"]}')
-    assert len(evaluate_scenes({}, out=tmp_path / "out", **settings).table) == 2
-    pairs.write_text('{"S06001": ["L0001"]}')
-    with pytest.raises(ValueError, match="L0001"):
-        evaluate_scenes({}, out=tmp_path / "out", **settings)
+    assert study.failures.empty and output.frames == LOW_RATE
+    change_length("target", -8000)
+    with pytest.raises(ValueError, match=r"target_CH1\.wav 8000"):
+        evaluate_scenes({}, **settings)
 
 
 LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}

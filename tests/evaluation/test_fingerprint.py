@@ -13,7 +13,7 @@ import hlsim
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import list_pretrained
-from hlsim.evaluation.fingerprint import fingerprint, value_hash
+from hlsim.evaluation.fingerprint import fingerprint
 
 N3 = Audiogram.standard("N3")
 
@@ -71,8 +71,3 @@ def test_objects_that_cannot_be_described_need_an_attribute(thing: Any) -> None:
     first = fingerprint(thing)
     thing.fingerprint = "version 2"
     assert None is not first != fingerprint(thing)
-
-
-def test_values_have_the_same_hash_whatever_the_order_of_names() -> None:
-    assert value_hash({"a": 1, "b": [1.0, 2.0]}) == value_hash({"b": [1.0, 2.0], "a": 1})
-    assert len({value_hash({"a": value}) for value in (1, 2, "1", None)}) == 4
