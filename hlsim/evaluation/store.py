@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 
 class ScoreStore:
@@ -21,40 +20,40 @@ class ScoreStore:
     Args:
         path: File of scores, which is created with the first one. None keeps them in memory.
 
+    Attributes:
+        scores: Measured values by column, under the key of each score.
+
     >>> store = ScoreStore()
-    >>> store.append("abc", {"values": {"haspi": 0.5}})
-    >>> store.get("abc")
-    {'values': {'haspi': 0.5}}
+    >>> store.append("abc", {"haspi": 0.5})
+    >>> store.scores
+    {'abc': {'haspi': 0.5}}
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
         self.path = None if path is None else Path(path)
-        self.records: dict[str, dict[str, Any]] = {}
+        self.scores: dict[str, Mapping[str, float | str]] = {}
         if self.path is None or not self.path.exists():
             return
         for line in self.path.read_text(encoding="utf-8", errors="replace").split("\n"):
-            # A line that is cut short, or is not a record, is ignored.
-            with suppress(ValueError, KeyError, TypeError, AttributeError):
-                record = json.loads(line)
-                self.records[record.pop("key")] = record
+            # A line that is cut short, or is not a score, is ignored.
+            with suppress(ValueError, KeyError, TypeError):
+                score = json.loads(line)
+                self.scores[score["key"]] = score["values"]
 
-    def get(self, key: str) -> dict[str, Any] | None:
-        """Return the record that was stored under a key, or None if there is none."""
-        return self.records.get(key)
-
-    def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Store a record under a key. The file, if any, has the record when this method returns.
+    def append(self, key: str, values: Mapping[str, float | str]) -> None:
+        """Store a score under a key. The file, if any, has the score when this method returns.
 
         Args:
             key: Hash of everything that decides the score.
-            record: Entries of the line, such as ``values``, the measured values by column.
+            values: Measured values by column.
 
         Raises:
-            ValueError: JSON cannot represent the record.
+            ValueError: JSON cannot represent the values.
         """
-        line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False)
+        score = {"key": key, "values": values}
+        line = json.dumps(score, ensure_ascii=False, allow_nan=False)
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "a", encoding="utf-8") as file:
                 file.write(f"\n{line}")  # The line before this one may be cut short.
-        self.records[key] = dict(record)
+        self.scores[key] = values

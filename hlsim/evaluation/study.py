@@ -232,11 +232,10 @@ def run_study(
         task = _Task(number, source, [])
         for condition in conditions:
             for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
-                record = store.get(key)
-                if record is None:
-                    task.missing.append((condition, measure, key))
+                if key in store.scores:
+                    results[number, condition.name, measure.name] = store.scores[key]
                 else:
-                    results[number, condition.name, measure.name] = record["values"]
+                    task.missing.append((condition, measure, key))
         if task.missing:
             tasks.append(task)
     total = len(items) * len(conditions) * len(measures)
@@ -245,8 +244,7 @@ def run_study(
         for (condition, measure, key), values in zip(task.missing, measured, strict=True):
             results[task.number, condition.name, measure.name] = values
             if key and not isinstance(values, str):
-                names = {"condition": condition.name, "measure": measure.name}
-                store.append(key, {"item": task.source.name, **names, "values": values})
+                store.append(key, values)
         report_progress(len(results), total)
     table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
     table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.

@@ -135,7 +135,7 @@ def test_values_without_a_fingerprint_are_not_stored(items: list[Item]) -> None:
     store = ScoreStore()
     unknown = [Condition("mine", lambda signal, ear: signal)]
     run_study(items, unknown, MEASURES[:1], store=store, jobs=1)
-    assert len(store.records) == 0
+    assert not store.scores
 
 
 CREST = """
