@@ -95,8 +95,9 @@ def save_compensator(
 ) -> None:
     """Save a trained compensator as a folder, which ``load_compensator`` loads.
 
-    A checkpoint that is already there is replaced, except for its README.md. The sample rate and
-    ``full_scale_spl`` are not saved; pass them to ``load_compensator``.
+    A checkpoint that is already there is replaced. A card, README.md, is written too, unless there
+    is one that somebody else wrote. The sample rate and ``full_scale_spl`` are not saved; pass them
+    to ``load_compensator``.
 
     Args:
         model: Compensator to save.
@@ -104,8 +105,8 @@ def save_compensator(
         audiogram: Ear for which the compensator was trained; None if it was trained for all ears.
 
     Raises:
-        ValueError: The model is no ``MappingCompensator`` or ``HearingAid``, or the folder contains
-            other files.
+        ValueError: The model is no ``MappingCompensator`` or ``HearingAid``, or the folder cannot
+            be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -17,7 +17,7 @@ import safetensors.torch
 import torch
 from torch import nn
 
-from hlsim.files import atomic_path
+from hlsim.files import atomic_path, write_atomically
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config")
@@ -25,6 +25,7 @@ Settings = Mapping[str, Any]
 
 WEIGHTS = "model.safetensors"
 CONFIG = "config.json"
+CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
 """Kind of the checkpoints of simulators. All other kinds are compensators."""
@@ -159,7 +160,8 @@ def save_checkpoint(
 ) -> None:
     """Save a model as a checkpoint, in place of an older one in the same folder.
 
-    If writing fails, an older checkpoint stays as it was. Its card and other files always stay.
+    If writing fails, an older checkpoint stays as it was. Its other files always stay, and so does
+    a card that somebody wrote; otherwise, a card is written that lists ``about``.
 
     Args:
         folder: Folder to write.
@@ -187,6 +189,17 @@ def save_checkpoint(
     with atomic_path(target / WEIGHTS) as new_weights, atomic_path(target / CONFIG) as new_config:
         new_weights.write_bytes(weights)
         new_config.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    _write_card(target, kind, about)
+
+
+def _write_card(folder: Path, kind: str, about: Settings) -> None:
+    """Write a card with a table of ``about``, unless there is a card that somebody else wrote."""
+    path, table_head = folder / CARD, "| record | value |\n|---|---|"
+    if path.exists() and table_head not in path.read_text(encoding="utf-8"):
+        return
+    introduction = f"A {kind} for hlsim. Load this folder with `{_loader_name(kind)}`."
+    rows = "\n".join(f"| {name} | {value} |" for name, value in about.items())
+    write_atomically(path, f"# {folder.name}\n\n{introduction}\n\n{table_head}\n{rows}\n")
 
 
 def _digest(config: Any) -> str:

@@ -74,6 +74,8 @@ def test_saving_again_writes_two_files_and_keeps_all_others(
 ) -> None:
     # safetensors: a length, then JSON; no pickle
     assert (folder / "model.safetensors").read_bytes()[8:9] == b"{"
+    save(folder, NeuroMSBG(SMALL), seed=7)
+    assert "| seed | 7 |" in (folder / "README.md").read_text()
     (folder / "README.md").write_text("mine")
     save(folder, NeuroMSBG(SMALL), seed=1)
     assert read_record(folder)["about"] == {"seed": 1}
