@@ -32,7 +32,7 @@ class TrainingRecipe:
         levels: Lowest and highest level of the speech in dB SPL.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1.
         validate_every: Number of steps between validations.
-        validation_items: Number of validation items, rounded up to batches of 8.
+        validation_items: Number of validation items, rounded up to batches of 4.
         seed: Seed of every random draw.
 
     Raises:

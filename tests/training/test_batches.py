@@ -103,7 +103,7 @@ def test_other_files_are_another_training(manifest: Path) -> None:
 def test_validation_is_fixed_and_has_the_levels_of_speech_before_treatment(
     manifest: Path, treated: bool, low: float, high: float
 ) -> None:
-    recipe = replace(SMALL, validation_items=60, treated=treated, levels=(85.0, 90.0))
+    recipe = replace(SMALL, validation_items=62, treated=treated, levels=(85.0, 90.0))
     data = TrainingData.from_manifest(manifest)
     first, again, other = (
         torch.cat([batch["signal"] for batch in load(data, settings).validation])
