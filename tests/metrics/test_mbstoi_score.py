@@ -86,25 +86,25 @@ def test_equals_pyclarity_of_silence(
     assert float(mbstoi(y, x)) == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_a_batch_equals_its_items(scenes: tuple[Tensor, Tensor]) -> None:
-    clean, noisy = scenes
-    items = [mbstoi(y, x) for y, x in zip(noisy, clean, strict=True)]
-    assert torch.equal(mbstoi(noisy[:, None], clean[:, None]), torch.stack(items)[:, None])
-
-
-def test_identical_signals_score_1_and_the_level_does_not_count(
-    scenes: tuple[Tensor, Tensor],
+def test_a_batch_equals_its_items_in_any_number_of_segments_at_once(
+    scenes: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clean, noisy = scenes
-    torch.testing.assert_close(mbstoi(0.1 * clean, clean), torch.ones(3, dtype=torch.float64))
-    torch.testing.assert_close(mbstoi(30.0 * noisy, clean), mbstoi(noisy, clean))
+    items = [mbstoi(y, x) for y, x in zip(noisy, clean, strict=True)]
+    expected = torch.stack(items)[:, None]
+    assert torch.equal(mbstoi(noisy[:, None], clean[:, None]), expected)
+    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi_score"], "CPU_SEGMENTS", 7)
+    scores = mbstoi(noisy[:, None], clean[:, None])
+    torch.testing.assert_close(scores, expected, atol=1e-12, rtol=0.0)
 
 
-def test_less_noise_is_better(scenes: tuple[Tensor, Tensor]) -> None:
+def test_the_level_does_not_count_and_less_noise_is_better(scenes: tuple[Tensor, Tensor]) -> None:
     clean, noisy = scenes
-    gains = (3.0, 1.0, 0.3, 0.1)
+    torch.testing.assert_close(mbstoi(30.0 * noisy, clean), mbstoi(noisy, clean))
+    gains = (3.0, 1.0, 0.3, 0.0)
     scores = torch.stack([mbstoi(clean + gain * (noisy - clean), clean) for gain in gains])
     assert bool((scores.diff(dim=0) > 0.0).all())
+    torch.testing.assert_close(scores[-1], torch.ones(3, dtype=torch.float64))
 
 
 def test_two_ears_score_more_than_either(scenes: tuple[Tensor, Tensor]) -> None:
@@ -112,15 +112,6 @@ def test_two_ears_score_more_than_either(scenes: tuple[Tensor, Tensor]) -> None:
     clean, noisy = (signal[0] for signal in scenes)
     either = [float(mbstoi(noisy[[ear, ear]], clean[[ear, ear]])) for ear in (0, 1)]
     assert float(mbstoi(noisy, clean)) > max(either) + 0.02
-
-
-def test_the_number_of_segments_at_once_does_not_matter(
-    scenes: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clean, noisy = scenes
-    expected = mbstoi(noisy, clean)
-    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi_score"], "CPU_SEGMENTS", 7)
-    torch.testing.assert_close(mbstoi(noisy, clean), expected, atol=1e-12, rtol=0.0)
 
 
 def test_gradient_equals_finite_differences(scenes: tuple[Tensor, Tensor]) -> None:
@@ -153,9 +144,7 @@ def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
         {"clean": torch.ones(2, 12000)},
         {"processed": torch.full((2, 16000), math.nan)},
         {"clean": torch.zeros(2, 16000)},
-        {"processed": torch.ones(2, 16000, dtype=torch.int16)},
-        {"processed": torch.randn(2, 6000), "clean": torch.randn(2, 6000)},  # too short
-        {"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)},
+        {"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)},  # too short
         {"sample_rate": 8000},
     ],
 )
