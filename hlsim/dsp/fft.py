@@ -55,10 +55,11 @@ class _RFFT(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         # The inverse counts each frequency twice, except 0 Hz and, for even lengths, the last one.
-        stride = max(1, ctx.points // 2) if ctx.points % 2 == 0 else ctx.points
         # The weights are complex because torch would convert real ones for each item.
         weights = gradient.new_full(gradient.shape[-1:], 0.5)
-        weights[::stride] = 1.0
+        weights[0] = 1.0
+        if ctx.points % 2 == 0:
+            weights[-1] = 1.0
         slope = torch.fft.irfft(gradient * weights, ctx.points, norm="forward")
         return slope[..., : ctx.time], None
 

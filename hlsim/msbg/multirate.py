@@ -21,7 +21,6 @@ are computed as one channel, their sum.
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -64,10 +63,6 @@ _FAST_SAMPLES = 6
 _WINDOW_STEPS = (8, 9, 7, 10, 6, 5)
 """Numbers of steps that one row of a matrix product may interpolate, the preferred one first."""
 
-Detector = Literal["itself", "modulus", "harmonics"]
-"""Signal from which an envelope is computed: the rectified channel itself, the modulus of the
-analytic signal, or this modulus with two harmonics."""
-
 
 @dataclass(frozen=True)
 class RateBand:
@@ -95,7 +90,7 @@ class RateBand:
 
     channels: slice
     points: int
-    detector: Detector
+    detector: str
     response: Tensor
     mean_weights: Tensor
     interpolation: Tensor
@@ -128,7 +123,7 @@ class MultirateBank:
 
 def _rate_and_detector(
     centre: float, top: float, is_wide: bool, rate_divisor: int, highest: float
-) -> tuple[int, Detector]:
+) -> tuple[int, str]:
     """Choose the number of samples per step and the detector of a channel.
 
     Args:
@@ -151,7 +146,7 @@ def _rate_and_detector(
 
 def _assign_rates(
     bank: FilterBank, count: int, rate_divisor: int, highest: float
-) -> list[tuple[slice, int, Detector]]:
+) -> list[tuple[slice, int, str]]:
     """Choose the sample rate and the detector of the lowest ``count`` channels of a filter bank.
 
     Returns:

@@ -108,15 +108,11 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
     width, columns = kernel.shape
     steps_per_window = width - _TAPS + 1
     steps = values.shape[-1]
-    padded = _pad_periodically(values)
-    if steps % steps_per_window:
-        padded = functional.pad(padded, (0, -steps % steps_per_window))
+    padded = functional.pad(_pad_periodically(values), (0, -steps % steps_per_window))
     windows = padded.unfold(-1, width, steps_per_window)
     # All windows are rows of one matrix product. Otherwise torch computes one product per channel,
     # which takes twice as long.
     interpolated = (windows.reshape(-1, width) @ kernel).view(*windows.shape[:-2], -1)
-    if steps % steps_per_window == 0:
-        return interpolated
     return interpolated[..., : steps * columns // steps_per_window]
 
 

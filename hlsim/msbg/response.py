@@ -84,7 +84,7 @@ def apply_bank_phase(
     torch.Size([1, 1600])
     """
     severity = severity_index(thresholds)
-    taps = constant_like(waveform, _phase_taps, rate, normal)[severity]
+    taps = constant_like(waveform, _taps, rate, "difference" if normal else "phase")[severity]
     filtered = filter_without_delay(waveform, taps)
     if not normal:
         return filtered
@@ -112,51 +112,35 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
     >>> simulate_normal_ear(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
     torch.Size([1, 1600])
     """
-    taps = constant_like(waveform, _normal_ear_taps, rate)[severity_index(thresholds)]
+    taps = constant_like(waveform, _taps, rate, "normal ear")[severity_index(thresholds)]
     return filter_without_delay(waveform, taps)
 
 
-def _normal_ear_taps(rate: int) -> NDArray[np.float64]:
-    """Compute impulse responses with a normal ear's magnitude and each severity's phase.
-
-    Returns:
-        Coefficients, (severities, 2 * half_length(rate)).
-    """
-    responses, points = _responses(rate)
-    phases = np.exp(1j * np.angle(responses))
-    return impulse_responses(np.abs(responses[0]) * phases, points, rate)
-
-
-def _phase_taps(rate: int, normal: bool) -> NDArray[np.float64]:
-    """Compute impulse responses with the phase of each severity's filter bank.
+def _taps(rate: int, kind: str) -> NDArray[np.float64]:
+    """Compute an impulse response for each severity, from the response of its filter bank.
 
     Args:
         rate: Sample rate in Hz.
-        normal: Whether the phase of the filter bank for normal ears is subtracted.
+        kind: ``"phase"`` for the phase of the filter bank; ``"difference"`` for this phase minus
+            that of the filter bank for normal ears; ``"normal ear"`` for the phase of the filter
+            bank with the magnitude of that for normal ears.
 
     Returns:
         Coefficients, (severities, 2 * half_length(rate)).
     """
-    responses, points = _responses(rate)
-    if normal:
-        phases = np.exp(1j * (np.angle(responses) - np.angle(responses[0])))
-    else:
-        magnitude = np.abs(responses)
-        floor = _MIN_RELATIVE_MAGNITUDE * magnitude.max(-1, keepdims=True)
-        phases = responses / np.maximum(magnitude, floor)
-    return impulse_responses(phases, points, rate)
-
-
-def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
-    """Compute the frequency response of each severity's filter bank.
-
-    Returns:
-        Responses, (severities, points // 2 + 1), and the FFT length ``points``.
-    """
     common = math.gcd(rate, MSBG_RATE)
     points = rate // common * 2 * math.ceil(common / (2.0 * _MAX_SPACING_HZ))
-    responses = [fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]
-    return np.stack(responses), points
+    responses = np.stack([fixed_response(BANKS[name], rate, points) for name in SEVERITIES])
+    magnitude = np.abs(responses)
+    angle = np.angle(responses)
+    if kind == "phase":
+        floor = _MIN_RELATIVE_MAGNITUDE * magnitude.max(-1, keepdims=True)
+        spectra = responses / np.maximum(magnitude, floor)
+    elif kind == "difference":
+        spectra = np.exp(1j * (angle - angle[0]))
+    else:
+        spectra = magnitude[0] * np.exp(1j * angle)
+    return impulse_responses(spectra, points, rate)
 
 
 def half_length(rate: int) -> int:
