@@ -31,10 +31,8 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
     tensor([0.+0.j, 2.+0.j, 0.+0.j])
     """
     points = signals.shape[-1] if points is None else points
-    if signals.requires_grad and torch.is_grad_enabled():
-        spectrum: Tensor = _RFFT.apply(signals[..., :points], points)
-        return spectrum
-    return torch.fft.rfft(signals, points)
+    spectrum: Tensor = _RFFT.apply(signals[..., :points], points)
+    return spectrum
 
 
 class _RFFT(torch.autograd.Function):
@@ -95,15 +93,8 @@ def power(spectrum: Tensor) -> Tensor:
     >>> power(torch.tensor([3.0 + 4.0j]))
     tensor([25.])
     """
-    if spectrum.requires_grad and torch.is_grad_enabled():
-        powers: Tensor = _Power.apply(spectrum)
-        return powers
-    return _squared_modulus(spectrum)
-
-
-def _squared_modulus(spectrum: Tensor) -> Tensor:
-    squares = torch.view_as_real(spectrum).square()
-    return squares[..., 0] + squares[..., 1]
+    powers: Tensor = _Power.apply(spectrum)
+    return powers
 
 
 class _Power(torch.autograd.Function):
@@ -111,7 +102,8 @@ class _Power(torch.autograd.Function):
 
     @staticmethod
     def forward(spectrum: Tensor) -> Tensor:
-        return _squared_modulus(spectrum)
+        squares = torch.view_as_real(spectrum).square()
+        return squares[..., 0] + squares[..., 1]
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:

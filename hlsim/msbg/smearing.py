@@ -206,10 +206,7 @@ def smear_spectrum(
     >>> smear_spectrum(spectrum, mixing)[1]
     tensor([1.2500e+01, 1.0000e-24])
     """
-    if torch.is_grad_enabled() and (spectrum.requires_grad or matrix.requires_grad):
-        smeared, smeared_power, *_ = _SmearSpectrum.apply(spectrum, matrix, gradient_floor)
-    else:
-        smeared, smeared_power, *_ = _smear_spectrum(spectrum, matrix)
+    smeared, smeared_power, *_ = _SmearSpectrum.apply(spectrum, matrix, gradient_floor)
     return smeared, smeared_power
 
 
