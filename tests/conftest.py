@@ -35,7 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
     Processes that tests start use one as well: several workers would wait for each other's threads.
     """
     torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     config.stash[NEW_OUTPUTS] = {}
 
 
