@@ -93,8 +93,6 @@ def test_the_soft_limit_is_monotonic_and_linear_for_soft_samples() -> None:
     assert limited.diff().min() >= 0.0 and limited.abs().max() <= peak
     soft = samples.abs() < peak / 2.0
     assert (limited[soft] / samples[soft] - 1.0).abs().nan_to_num().max() < 6e-4
-    points = torch.tensor([-3.0, 0.0, 1.0, 2.5], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: soft_limit(x, 100.0), (points,))
     infinite = torch.tensor([1e30, float("inf")])
     assert soft_limit(infinite, 100.0).tolist() == pytest.approx([peak] * 2)
 

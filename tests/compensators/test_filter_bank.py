@@ -15,7 +15,6 @@ from compensators.filter_bank import (
     band_powers,
     frame_power,
     level_db,
-    speech_band_levels,
 )
 from compensators.smoothing import _weight_of_past, follow_peaks
 from hlsim.calibration import set_level
@@ -43,14 +42,6 @@ def test_levels_are_in_db_spl() -> None:
     noise = set_level(torch.randn(1, HISTORY + 400 * HOP), 50.0)
     assert float(level_db(frame_power(noise).sum(-1).mean())) == pytest.approx(50.0, abs=0.3)
     assert float(level_db(torch.zeros(1))) == pytest.approx(0.0, abs=1e-4)
-
-
-def test_average_speech_has_its_level_and_falls_with_frequency() -> None:
-    levels = torch.tensor(speech_band_levels(20))
-    total = 10.0 * torch.log10((10.0 ** (levels / 10.0)).sum())
-    assert float(total) == pytest.approx(65.0, abs=1e-4)
-    assert int(levels.argmax()) in (1, 2, 3, 4)
-    assert float(levels.max() - levels[-2]) > 15.0
 
 
 def test_gains_equal_a_sum_in_float64() -> None:
