@@ -28,8 +28,8 @@ the longer one of the two; the table of throughput shows it beside the measureme
   are limited by memory bandwidth: 41,000 times real time for MSBG at 16 kHz, 15,000 with its
   backward pass; 35,000 and 11,000 for ``neuro-msbg``.
 * HASPI, HASQI and MBSTOI looped over their items in the first run: 180 to 420 times real time for
-  HASPI. They process whole batches since; we expect 300 times real time at batch 1, where the host
-  is the limit, and above the goal of 1,000 at batches of 16 and 64.
+  HASPI. HASPI and HASQI process whole batches since; we expect 300 times real time at batch 1,
+  where the host is the limit, and above the goal of 1,000 at batches of 16 and 64.
 * Equality: without TF32 values agree to 1e-5 and gradients to 1e-3, as float32 and float64 do on a
   CPU. With torch's defaults the networks and resampling (convolutions) agree to about 1e-3.
 * cuDNN's LSTM has a backward pass in training mode only: the gradient through the frozen

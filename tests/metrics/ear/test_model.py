@@ -190,15 +190,6 @@ def test_frames_and_modulation() -> None:
     np.testing.assert_allclose(correlation[0].numpy(), wanted, rtol=0, atol=1e-12)
 
 
-def test_channels_may_come_in_chunks() -> None:
-    levels = 10.0 * torch.randn(1, 32, 500, dtype=torch.float64).abs()
-    low, high = slice(0, 5), slice(5, 32)
-    amplitude = sum(envelopes.mean_amplitude(levels[:, part]) for part in (low, high))
-    torch.testing.assert_close(amplitude, envelopes.mean_amplitude(levels))
-    cepstrum = sum(envelopes.cepstrum(levels[:, part], part) for part in (low, high))
-    torch.testing.assert_close(cepstrum, envelopes.cepstrum(levels))
-
-
 def test_expected_noise_adds_what_noise_has_on_average() -> None:
     noise = torch.randn(300, 5, 900, dtype=torch.float64)
     extent = Extent((900,) * 300)
@@ -223,14 +214,6 @@ def test_shift_of_several_items_and_its_gradient() -> None:
             inside = 0 <= source < ends[i] and t < stops[i]
             assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
     assert torch.autograd.gradcheck(shifted, (signal,))
-
-
-def test_extent_takes_each_item_to_its_end() -> None:
-    extent = Extent((100, 30))
-    assert (extent.longest, extent.padded) == (100, 128)
-    signal = torch.ones(2, 4, 128)
-    assert extent.cut(signal).sum((1, 2)).tolist() == [400.0, 120.0]
-    assert torch.equal(extent.mean(signal), torch.ones(2, 4))
 
 
 def test_channels_in_chunks_are_all_of_them() -> None:
