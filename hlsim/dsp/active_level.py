@@ -37,7 +37,7 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
         Level in dB relative to RMS 1.0.
 
     Raises:
-        ValueError: The waveform is silent, empty or not one-dimensional.
+        ValueError: The waveform is silent or empty.
 
     >>> speech = np.sin(np.arange(16000.0))
     >>> with_pause = np.concatenate((speech, np.zeros(64000)))
@@ -45,10 +45,6 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     -1
     """
     samples = np.asarray(waveform, dtype=np.float64)
-    if samples.ndim != 1:
-        raise ValueError(
-            f"expected a waveform of shape (time,), got shape {samples.shape}; pass one channel"
-        )
     if not samples.any():
         raise ValueError("expected speech, got a waveform that is silent or empty")
     pole = math.exp(-1.0 / (sample_rate * _TIME_CONSTANT))

@@ -39,7 +39,7 @@ def test_level_is_close_to_pyclaritys(speech: Speech) -> None:
         assert -0.5 < difference < 1.5
 
 
-def test_silence_and_several_channels_are_rejected() -> None:
-    for waveform in (np.zeros(100), np.zeros(0), np.ones((2, 100))):
+def test_silence_is_rejected() -> None:
+    for waveform in (np.zeros(100), np.zeros(0)):
         with pytest.raises(ValueError):
             active_level_db(waveform, 16000)

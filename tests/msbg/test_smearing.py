@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.smearing import BROADENING, HOP, smear, smearing_matrix
 
 clarity = pytest.importorskip("clarity.evaluator.msbg.smearing")
@@ -41,21 +40,6 @@ def test_smearing_equals_pyclaritys_sample_by_sample(severity: str, length: int)
         # pyclarity continues with the zeros of the padding, so that only the first hops are equal.
         stop = HOP * -(-length // HOP)
         np.testing.assert_allclose(ours[:stop], theirs[:stop], atol=1e-10)
-
-
-@pytest.mark.parametrize("severity", BROADENING)
-@pytest.mark.parametrize("highest", [8000.0, 9000.0])
-def test_a_part_of_the_matrix_is_enough_for_low_frequencies(severity: str, highest: float) -> None:
-    spectrum = torch.fft.rfft(torch.randn(32 * 400, dtype=torch.float64))
-    spectrum[round(highest / (MSBG_RATE / 2) * 32 * 400) :] = 0.0
-    noise = torch.fft.irfft(spectrum)
-    matrix = torch.from_numpy(smearing_matrix(severity)[:128, :128])
-    part = torch.from_numpy(smearing_matrix(severity, 2, highest))
-    assert len(part) < 128
-    expected = torch.fft.rfft(smear(noise, matrix, 2))
-    ours = torch.fft.rfft(smear(noise, part, 2))
-    band = slice(round(highest / (MSBG_RATE / 2) * HOP * (32 * 400 // HOP + 3)))
-    assert (ours - expected)[band].norm() < 1e-3 * expected[band].norm()
 
 
 @pytest.mark.parametrize("severity", BROADENING)
