@@ -169,33 +169,18 @@ def test_in_a_lightning_validation_loop(clean: Tensor, tmp_path: Path) -> None:
     class Amplifier(lightning.LightningModule):
         def __init__(self) -> None:
             super().__init__()
-            self.gain = torch.nn.Parameter(torch.tensor(4.0))
             self.haspi = HASPI(16000)
 
-        def training_step(self, batch: list[Tensor], _: int) -> Tensor:
-            return (self.gain * batch[0]).square().mean()
-
         def validation_step(self, batch: list[Tensor], _: int) -> None:
-            self.haspi.update(self.gain * batch[0], batch[0], N3)
+            self.haspi.update(4.0 * batch[0], batch[0], N3)
             self.log("haspi", self.haspi, on_epoch=True)
 
-        def configure_optimizers(self) -> torch.optim.Optimizer:
-            return torch.optim.SGD(self.parameters(), lr=0.0)
-
     loader = torch.utils.data.DataLoader(torch.utils.data.TensorDataset(clean), batch_size=1)
-    trainer = lightning.Trainer(
-        max_epochs=2,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        default_root_dir=tmp_path,
-    )
+    trainer = lightning.Trainer(accelerator="cpu", logger=False, default_root_dir=tmp_path)
     model = Amplifier()
-    trainer.fit(model, loader, loader)
     expected = sum(expected_score(clean[i], 4.0 * clean[i], N3) for i in range(2)) / 2
-    assert float(trainer.callback_metrics["haspi"]) == pytest.approx(expected, abs=1e-6)
+    for _ in range(2):  # epochs
+        (values,) = trainer.validate(model, loader, verbose=False)
+        assert values["haspi"] == pytest.approx(expected, abs=1e-6)
     # The checkpoint does not contain the metric.
-    assert set(model.state_dict()) == {"gain"}
+    assert not model.state_dict()

@@ -1,11 +1,10 @@
-"""Stages of Kates' ear equal pyclarity's, the recursions scipy's, and shifts equal slices."""
+"""Stages of Kates' ear equal pyclarity's, and shifts equal slices."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from scipy.signal import lfilter
 from torch import Tensor
 
 from hlsim.audio import read_audio
@@ -115,14 +114,6 @@ def test_gammatones(pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: floa
         )
 
 
-def test_a_recursion_is_the_filter_whatever_the_block() -> None:
-    signal = torch.randn(3, 40 * recursions.BLOCK, dtype=torch.float64)
-    ours = recursions.gain_lowpass(CPU, torch.float64)(signal).flatten(-2)
-    pole = (1.0 - np.tan(np.pi / 30)) / (1.0 + np.tan(np.pi / 30))
-    expected = lfilter([(1.0 - pole) / 2.0] * 2, [1.0, -pole], signal.numpy())
-    np.testing.assert_allclose(ours.numpy(), expected, rtol=0, atol=1e-13)
-
-
 @pytest.mark.parametrize("name", ["NH", "N1", "N4", "S3", "N7"])
 def test_hair_cells(name: str) -> None:
     eb = of_clarity()
@@ -214,9 +205,3 @@ def test_shift_of_several_items_and_its_gradient() -> None:
             inside = 0 <= source < ends[i] and t < stops[i]
             assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
     assert torch.autograd.gradcheck(shifted, (signal,))
-
-
-def test_channels_in_chunks_are_all_of_them() -> None:
-    for samples in (100, 72000, 10**8):
-        chunks = list(ear_model.channel_chunks(torch.zeros(1).expand(1, samples)))
-        assert [c for chunk in chunks for c in range(chunk.start, chunk.stop)] == list(range(32))
