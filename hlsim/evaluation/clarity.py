@@ -316,7 +316,7 @@ def _read_scene(pair: _Pair, rate: int) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: A file is broken, or has another rate or length.
     """
-    mix, reference = _read_channels(pair.mix, rate), _read_channels(pair.reference, rate)
+    mix, reference = _read_channels(pair.mix, rate, [2]), _read_channels(pair.reference, rate)
     in_room_file = pair.mix.with_name(f"{pair.scene}_target_CH1.wav")
     if pair.reference.name.endswith(_REFERENCE_ENDINGS[-1]) or not in_room_file.is_file():
         return mix, reference
@@ -327,16 +327,21 @@ def _read_scene(pair: _Pair, rate: int) -> tuple[Tensor, Tensor]:
     return mix, set_level(reference, level_spl(in_room))
 
 
-def _read_channels(path: Path, rate: int) -> Tensor:
+def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:
     """Read the channels for the left and the right ear; one channel is for both. Shape: (2, time).
 
+    Args:
+        path: Audio file.
+        rate: Expected sample rate in Hz.
+        numbers: Accepted numbers of channels.
+
     Raises:
-        ValueError: The file has another sample rate or more channels.
+        ValueError: The file has another sample rate or number of channels.
     """
     waveform, file_rate = read_audio(path)
-    if file_rate != rate or len(waveform) > 2:
+    if file_rate != rate or len(waveform) not in numbers:
         raise ValueError(
-            f"{path}: expected one or two channels at the rate of the first scene, {rate} Hz, got "
-            f"{len(waveform)} at {file_rate} Hz; replace the file"
+            f"{path}: expected {' or '.join(map(str, numbers))} channels at the rate of the first "
+            f"scene, {rate} Hz, got {len(waveform)} at {file_rate} Hz; replace the file"
         )
     return waveform.expand(2, -1)

@@ -114,6 +114,8 @@ def evaluate_compensators(
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
     ears = read_ears(audiograms)
     if audiogram is not None:
+        if audiograms is not None:
+            raise ValueError("expected one ear or a file of ears, got both; leave out one of them")
         ears_of_aids = {ear_name(audiogram): audiogram}
         ears = list(ears_of_aids.items())
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)

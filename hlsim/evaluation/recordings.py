@@ -384,9 +384,13 @@ def _read_folders(
 
 def _files_by_name(folder: str | Path) -> dict[str, Path]:
     """Return the audio files of a folder by their path below it, without extension."""
-    return {
-        path.relative_to(folder).with_suffix("").as_posix(): path for path in find_audio(folder)
-    }
+    files: dict[str, Path] = {}
+    for path in find_audio(folder):
+        name = path.relative_to(folder).with_suffix("").as_posix()
+        if name in files:
+            raise ValueError(f"{files[name]} and {path} differ in their extension; keep one")
+        files[name] = path
+    return files
 
 
 def _read_manifest(
@@ -411,14 +415,19 @@ def _read_manifest(
     """
     folder = Path(path).parent if root is None else Path(root)
     rows = read_table(path, "the manifest")
+    if "spl" in rows[0][1]:
+        raise ValueError(
+            f"{path}: expected no column spl, because all files have one level; remove it, and "
+            "pass the option --spl (spl in Python)"
+        )
     listeners: dict[str, Listener] = {}
     if audiograms is not None:
         listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})
-    recordings: dict[tuple[str, Path, Audiogram], Recording] = {}
+    recordings: dict[tuple[str, Path], Recording] = {}
     for line, row in rows:
         place = f"{path}, line {line}"
         recording = convert_at(place, _read_row, row, folder, listeners, audiogram, settings)
-        key = recording.name, recording.clean, recording.audiogram
+        key = recording.name, recording.clean
         earlier = recordings.get(key)
         if earlier is not None:
             if row["condition"] in earlier.outputs:
@@ -426,6 +435,11 @@ def _read_manifest(
                     f"{place}: expected one row of {recording.name} under condition "
                     f"{row['condition']}, got a second one; remove one of them, or give both "
                     "different values in the column item"
+                )
+            if recording.audiogram != earlier.audiogram:
+                raise ValueError(
+                    f"{place}: expected the audiogram of earlier rows of {recording.name}, got "
+                    "another one; write one audiogram in all its rows"
                 )
             recording = replace(recording, outputs={**earlier.outputs, **recording.outputs})
         recordings[key] = recording

@@ -154,6 +154,7 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
         {"items": 0},
         {"audiogram": Audiogram.standard("N7")},
         {"enhancers": ["no_such:module"]},
+        {"audiograms": "ears.csv"},
     ):
         settings = {"compensators": {"mine": Unaided()}, "audiogram": N3, **options, **changes}
         with pytest.raises(ValueError):

@@ -162,6 +162,8 @@ def test_the_better_ear_counts(corpus: Path) -> None:
             "line 3: expected one row of L1 left .* under condition unaided",
         ),
         ("L1,left,aided", "L1,left,", "line 3: expected a value in the column condition"),
+        ("N3\nL2", "N4\nL2", "line 3: expected the audiogram of earlier rows of L1 left"),
+        (",snr,", ",spl,", "expected no column spl, .* pass the option --spl"),
         (",5,N3", ",x,N3", "line 2: could not convert string to float: 'x'"),
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
         ("before/a", "../a", "line 2: expected the path of a file below"),
@@ -206,6 +208,12 @@ def test_invalid_settings_are_rejected_before_scoring(
 
 
 def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
+    path = corpus / "before" / "a.b.wav"
+    twin = path.with_suffix(".flac")
+    twin.write_bytes(path.read_bytes())
+    with pytest.raises(ValueError, match="differ in their extension; keep one"):
+        haspi_report(**folders(corpus), audiogram=N4)
+    twin.unlink()
     (corpus / "after" / "a.b.wav").rename(corpus / "after" / "d.wav")
     with pytest.raises(
         ValueError,
