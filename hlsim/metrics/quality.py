@@ -190,6 +190,7 @@ class QualityReference(Reference):
             delays=delays,
             smooth_levels=levels,
             adapted_motion=motion,
+            segments=self._segment_spectra(motion, delays, channels, None, extent),
             level=cochlea.level,
         )
 
@@ -243,10 +244,13 @@ class QualityReference(Reference):
         power = ear_model.align_channels(power, envelope, clean.envelope, extent)
         motion = ear_model.align_channels(motion, motion.detach(), clean.motion, extent)
         levels, motion = self._adapt(power, motion, inner, clean.delays, extent)
-        clean_segments, segments = (
-            self._segment_spectra(signal, clean, noise, extent)
-            for signal, noise in zip((clean.adapted_motion, motion), noises, strict=True)
-        )
+        clean_noise, noise = noises
+        segments = self._segment_spectra(motion, clean.delays, channels, noise, extent)
+        clean_segments = clean.segments
+        if clean_noise is not None:
+            clean_segments = self._segment_spectra(
+                clean.adapted_motion, clean.delays, channels, clean_noise, extent
+            )
         counts = fine_structure.segments_of(extent)
         return _Comparison(
             clean_levels=clean.smooth_levels,
@@ -258,14 +262,19 @@ class QualityReference(Reference):
         )
 
     def _segment_spectra(
-        self, motion: Tensor, clean: _Channels, noise: Tensor | None, extent: Extent
+        self,
+        motion: Tensor,
+        delays: Tensor,
+        channels: slice,
+        noise: Tensor | None,
+        extent: Extent,
     ) -> tuple[Tensor, Tensor]:
         """Add noise to the motion, delay its channels, and compute ``segment_spectra``."""
         motion = motion[..., : extent.longest]
         if noise is not None:
             amplitude = self._unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0)
-            motion = motion + amplitude * noise[..., clean.channels, :].to(motion)
-        return fine_structure.segment_spectra(_delay(motion, clean.delays, extent), extent)
+            motion = motion + amplitude * noise[..., channels, :].to(motion)
+        return fine_structure.segment_spectra(_delay(motion, delays, extent), extent)
 
 
 @dataclass(frozen=True)
@@ -278,6 +287,7 @@ class _Channels:
         delays: Delays that make up for different group delays. Shape: (items, channels).
         smooth_levels: Smoothed levels. Shape: (items, channels, segments).
         adapted_motion: Motion after adaptation. Shape: (items, channels, padded).
+        segments: ``segment_spectra`` of that motion.
         level: Long-term level in dB over threshold. Shape: (items, channels).
     """
 
@@ -287,6 +297,7 @@ class _Channels:
     delays: Tensor
     smooth_levels: Tensor
     adapted_motion: Tensor
+    segments: tuple[Tensor, Tensor]
     level: Tensor
 
 
