@@ -1,5 +1,6 @@
-"""The parser of a command, and the options that several commands have.
+"""The parser of a command, and the options that commands of several files have.
 
+Options of all trainings are in ``training.py``, and those of all evaluations in ``evaluation.py``.
 This module does not import torch, so that ``--help`` takes a fraction of a second.
 """
 

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import MISSING, Field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,7 +45,8 @@ def add_recipe(parser: Parser, recipe: type[TrainingRecipe], example: str) -> No
             *names,
             dest="settings",
             action="append",
-            type=(name + "={}").format,
+            # The value becomes a text such as --recipe.steps=100, which jsonargparse reads.
+            type=partial("{}={}".format, name),
             default=[],
             metavar="VALUE",
             help=text.replace("%", "%%"),

@@ -212,19 +212,16 @@ def _adjust(
     comparisons: Sequence[Comparison], planned: Collection[PlannedComparison]
 ) -> list[Comparison]:
     """Mark the planned comparisons of a measure, and adjust the p values of all others."""
-    is_planned = [
-        len(comparisons) > 1 and (c.measure, c.before, c.after) in planned for c in comparisons
+    marked = [
+        replace(c, planned=len(comparisons) > 1 and (c.measure, c.before, c.after) in planned)
+        for c in comparisons
     ]
-    family = [c for c, p in zip(comparisons, is_planned, strict=True) if not p]
-    p_t, p_w = iter(holm(c.p_t for c in family)), iter(holm(c.p_w for c in family))
-    adjusted = []
-    for comparison, p in zip(comparisons, is_planned, strict=True):
-        if p:
-            adjusted.append(replace(comparison, planned=True))
-        else:
-            changes = replace(comparison, p_t=next(p_t), p_w=next(p_w), family=len(family))
-            adjusted.append(changes)
-    return adjusted
+    family = [index for index, comparison in enumerate(marked) if not comparison.planned]
+    adjusted_t = holm(marked[index].p_t for index in family)
+    adjusted_w = holm(marked[index].p_w for index in family)
+    for index, p_t, p_w in zip(family, adjusted_t, adjusted_w, strict=True):
+        marked[index] = replace(marked[index], p_t=p_t, p_w=p_w, family=len(family))
+    return marked
 
 
 def _compare_pair(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +49,13 @@ _LEVEL_WEIGHTS = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
 
 Excess level costs twice its default, as HASPI rewards gain.
 """
+
+
+class _Unregistered(NamedTuple):
+    """Thresholds and criterion of a loss, which are in no state dict."""
+
+    thresholds: Tensor | None
+    criterion: Any
 
 
 class HearingLossLoss(nn.Module):
@@ -166,7 +173,7 @@ class HearingLossLoss(nn.Module):
             simulator, self.sample_rate, self.full_scale_spl, normal, reference, checkpoint
         )
         # nn.Module does not register what is in a tuple.
-        self._unregistered: tuple[Tensor | None, Any] = (store_thresholds(audiogram), criterion)
+        self._unregistered = _Unregistered(store_thresholds(audiogram), criterion)
 
     @property
     def simulator(self) -> nn.Module:
@@ -289,7 +296,7 @@ class HearingLossLoss(nn.Module):
                 "expected compensated and clean with the same shape, "
                 f"got {tuple(compensated.shape)} and {tuple(clean.shape)}"
             )
-        stored = self._unregistered[0]
+        stored = self._unregistered.thresholds
         ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)
         if self.ears == "better" or "interaural" in self.criteria:
             check_two_channels(clean)
@@ -363,7 +370,7 @@ class HearingLossLoss(nn.Module):
         if name == "paper":
             estimate = resample(perceived, self.sample_rate, NEURO_RATE)
             return paper_parts(estimate, resample(reference, self.sample_rate, NEURO_RATE))
-        value = self._unregistered[1](perceived, reference)
+        value = self._unregistered.criterion(perceived, reference)
         return {name: check_shape(value, "criterion", (len(perceived),))}
 
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -375,7 +382,7 @@ class HearingLossLoss(nn.Module):
             return tensor.to(moved.device) if is_half else moved
 
         super()._apply(function, recurse)
-        for module in (self.simulator, self._frozen.normal, self._unregistered[1]):
+        for module in (self.simulator, self._frozen.normal, self._unregistered.criterion):
             if isinstance(module, nn.Module):
                 module._apply(move)
         return self
