@@ -1,4 +1,4 @@
-"""Properties of an aid that scores of speech do not show: gain, tones, quiet noise, delay, cost.
+"""Properties of an aid that speech scores do not show: gain, tones, quiet noise, look-ahead, cost.
 
 An aid is a function ``(waveform, ear) -> waveform`` for one signal at 16 kHz in pascals.
 """

@@ -1,4 +1,4 @@
-"""The result of an evaluation: the table of its study, the comparisons, and the settings."""
+"""An evaluation: it runs a study, and holds its table, the comparisons and the settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The criterion ``"bands"``, which compares levels in bands about as wide as auditory filters.
+"""Levels in bands about as wide as auditory filters, for the default criterion and ``"bands"``.
 
 There are 24 bands from 80 Hz to 7.5 kHz. They are equally wide, 1.25 ERB (equivalent rectangular
 bandwidths), on the scale of Glasberg and Moore (1990), rectangular and without gaps, so that their
@@ -26,19 +26,19 @@ Neuro-MSBG returns nothing above 8 kHz.
 
 FRAME_SECONDS = 0.032
 
-LOWEST_POWER = 1e-18
+_POWER_FLOOR = 1e-18
 """Power, -86 dB SPL, added before the logarithm, which keeps the gradient near silence finite.
 
 It does not limit the perceived level: a band at -40 dB SPL still has its whole gradient.
 """
 
-DEPTH = 40.0
+_DEPTH_DB = 40.0
 """Level in dB below the strongest band of an item, for a normal ear, at which audibility begins."""
 
 RISE = 20.0
 """Range in dB over which the weight of a band rises from 0 to 1."""
 
-LOWEST_TOTAL_WEIGHT = 1e-3
+_WEIGHT_FLOOR = 1e-3
 """Smallest sum of weights by which a loss is divided."""
 
 
@@ -64,7 +64,7 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     stft, shares, scale = band_analysis(waveform, sample_rate)
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
     powers = (power(spectrum) * scale) @ shares
-    levels = 10.0 * torch.log10(powers + LOWEST_POWER) + PASCAL_SPL
+    levels = 10.0 * torch.log10(powers + _POWER_FLOOR) + PASCAL_SPL
     return levels.reshape(*waveform.shape[:-1], *levels.shape[-2:])
 
 
@@ -101,8 +101,8 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
     weights = torch.maximum(
         audibility_weights(reference_levels, threshold), audibility_weights(levels, threshold)
     )
-    errors = (levels - torch.maximum(reference_levels, threshold - DEPTH)).abs()
-    total = weights.sum((-2, -1)).clamp_min(LOWEST_TOTAL_WEIGHT)
+    errors = (levels - torch.maximum(reference_levels, threshold - _DEPTH_DB)).abs()
+    total = weights.sum((-2, -1)).clamp_min(_WEIGHT_FLOOR)
     return (weights * errors).sum((-2, -1)) / total
 
 
@@ -124,7 +124,7 @@ def audibility_threshold(levels: Tensor) -> Tensor:
     tensor([23.0014, 20.0000, 20.0000])
     """
     quiet = constant(threshold_in_quiet, dtype=levels.dtype, device=levels.device)
-    return torch.maximum(quiet, levels.amax((-2, -1), keepdim=True) - DEPTH).detach()
+    return torch.maximum(quiet, levels.amax((-2, -1), keepdim=True) - _DEPTH_DB).detach()
 
 
 def audibility_weights(levels: Tensor, threshold: Tensor) -> Tensor:

@@ -53,13 +53,13 @@ Speech that is unrelated to the reference costs 1, a level that is 40 dB too low
 that is 40 dB too high about 1.6.
 """
 
-DEPTH = 41.0
+_DEPTH_DB = 41.0
 """Level in dB below the strongest band of an item at which the weight of a band is one half."""
 
 KNEE = 10.0
 """Difference in level in dB at which one more dB costs half as much as the first."""
 
-LOWEST_POWER = 1e-22
+_POWER_FLOOR = 1e-22
 """Power, -126 dB SPL, added before the logarithm.
 
 Soft speech in an N5 ear has -110, and keeps its gradient.
@@ -95,7 +95,7 @@ SIGN_WEIGHT = 0.1
 PRODUCT_FLOOR = 1e-36
 """Added to products of two powers; far below the products of audible bands."""
 
-LOWEST_TOTAL_WEIGHT = 1e-9
+_WEIGHT_FLOOR = 1e-9
 """Smallest sum of weights by which a part is divided: that of a reference at about -160 dB SPL."""
 
 
@@ -128,14 +128,14 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
     cross = _average_segments(spectrum * reference.conj())
     common = (power(cross) + PRODUCT_FLOOR).sqrt() @ shares
     aligned = cross.real.contiguous() @ shares
-    product = (level + LOWEST_POWER) * reference_level + PRODUCT_FLOOR
+    product = (level + _POWER_FLOOR) * reference_level + PRODUCT_FLOOR
 
     quiet = constant(_quiet_power, dtype=perceived.dtype, device=perceived.device)
     strongest = reference_level.detach().amax((-2, -1), keepdim=True)
-    threshold = torch.maximum(quiet, 10.0 ** (-DEPTH / 10.0) * strongest)
+    threshold = torch.maximum(quiet, 10.0 ** (-_DEPTH_DB / 10.0) * strongest)
     weights = _audibility(reference_level, threshold)
     perceived_weights = _audibility(level, threshold)
-    total = weights.sum((-2, -1)).clamp_min(LOWEST_TOTAL_WEIGHT)
+    total = weights.sum((-2, -1)).clamp_min(_WEIGHT_FLOOR)
     # Noise in a silent reference has no audible reference whose weight it could be divided by.
     louder_total = torch.maximum(total, perceived_weights.sum((-2, -1)) / 10.0)
 
@@ -281,7 +281,7 @@ def _audibility(powers: Tensor, threshold: Tensor) -> Tensor:
 
 
 def _decibels(powers: Tensor) -> Tensor:
-    return 10.0 * torch.log10(powers + LOWEST_POWER)
+    return 10.0 * torch.log10(powers + _POWER_FLOOR)
 
 
 def _quiet_power() -> NDArray[np.float64]:
