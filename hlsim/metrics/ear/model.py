@@ -491,13 +491,23 @@ class _Shift(torch.autograd.Function):
         size: int,
     ) -> Tensor:
         ctx.settings = -delays, stops, ends, signal.shape[-1]
+        if signal.device.type == "cpu":  # slices are nine times as fast as an index
+            delayed = signal.new_zeros((*signal.shape[:-1], size))
+            for item, (end, stop) in enumerate(zip(ends, stops, strict=True)):
+                rows, outputs = torch.atleast_2d(signal[item], delayed[item])
+                item_delays = delays[item].flatten().tolist()
+                for row, output, delay in zip(rows, outputs, item_delays, strict=True):
+                    start = max(delay, 0)
+                    last = max(start, min(end + delay, stop))
+                    output[start:last] = row[start - delay : last - delay]
+            return delayed
         target = torch.arange(size, device=signal.device)
         source = target - delays.unsqueeze(-1)
-        end, stop = (
+        source_end, target_end = (
             integers(limits, signal.device).view(-1, *[1] * (signal.ndim - 1))
             for limits in (ends, stops)
         )
-        is_inside = (source >= 0) & (source < end) & (target < stop)
+        is_inside = (source >= 0) & (source < source_end) & (target < target_end)
         samples = signal.gather(-1, source.clamp(0, signal.shape[-1] - 1))
         return torch.where(is_inside, samples, 0.0)
 
