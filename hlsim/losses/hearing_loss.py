@@ -94,9 +94,10 @@ class HearingLossLoss(nn.Module):
 
     Args:
         audiogram: Ear or ears; may be passed to each call instead. The standard audiogram ``"N7"``
-            is not accepted, because it has thresholds above 100 dB HL. A tensor that requires a
-            gradient gets one, and is not registered either. Every simulator, ``"msbg"`` included,
-            receives the levels at eight frequencies, ``Audiogram.thresholds``.
+            is not accepted, because it has thresholds above 100 dB HL. The loss stores a copy of a
+            tensor without its gradient: to train an audiogram, pass it to each call. Every
+            simulator, ``"msbg"`` included, receives the levels at eight frequencies,
+            ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
             exact model; or a module, which is called with a waveform and thresholds. The module
             itself is frozen, so pass a copy of one that is still trained. It may have the
