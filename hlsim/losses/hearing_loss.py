@@ -277,6 +277,10 @@ class HearingLossLoss(nn.Module):
             gain = gain_to_pascals(self.full_scale_spl)
             return perceived * gain, reference * gain
 
+    def extra_repr(self) -> str:
+        simulator, criteria = type(self.simulator).__name__, "+".join(self.criteria)
+        return f"simulator={simulator}, criterion={criteria}, sample_rate={self.sample_rate}"
+
     def _prepare(
         self,
         compensated: Tensor,

@@ -191,6 +191,12 @@ class MSBG(nn.Module):
             raise ValueError(f"expected a severity of {', '.join(SEVERITIES)}, got {severity!r}")
         return STRUCTURAL_DELAY + (SMEARING_DELAY if severity in BROADENING else 0)
 
+    def extra_repr(self) -> str:
+        return (
+            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
+            f"aligned={self.aligned}"
+        )
+
     def _simulate(
         self, waveform: Tensor, thresholds: Tensor, grids: list[Audiogram | None]
     ) -> Tensor:
