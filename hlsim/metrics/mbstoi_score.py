@@ -95,16 +95,30 @@ def mbstoi(processed: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Ten
     precision = torch.float32 if processed.device.type == "mps" else torch.float64
     signals = torch.stack([clean, processed], -3).to(precision).reshape(-1, 2, 2, time)
     check_finite("processed or clean", signals)
+    is_sounding = signals[:, 0].flatten(1).any(-1).tolist()
+    if not all(is_sounding):
+        index = is_sounding.index(False)
+        raise ValueError(f"clean is silent at both ears in item {index}; leave the item out")
+    # One item at a time on a CPU, because caches hold no more.
+    batches = signals.split(1 if signals.device.type == "cpu" else len(signals))
+    with torch.autocast(signals.device.type, enabled=False):
+        scores = map_on_cores(lambda batch: _score_batch(batch, sample_rate), batches, signals)
+    return torch.cat(scores).to(clean.dtype).reshape(items)
 
-    def score(item: Tensor) -> Tensor:
-        if not bool(item[0].any()):
-            raise ValueError("clean is silent at both ears; leave the item out")
-        with torch.autocast(item.device.type, enabled=False):
-            frames = _remove_silence(_resample(item, sample_rate))
-            return _mean_correlation(_band_features(frames))
 
-    scores = map_on_cores(score, signals.unbind(), signals)
-    return torch.stack(scores).to(clean.dtype).reshape(items)
+def _score_batch(signals: Tensor, rate: int) -> Tensor:
+    """Compute MBSTOI of items at once.
+
+    Args:
+        signals: Clean, then processed speech at the left, then the right ear. Shape: (items, 2, 2,
+            time).
+        rate: Sample rate in Hz.
+
+    Returns:
+        Scores. Shape: (items,).
+    """
+    frames, counts = _remove_silence(_resample(signals.movedim(0, 2), rate))
+    return _mean_correlation(_band_features(frames), counts)
 
 
 def _resample(signals: Tensor, rate: int) -> Tensor:
@@ -120,15 +134,16 @@ def _resample(signals: Tensor, rate: int) -> Tensor:
     return torch.fft.irfft(spectrum, points) * (points / time)
 
 
-def _remove_silence(signals: Tensor) -> Tensor:
+def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
     """Remove the frames where clean speech is silent at both ears, and overlap and add the others.
 
     Args:
         signals: Clean signals of the left and the right ear, then the processed ones. Shape:
-            (2, 2, time).
+            (2, 2, items, time).
 
     Returns:
-        Windowed frames of the shortened signals. Shape: (2, 2, frames, 256).
+        Windowed frames of the shortened signals, those of all items one after another, (2, 2,
+        frames, 256), and the number of frames of each item.
 
     Raises:
         ValueError: Too few frames remain for a segment.
@@ -138,21 +153,32 @@ def _remove_silence(signals: Tensor) -> Tensor:
     padded = functional.pad(signals, (0, max(0, missing)))
     # As in pyclarity, a frame that ends with the signal is left out.
     frames = padded[..., :-1].unfold(-1, FRAME, HOP) * window
-    norms = frames[0].detach().norm(dim=-1)
+    norms = frames[0].detach().norm(dim=-1)  # ears, items, frames
     levels = 20.0 * torch.log10(norms + np.finfo(np.float64).eps)
     is_loud = levels > levels.amax(-1, keepdim=True) - RANGE_DB
-    active = frames[..., is_loud.any(0), :]
-    count = active.shape[-2]
-    if count <= SEGMENT:
+    is_active = is_loud.any(0)
+    counts = is_active.sum(-1).tolist()
+    if min(counts) <= SEGMENT:
         raise ValueError(
             f"expected at least {(SEGMENT + 2) * HOP / RATE:.2g} s of clean speech within "
-            f"{RANGE_DB:g} dB of its loudest frame, got {(count + 1) * HOP / RATE:.2g} s; pass "
-            "longer signals"
+            f"{RANGE_DB:g} dB of its loudest frame, got {(min(counts) + 1) * HOP / RATE:.2g} s; "
+            "pass longer signals"
         )
-    first_halves = functional.pad(active[..., :HOP], (0, 0, 0, 1))
-    second_halves = functional.pad(active[..., HOP:], (0, 0, 1, 0))
-    hops = first_halves + second_halves
-    return torch.cat([hops[..., :-1, :], hops[..., 1:, :]], -1) * window
+    active = frames.flatten(2, 3)[..., is_active.flatten(), :]
+    first_halves, second_halves = active.split(HOP, -1)
+    is_last = (_frames_to_end(counts, active.device) == 1)[:, None]
+    is_first = is_last.roll(1, 0)
+    before = torch.where(is_first, 0.0, second_halves.roll(1, -2))
+    after = torch.where(is_last, 0.0, first_halves.roll(-1, -2))
+    return torch.cat([first_halves + before, after + second_halves], -1) * window, counts
+
+
+def _frames_to_end(counts: list[int], device: torch.device) -> Tensor:
+    """Return the number of frames from each frame, which counts, to the end of its item.
+
+    Shape: (frames of all items,).
+    """
+    return torch.cat([torch.arange(count, 0, -1, device=device) for count in counts])
 
 
 def _window() -> NDArray[np.float64]:
@@ -178,18 +204,27 @@ def _band_features(frames: Tensor) -> Tensor:
     return bands.flatten(0, 1).permute(1, 2, 0)
 
 
-def _mean_correlation(features: Tensor) -> Tensor:
-    """Compute the mean correlation over all segments of an item.
+def _mean_correlation(features: Tensor, counts: list[int]) -> Tensor:
+    """Compute the mean correlation over all segments of each item.
 
-    Shape: (frames, bands, 8) -> ().
+    Args:
+        features: Output of ``_band_features``.
+        counts: Number of frames of each item.
+
+    Returns:
+        Means. Shape: (items,).
     """
     windows = features.unfold(0, SEGMENT, 1)  # a segment begins at every frame
-    segments = len(windows) - 1
+    to_end = _frames_to_end(counts, features.device)
+    starts = (to_end > SEGMENT).nonzero().squeeze(-1)
     segments_at_once = CPU_SEGMENTS if features.device.type == "cpu" else GPU_SEGMENTS
-    groups = torch.arange(segments, device=features.device).split(segments_at_once)
-    # As in pyclarity, one ear alone is not used in the last segment.
-    correlations = [_correlate(windows[group], group < segments - 1) for group in groups]
-    return torch.cat(correlations).mean()
+    # As in pyclarity, one ear alone is not used in the last segment of an item.
+    correlations = [
+        _correlate(windows[group], to_end[group] > SEGMENT + 1)
+        for group in starts.split(segments_at_once)
+    ]
+    items = torch.cat(correlations).split([count - SEGMENT for count in counts])
+    return torch.stack([item.mean() for item in items])
 
 
 def _band_matrix() -> NDArray[np.float64]:

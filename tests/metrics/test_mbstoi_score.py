@@ -2,7 +2,6 @@
 
 import math
 import runpy
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.dsp.resample import resample
-from hlsim.metrics import mbstoi
+from hlsim.metrics import mbstoi, mbstoi_score
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
@@ -93,9 +92,22 @@ def test_a_batch_equals_its_items_in_any_number_of_segments_at_once(
     items = [mbstoi(y, x) for y, x in zip(noisy, clean, strict=True)]
     expected = torch.stack(items)[:, None]
     assert torch.equal(mbstoi(noisy[:, None], clean[:, None]), expected)
-    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi_score"], "CPU_SEGMENTS", 7)
+    monkeypatch.setattr(mbstoi_score, "CPU_SEGMENTS", 7)
     scores = mbstoi(noisy[:, None], clean[:, None])
     torch.testing.assert_close(scores, expected, atol=1e-12, rtol=0.0)
+
+
+def test_items_at_once_as_on_a_gpu_equal_items_and_their_gradients(
+    scenes: tuple[Tensor, Tensor],
+) -> None:
+    clean, noisy = (signal.clone() for signal in scenes)
+    clean[1, :, 6000:14000] = 0.0  # items of different lengths without their pauses
+    signals = torch.stack([clean, noisy], 1).requires_grad_()
+    at_once = mbstoi_score._score_batch(signals, 16000)
+    items = [mbstoi_score._score_batch(item[None], 16000) for item in signals]
+    torch.testing.assert_close(at_once, torch.cat(items), atol=1e-12, rtol=0.0)
+    gradients = [torch.autograd.grad(s.sum(), signals)[0] for s in (at_once, torch.cat(items))]
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)
 
 
 def test_the_level_does_not_count_and_less_noise_is_better(scenes: tuple[Tensor, Tensor]) -> None:
