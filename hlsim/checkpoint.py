@@ -78,7 +78,10 @@ def read_checkpoint(
             f"{folder}: expected a checkpoint of kind {' or '.join(kinds)}, got {kind}; load it "
             f"with {_loader_name(kind)}"
         )
-    weights = (folder / WEIGHTS).read_bytes()
+    try:
+        weights = (folder / WEIGHTS).read_bytes()
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot read {WEIGHTS}: {error}") from error
     settings: Any = record.get("config")
     digests = {
         WEIGHTS: (hashlib.sha256(weights).hexdigest(), record.get("sha256")),

@@ -199,6 +199,8 @@ def listen(
                 f"expected shape (time,) or (2, time), got {tuple(tensor.shape)} for {label!r}; "
                 "pass one item, such as x[0]"
             )
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(f"some samples of {label!r} are NaN or infinite; leave it out")
         pascals[label.replace("_", " ")] = tensor * gain
     return Players(pascals, check_rate(sample_rate))
 

@@ -95,6 +95,9 @@ def test_changed_weights_are_rejected(folder: Path) -> None:
         path.write_bytes(weights[:place] + bytes([weights[place] ^ 1]) + weights[place + 1 :])
         with pytest.raises(ValueError, match="SHA-256"):
             load_pretrained(folder)
+    path.unlink()
+    with pytest.raises(ValueError, match=r"cannot read model\.safetensors"):
+        load_pretrained(folder)
 
 
 def test_a_changed_configuration_is_rejected_whatever_the_order_of_names(folder: Path) -> None:

@@ -100,6 +100,10 @@ REJECTED: dict[str, tuple[Callable[[Path], object], str]] = {
     "infinity": (lambda _: hlsim.simulate(SPEECH / 0.0, "N3"), "NaN or infinity in 1"),
     "no player": (lambda _: hlsim.listen(), "pass signals by name"),
     "a batch to play": (lambda _: hlsim.listen(batch=torch.ones(3, 99)), "got .3, 99. for 'batch'"),
+    "a diverged output to play": (
+        lambda _: hlsim.listen(x=torch.ones(99) / 0.0),
+        "NaN or infinite",
+    ),
     "unknown aid": (lambda _: hlsim.compensate(SPEECH, "N3", compensator="none"), "'none'"),
     "URL": (lambda _: hlsim.load_audio("https://a.wav"), "there is no such audio file"),
     "rate as text": (lambda path: hlsim.load_audio(path, sample_rate="16000"), r"'16000' \(str\)"),

@@ -246,7 +246,7 @@ def _make_conditions(
 
 def _folder_name(condition: Condition) -> str:
     """Return the name of the folder for the signals of a condition."""
-    return re.sub(r"[^\w.+-]+", "-", condition.name)
+    return re.sub(r"[^\w.+-]+", "-", condition.name).strip(".-")
 
 
 @torch.no_grad()

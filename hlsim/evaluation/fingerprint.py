@@ -41,11 +41,12 @@ def fingerprint(processing: Any) -> str | None:
     >>> fingerprint(abs) is None
     True
     """
+    name = _name(processing)
     if isinstance(processing, WaveformPlugin):
-        processing = processing.function
+        name, processing = processing.name, processing.function
     stated = getattr(processing, "fingerprint", None)
     if stated is not None:
-        return value_hash([_name(processing), str(stated)])
+        return value_hash([name, str(stated)])
     if not isinstance(processing, nn.Module):
         return None
     tensors = dict([*processing.named_parameters(), *processing.named_buffers()])

@@ -226,6 +226,7 @@ def _draw_clips(
     Shape of speech and noise: (time,).
     """
     check_number("items", items, 1)
+    check_number("seconds", seconds, 0.02)
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
     noises = None
     if noise is not None:

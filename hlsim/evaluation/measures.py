@@ -64,7 +64,7 @@ MEASURES = {
 
 
 def find_measures(names: Sequence[str]) -> list[Measure]:
-    """Return the measures of some names.
+    """Return the measures of some names, without duplicates.
 
     Args:
         names: Names in ``MEASURES``, or ``package.module:name`` of your own functions.
@@ -79,7 +79,9 @@ def find_measures(names: Sequence[str]) -> list[Measure]:
     check_names([name for name in names if ":" not in name], MEASURES, "measures")
     if "pesq" in names:
         require("pesq", "pesq")
-    return [MEASURES[name] if name in MEASURES else load_measure(name) for name in names]
+    return [
+        MEASURES[name] if name in MEASURES else load_measure(name) for name in dict.fromkeys(names)
+    ]
 
 
 class _PluginMeasure:

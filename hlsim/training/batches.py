@@ -374,7 +374,8 @@ def _make_data(
         validation: Batches from which those for validation are drawn once.
         teacher: See ``BatchData``.
     """
-    shared = set(training.speech.files) & set(validation.speech.files)
+    valid_files = {path.resolve() for path in validation.speech.files}
+    shared = {path.resolve() for path in training.speech.files} & valid_files
     if data.valid_speech and shared:
         raise ValueError(
             f"{len(shared)} files are used for both training and validation, such as "

@@ -173,6 +173,8 @@ class CompensatorRecipe(TrainingRecipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        expected = "2 or more, because babble consists of the other items"
+        self._require("batch", self.batch > 1 or not self.babble, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"
             self._require("kind", self.kind == "hearing-aid", expected)

@@ -152,6 +152,7 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
     for changes in (
         {"compensators": {"NAL-R": Unaided()}},
         {"items": 0},
+        {"seconds": 0.01},
         {"audiogram": Audiogram.standard("N7")},
         {"enhancers": ["no_such:module"]},
         {"audiograms": "ears.csv"},

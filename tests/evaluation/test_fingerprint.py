@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import list_pretrained
 from hlsim.evaluation.fingerprint import fingerprint
+from hlsim.plugins import WaveformPlugin
 
 N3 = Audiogram.standard("N3")
 
@@ -59,6 +61,14 @@ def test_settings_of_any_describable_type_count() -> None:
     assert fingerprints == [fingerprint(Foreign(setting)) for setting in settings]
     moved = type("Foreign", (Foreign,), {"__module__": "elsewhere", "__qualname__": "Foreign"})
     assert fingerprint(moved(1.0)) == fingerprint(Foreign(1.0)), "the place of a class is ignored"
+
+
+def test_functions_of_one_name_in_two_files_have_two_fingerprints(tmp_path: Path) -> None:
+    fingerprints = set()
+    for name in ("a.py", "b.py"):
+        (tmp_path / name).write_text("def half(x, rate): return x / 2\nhalf.fingerprint = '1'")
+        fingerprints.add(fingerprint(WaveformPlugin(f"{tmp_path / name}:half", "enhancer")))
+    assert len(fingerprints) == 2 and None not in fingerprints
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,8 @@ def test_a_score_is_that_of_the_metric_and_is_read_again(corpus: Path) -> None:
 
 
 def test_a_single_condition_is_scored_without_a_comparison(corpus: Path) -> None:
-    settings: dict[str, Any] = {"audiogram": N4, "spl": 65.0, "jobs": 1, "measures": ["stoi"]}
+    settings: dict[str, Any] = {"audiogram": N4, "spl": 65.0, "jobs": 1}
+    settings["measures"] = ["stoi", "stoi"]
     manifest = write_manifest(corpus, "condition,clean,processed\nmine,A,after/a.b.wav\n")
     for report in (
         haspi_report(corpus / "clean", after=corpus / "after", **settings),

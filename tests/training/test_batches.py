@@ -90,7 +90,7 @@ def test_validation_is_on_other_speech_where_there_is_some(manifest: Path) -> No
     with pytest.raises(ValueError, match="an empty list"):
         load(TrainingData.from_manifest(manifest))
     with pytest.raises(ValueError, match="both training and validation"):
-        load(TrainingData(manifest.parent, valid_speech=manifest.parent / "clean"))
+        load(TrainingData(manifest.parent, valid_speech=manifest.parent / "noisy/../clean"))
 
 
 def test_other_files_are_another_training(manifest: Path) -> None:

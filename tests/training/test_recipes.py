@@ -70,6 +70,7 @@ def test_the_help_describes_every_setting() -> None:
         (CompensatorRecipe, {"weights": {"bands": 0.0}}),
         (CompensatorRecipe, {"weights": {"denoising": 1.0}}),  # There is no noise reduction.
         (CompensatorRecipe, {"unreduced": 0.5}),
+        (CompensatorRecipe, {"babble": 0.5, "batch": 1}),
     ],
 )
 def test_invalid_settings_are_rejected(recipe: Any, settings: dict[str, Any]) -> None:
