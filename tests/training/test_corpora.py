@@ -160,6 +160,8 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         read_manifest(tmp_path / "a" / "m.csv")
     (tmp_path / "m.csv").write_text("seconds,path\n2.5,a/1.wav\n")
     assert read_manifest(tmp_path / "m.csv") == [Utterance("a/1.wav")]
+    with pytest.raises(ValueError, match="no manifest; choose another name"):
+        write_manifest(tmp_path / "m.csv", UTTERANCES)
 
 
 @pytest.mark.parametrize(

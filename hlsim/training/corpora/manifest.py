@@ -97,7 +97,8 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
         utterances: Rows of the manifest.
 
     Raises:
-        ValueError: The file cannot be written, or its name does not end in .csv.
+        ValueError: The file cannot be written, its name does not end in .csv, or it exists and is
+            no manifest.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -106,8 +107,11 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     path,noisy,speaker,split
     1.wav,,,train
     """
-    if Path(path).suffix != ".csv":
+    target = Path(path)
+    if target.suffix != ".csv":
         raise ValueError(f"{path}: expected the name of a manifest, which ends in .csv")
+    if target.is_file() and not target.read_bytes().startswith(",".join(COLUMNS).encode()):
+        raise ValueError(f"{path}: would replace a file that is no manifest; choose another name")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
