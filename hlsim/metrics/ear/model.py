@@ -42,6 +42,7 @@ from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import (
     BLOCK,
     RATE,
+    Recursion,
     adaptation,
     apply_filter,
     gain_lowpass,
@@ -207,24 +208,39 @@ def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
     return bandwidth * constant_like(bandwidth, _normal_decay)[channels]
 
 
-def _apply_gammatones(bandwidth: Tensor, channels: slice, signal: Tensor) -> tuple[Tensor, Tensor]:
-    """Filter signals by gammatones, and return the real part and the power of the envelope.
+def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recursion:
+    """Return the gammatones of some channels.
 
     Args:
         bandwidth: Bandwidths of the filters, relative to normal hearing, which are the same for all
             items, or those of each item. Shape: (channels,) or (items, channels).
         channels: The channels.
+        dtype: Precision of the filters.
+    """
+    centres = constant(centre_frequencies, dtype=torch.float64, device=bandwidth.device)[channels]
+    # The response of normal and wider filters has vanished after this number of samples.
+    memory = math.ceil(50.0 / float(_normal_decay()[channels.start]))
+    angles = centres * (2.0 * math.pi / RATE)
+    return gammatone(_decay(bandwidth, channels), angles, memory, dtype)
+
+
+def _control_filters(start: int, stop: int, device: torch.device, dtype: torch.dtype) -> Recursion:
+    """Return the control filters of the channels from ``start`` to before ``stop``."""
+    channels = slice(start, stop)
+    return _gammatones(_control_bandwidth(device)[channels], channels, dtype)
+
+
+def _apply_gammatones(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
+    """Filter signals by gammatones, and return the real part and the power of the envelope.
+
+    Args:
+        filters: The gammatones.
         signal: Signals. Shape: (items, padded).
 
     Returns:
         Real part in blocks, (items, channels, padded / 64, 64), and power, (items, channels,
         padded).
     """
-    centres = constant(centre_frequencies, dtype=torch.float64, device=signal.device)[channels]
-    # The response of normal and wider filters has vanished after this number of samples.
-    memory = math.ceil(50.0 / float(_normal_decay()[channels.start]))
-    angles = centres * (2.0 * math.pi / RATE)
-    filters = gammatone(_decay(bandwidth, channels), angles, memory, signal.dtype)
     # Torch rounds products of tensors with a dimension for items differently.
     output = filters(signal)[None] if len(signal) == 1 else filters(signal[:, None])
     real, imaginary = output.split(BLOCK, -1)
@@ -236,8 +252,10 @@ def _control_power(signal: Tensor, channels: slice) -> Tensor:
 
     Shape: (items, padded) -> (items, channels, padded).
     """
-    bandwidth = compute_once(_control_bandwidth, signal.device)[channels]
-    return _apply_gammatones(bandwidth, channels, signal)[1]
+    filters = compute_once(
+        _control_filters, channels.start, channels.stop, signal.device, signal.dtype
+    )
+    return _apply_gammatones(filters, signal)[1]
 
 
 def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Extent) -> Tensor:
@@ -305,7 +323,8 @@ def simulate_cochlea(
     cells = ear[..., channels]
     control = _control_power(signal, channels)
     bandwidth = _bandwidths(control, cells, channels, extent)
-    real, power = _apply_gammatones(bandwidth.squeeze(0), channels, signal)
+    filters = _gammatones(bandwidth.squeeze(0), channels, signal.dtype)
+    real, power = _apply_gammatones(filters, signal)
     gain = _compression_gain(control, cells)
     compressed = power * gain.square()
     if not motion:
