@@ -180,6 +180,8 @@ def _read_pairs(
             raise ValueError(f"{scenes_listeners}: {folder} has no scene {scene!r}; correct one")
         if len(people[name].ears()) < 2:
             raise ValueError(f"{listeners}: listener {name!r} lacks an ear; add its audiogram")
+        if Path(name).name != name:
+            raise ValueError(f"{listeners}: listener {name!r} cannot name a file; rename it")
         candidates = [folder / f"{scene}{ending}" for ending in _REFERENCE_ENDINGS]
         reference = next(filter(Path.is_file, candidates), None)
         if reference is None:

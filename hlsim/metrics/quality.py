@@ -110,6 +110,8 @@ class QualityReference(Reference):
     True
     """
 
+    _needs_ear = True
+
     envelope_segment: ClassVar[int]
     """Samples of a segment of the smoothed envelopes at 24 kHz."""
 

@@ -80,6 +80,8 @@ class Reference(ABC):
     True
     """
 
+    _needs_ear = False  # Whether the features of clean signals depend on the ear.
+
     def __init__(
         self,
         clean: Tensor,
@@ -108,7 +110,7 @@ class Reference(ABC):
                 "because a score means nothing below; pass longer signals"
             )
         check_finite("clean", self._rows)
-        if audiogram is not None:
+        if self._needs_ear or audiogram is not None:
             self._ears = self._thresholds(audiogram)
             self._ears_on_host = self._thresholds(audiogram, host=True)
         self._groups = [slice(0, items)]

@@ -332,6 +332,7 @@ BAD_ARGUMENTS: list[dict[str, Any]] = [
     {"processed": torch.zeros(12800, device="meta")},
     {"audiogram": torch.full((8,), 130.0)},
     {"audiogram": [N3, N3]},
+    {"audiogram": None},
     {"sample_rate": 8000},
     {"full_scale_spl": -1.0},
     {"lengths": 9000},
