@@ -203,6 +203,8 @@ def _copy(func: Any, args: Any, kwargs: dict[str, Any], on_device: bool) -> Any:
         count_wait("copy to the host")
     elif on_device and not isinstance(source, PretendTensor) and source.ndim and waits_for_it:
         count_wait("blocking copy to the device")
+    elif target.ndim == source.ndim == 0:
+        count_wait("assignment of a number to one element, which a GPU copies from the host")
     func(*tree_map(inner, args), **tree_map(inner, kwargs))
     return target
 

@@ -55,9 +55,10 @@ class _RFFT(torch.autograd.Function):
         # The inverse counts each frequency twice, except 0 Hz and, for even lengths, the last one.
         # The weights are complex because torch would convert real ones for each item.
         weights = gradient.new_full(gradient.shape[-1:], 0.5)
-        weights[0] = 1.0
+        # An assignment to a single number would make the host wait for a GPU.
+        weights[0].fill_(1.0)
         if ctx.points % 2 == 0:
-            weights[-1] = 1.0
+            weights[-1].fill_(1.0)
         slope = torch.fft.irfft(gradient * weights, ctx.points, norm="forward")
         return slope[..., : ctx.time], None
 
