@@ -29,7 +29,10 @@ _COMPARISON = (
     "that clinics know, amplified to the same output level. This comparison was planned before "
     "the scores were known."
 )
-_LISTEN = "One utterance of a voice that the aid was not trained on."
+_LISTEN = (
+    "One utterance of a voice that the aid was not trained on. Its words: My father fixed the "
+    "broken zip with a pair of pliers."
+)
 _ABOUT_PICTURES = (
     "The aid started from the gains of NAL-R, and was trained for this ear through Neuro-MSBG for "
     "{steps} steps, so that the ear perceives speech as loud as a normal ear does, in "

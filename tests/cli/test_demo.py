@@ -6,6 +6,7 @@ from statistics import fmean
 
 import pytest
 
+from hlsim.cli.demo_study import SPEECH
 from tests.helpers import run_short_demo
 
 pytest.importorskip("lightning")
@@ -41,4 +42,8 @@ def test_demo_writes_a_page_that_agrees_with_the_table(tmp_path: Path, speech_di
     for name in names:
         assert f">{means[name]:.3f}</td>" in page
     assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0
+    # the words beside the player are those of the utterance that is played, the last one
+    transcripts = (SPEECH / "README.md").read_text().splitlines()
+    (row,) = [line for line in transcripts if f"/{rows[-1]['name']}.flac" in line]
+    assert f"Its words: {row.split(' | ')[2]}" in page
     assert "for 20 steps" in page and "exceeds 110 dB SPL" in page
