@@ -102,7 +102,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def make_parser(command: str) -> Parser:
-    """Make the parser of a command, whose module only now is imported.
+    """Make the parser of a command, after importing the module that declares its options.
 
     >>> make_parser("prepare").prog
     'hlsim prepare'

@@ -177,7 +177,7 @@ def _read_pairs(
     pairs = []
     for scene, name in names:
         if scene not in mixes:
-            raise ValueError(f"{scenes_listeners}: {folder} has no scene {scene!r}; correct one")
+            raise ValueError(f"{scenes_listeners}: no scene {scene!r} in {folder}; correct it")
         if len(people[name].ears()) < 2:
             raise ValueError(f"{listeners}: listener {name!r} lacks an ear; add its audiogram")
         if Path(name).name != name:

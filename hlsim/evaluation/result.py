@@ -99,7 +99,7 @@ class Evaluation:
 
     @property
     def aids(self) -> list[str]:
-        """Names of the conditions that are compared with others, which are of the kind aid."""
+        """Names of the aids: conditions of the kind ``aid``, which are compared with the others."""
         return [condition.name for condition in self.conditions if condition.kind == "aid"]
 
     @property

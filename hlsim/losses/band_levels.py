@@ -145,7 +145,7 @@ def audibility_weights(levels: Tensor, threshold: Tensor) -> Tensor:
 
 
 def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor, float]:
-    """Return what computes band powers: a Fourier transform, weights of its bins, and a factor.
+    """Design the computation of band powers: Fourier transform, weights of its bins, and factor.
 
     Args:
         like: Tensor with the type and the device of the weights.

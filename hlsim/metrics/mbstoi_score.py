@@ -174,9 +174,13 @@ def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
 
 
 def _frames_to_end(counts: list[int], device: torch.device) -> Tensor:
-    """Return the number of frames from each frame, which counts, to the end of its item.
+    """Count, for each frame, the frames of its item that are not before it.
 
-    Shape: (frames of all items,).
+    Args:
+        counts: Number of frames of each item.
+        device: Device of the result.
+
+    Returns: Counts, such as 3, 2, 1 for an item of three frames. Shape: (frames of all items,).
     """
     return torch.cat([torch.arange(count, 0, -1, device=device) for count in counts])
 

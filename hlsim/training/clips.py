@@ -97,9 +97,10 @@ class Clips:
                 waveform = torch.zeros(1)
             peak = max(float(waveform.abs().max()), _LOWEST_PEAK)
             self._recordings[index] = (waveform / peak * 32767.0).round().to(torch.int16)
-            while sum(map(len, self._recordings.values())) > MAX_SAMPLES_IN_MEMORY:
+            sizes = [len(samples) for samples in self._recordings.values()]
+            while len(sizes) > 1 and sum(sizes) > MAX_SAMPLES_IN_MEMORY:
                 oldest = next(iter(self._recordings))
-                del self._recordings[oldest]
+                del self._recordings[oldest], sizes[0]
         return self._recordings[index].float() / 32767.0
 
     def cut_clip(self, index: int, position: float) -> Tensor:
