@@ -1,26 +1,29 @@
-"""Outputs and gradients equal those in the golden file, bit by bit on the machine that wrote it."""
+"""Outputs and gradients keep to the golden file: within tolerances, or bit by bit if asked for."""
 
 import pytest
 
-from tests.golden import CASES, compute, environment, read_file
+from tests.golden import CASES, COMMITTED_FILE, LOCAL_FILE, compute, read_file
 
-MADE_IN, _, SUMMARIES = read_file()
-SAME_MACHINE = environment() == MADE_IN
+_, SUMMARIES = read_file(LOCAL_FILE or COMMITTED_FILE)
 
 
-def test_file_holds_every_case() -> None:
-    assert SUMMARIES.keys() == CASES.keys()
+def test_committed_file_holds_every_case() -> None:
+    _, committed = read_file(COMMITTED_FILE)
+    assert committed.keys() == CASES.keys()
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_case_is_unchanged(name: str) -> None:
-    case = CASES[name]
-    expected, computed = SUMMARIES[name], compute(case)
+    if LOCAL_FILE and name not in SUMMARIES:
+        pytest.skip(f"{LOCAL_FILE} was written before this case existed")
+    case, expected = CASES[name], SUMMARIES[name]
+    computed = compute(case)
     assert computed.keys() == expected.keys()
     for output, summary in computed.items():
         if summary.digest == expected[output].digest:
             continue
         difference = expected[output].difference(summary)
-        allowed = 0.0 if SAME_MACHINE and not case.may_change else case.tolerance_of(output)
-        assert allowed, f"{output}: other bits, {difference:.1e} of the peak away"
-        assert difference <= allowed, f"{output}: {difference:.1e} of the peak away"
+        assert not LOCAL_FILE, f"{output}: other bits, {difference:.1e} of the peak away"
+        assert difference <= case.tolerance_of(output), (
+            f"{output}: {difference:.1e} of the peak away"
+        )
