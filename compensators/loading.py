@@ -11,9 +11,8 @@ from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record, save_checkpoint
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.version import __version__
 
 Trained = MappingCompensator | HearingAid

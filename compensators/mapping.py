@@ -11,13 +11,12 @@ from torch.nn import functional
 from compensators.config import MappingConfig
 from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
-from compensators.nalr import nalr_gains_db
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import interpolate
-from hlsim.calibration import PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
 from hlsim.neuro.blocks import DualPathBlock
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork

@@ -32,7 +32,7 @@ from compensators.filter_bank import (
 )
 from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
-from compensators.nalr import nalr_gains_db
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,

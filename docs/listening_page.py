@@ -131,8 +131,8 @@ def _export_models(folder: Path) -> None:
     import onnxruntime
 
     from hlsim import load_compensator, load_pretrained
+    from hlsim.calibration import NEURO_RATE
     from hlsim.export import export_aid, export_fit, export_onnx
-    from hlsim.neuro.config import NEURO_RATE
 
     aid = load_compensator(AID)
     with tempfile.TemporaryDirectory() as scratch:

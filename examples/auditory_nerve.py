@@ -27,9 +27,9 @@ from torch import nn
 from compensators import NALR, WDRC, load_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.augment import mix
+from hlsim.data.clips import Clips
 from hlsim.evaluation.items import read_ears
-from hlsim.training.augment import mix
-from hlsim.training.clips import Clips
 
 RATE = 16000  # Hz
 MODEL_RATE = 100_000  # Hz

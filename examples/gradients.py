@@ -18,8 +18,8 @@ from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import set_level
-from hlsim.training.augment import mix
-from hlsim.training.clips import Clips
+from hlsim.data.augment import mix
+from hlsim.data.clips import Clips
 
 RATE = 16000
 HALF_HOP = 12  # samples

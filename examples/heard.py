@@ -16,6 +16,7 @@ from compensators import load_compensator
 from hlsim import MSBG, Audiogram, list_pretrained, load_pretrained
 from hlsim.audio import read_audio
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.report.players import spectrogram_levels
 
@@ -33,7 +34,7 @@ AIDS = {
 
 def read_speech() -> Tensor:
     """Read an utterance that ships with hlsim, at 65 dB SPL. Shape: -> (time,)."""
-    waveform, rate = read_audio(ROOT / "hlsim" / "data" / "speech" / "valid" / "flite-rms-01.flac")
+    waveform, rate = read_audio(EXAMPLE_FILE)
     return set_level(resample(waveform[0], rate, RATE), 65.0)
 
 

@@ -54,14 +54,14 @@ from hlsim import MSBG, Audiogram
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
+from hlsim.data.augment import mix
+from hlsim.data.clips import Clips
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
 from hlsim.files import read_table, sha256
 from hlsim.plugins import load_plugin
-from hlsim.training.augment import mix
-from hlsim.training.clips import Clips
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hlsim.data.clips import Clips
 from hlsim.metrics import mbstoi
-from hlsim.training.clips import Clips
 
 HEAD_SECONDS = 0.0875 / 343.0  # time in which sound travels the radius of the head, 8.75 cm
 

@@ -25,9 +25,9 @@ from examples.enhancers import GTCRN, DeepFilterNet3, RNNoise
 from hlsim import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.augment import mix
+from hlsim.data.clips import Clips
 from hlsim.metrics import haspi
-from hlsim.training.augment import mix
-from hlsim.training.clips import Clips
 
 RATE, SECONDS, LEVEL = 16000, 3.0, 65.0
 

@@ -20,8 +20,8 @@ from hlsim import MSBG, Audiogram
 from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, STANDARD
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import set_level
-from hlsim.training.clips import Clips
-from hlsim.training.ears import draw_thresholds
+from hlsim.data.clips import Clips
+from hlsim.data.ears import draw_thresholds
 
 
 def error_at_44100_hz(signal: torch.Tensor, ear: Audiogram) -> float:

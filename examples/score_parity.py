@@ -23,8 +23,8 @@ from torch import Tensor
 from compensators import NALR
 from hlsim import Audiogram
 from hlsim.calibration import set_level
+from hlsim.data.clips import Clips
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference
-from hlsim.training.clips import Clips
 
 PYCLARITY = {"haspi": haspi_v2, "hasqi": hasqi_v2, "haaqi": partial(haaqi_v1, equalisation=1)}
 RATE = 16000

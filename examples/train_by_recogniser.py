@@ -41,11 +41,11 @@ from compensators import HearingAid, load_compensator, save_compensator
 from hlsim import MSBG
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
-from hlsim.losses.band_levels import band_level_loss
-from hlsim.metrics.score_loss import score_loss
-from hlsim.training.augment import draw_uniform, mix
-from hlsim.training.clips import Clips
-from hlsim.training.ears import draw_thresholds
+from hlsim.data.augment import draw_uniform, mix
+from hlsim.data.clips import Clips
+from hlsim.data.ears import draw_thresholds
+from hlsim.losses.score_loss import score_loss
+from hlsim.metrics.band_levels import band_level_loss
 
 SECONDS = 3.0  # duration of the clips
 PADDING_SECONDS = 1  # silence after them, as the machine listener's inputs have whole seconds

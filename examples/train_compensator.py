@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
+from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
-from hlsim.training.clips import Clips
 
 SAMPLE_RATE = 16000
 POWER_FLOOR = 1e-11

@@ -21,10 +21,10 @@ from torch import Tensor
 
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
+from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
-from hlsim.losses.band_levels import band_edges, band_levels
 from hlsim.metrics import HaspiReference, HasqiReference
-from hlsim.training.clips import Clips
+from hlsim.metrics.band_levels import band_edges, band_levels
 
 RATE, SECONDS, SPL = 16000, 3.0, 65.0
 TALKERS, EARS = 4, ("N2", "N3", "N4")

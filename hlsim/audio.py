@@ -34,8 +34,8 @@ def read_audio(path: str | Path) -> tuple[Tensor, int]:
         ValueError: There is no such file; libsndfile cannot read it; it is empty, silent, or holds
             NaN or infinity; or its sample rate is below 16 kHz.
 
-    >>> import hlsim
-    >>> samples, rate = read_audio(hlsim.shortcuts.EXAMPLE_FILE)
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> samples, rate = read_audio(EXAMPLE_FILE)
     >>> samples.shape, rate
     (torch.Size([1, 64320]), 16000)
     """
@@ -126,8 +126,8 @@ def find_audio(folder: str | Path) -> list[Path]:
     Raises:
         ValueError: There is no such folder, or no audio in it.
 
-    >>> import hlsim
-    >>> [path.name for path in find_audio(hlsim.shortcuts.EXAMPLE_FILE.parent)][:1]
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> [path.name for path in find_audio(EXAMPLE_FILE.parent)][:1]
     ['espeak-scotland-m7-01.flac']
     """
     root = Path(folder)

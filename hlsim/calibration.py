@@ -13,6 +13,9 @@ from hlsim.checks import check_number, check_time_last, describe, is_finite
 PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
 
+NEURO_RATE = 16000
+"""Sample rate in Hz at which the networks work, and default rate of every function."""
+
 POWER_FLOOR = 1e-20
 """Power of -106 dB SPL in Pa^2, to which lower powers are raised, so that all levels are finite."""
 

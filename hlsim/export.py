@@ -53,11 +53,10 @@ from compensators.limiter import soft_limit
 from compensators.wearable import Wearable
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import gain_to_pascals
+from hlsim.calibration import NEURO_RATE, gain_to_pascals
 from hlsim.extras import require
 from hlsim.files import atomic_path
 from hlsim.neuro import NeuroMSBG
-from hlsim.neuro.config import NEURO_RATE
 
 TOLERANCE = 1e-4
 """Largest error of an ONNX file, relative to the peak of the output."""

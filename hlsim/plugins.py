@@ -1,4 +1,4 @@
-"""Plug-ins: teachers, enhancers, aids and measures from your own code, loaded by name."""
+"""Plug-ins: simulators, enhancers, aids and measures from your own code, loaded by name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def load_plugin(name: str, kind: str) -> Any:
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
-        kind: Noun for the object in error messages, such as ``"teacher"``.
+        kind: Noun for the object in error messages, such as ``"simulator"``.
 
     Raises:
         ValueError: The name has another form, the import fails, or the object does not exist.
@@ -65,12 +65,12 @@ def load_plugin(name: str, kind: str) -> Any:
 class WaveformPlugin:
     """Your own function or ``nn.Module`` from waveform to waveform, with validated outputs.
 
-    Calls compute no gradients. A module is set to evaluation mode and moved to the device of its
+    A module is set to evaluation mode and moved to the device of its
     input.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
-        kind: Noun for the plug-in in error messages: ``"teacher"``, ``"enhancer"`` or ``"aid"``.
+        kind: Noun for the plug-in in error messages: ``"simulator"``, ``"enhancer"`` or ``"aid"``.
 
     Attributes:
         function: The function or module that was loaded. Its author changes its attribute
@@ -103,7 +103,11 @@ class WaveformPlugin:
 
     @torch.no_grad()
     def __call__(self, waveform: Tensor, *arguments: Any) -> Tensor:
-        """Call the plug-in.
+        """Call the plug-in without computing gradients; see ``call``."""
+        return self.call(waveform, *arguments)
+
+    def call(self, waveform: Tensor, *arguments: Any) -> Tensor:
+        """Call the plug-in, and validate its output.
 
         Shape: (..., time) -> (..., time), in the precision of the waveform. The output of an aid
         may have another duration.
@@ -113,8 +117,9 @@ class WaveformPlugin:
             arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: The plug-in fails, or its output is not a real, finite tensor of the same
-                shape.
+            ValueError: The plug-in fails, its output is not a real tensor of the expected shape,
+                or it is not finite. Samples of an output with a gradient may be NaN or infinite, so
+                that a gradient scaler can detect them.
         """
         if isinstance(self.function, nn.Module):
             self.function.to(waveform.device)
@@ -131,7 +136,7 @@ class WaveformPlugin:
                 f"{tuple(getattr(output, 'shape', ()))}, expected a real tensor of shape "
                 f"{tuple(waveform.shape)}"
             )
-        if not bool(output.isfinite().all()):
+        if not output.requires_grad and not bool(output.isfinite().all()):
             raise ValueError(f"{self.kind} {self.name} returned samples that are NaN or infinite")
         return output.to(waveform)
 

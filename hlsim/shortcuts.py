@@ -15,17 +15,16 @@ from torch import Tensor
 from compensators import load_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL, gain_to_pascals, set_level
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals, set_level
 from hlsim.checks import check_rate
+from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.files import write_atomically
-from hlsim.losses.frozen_simulator import build_simulator
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.simulators import load_simulator
 from hlsim.version import __version__
 
 Audio = TypeVar("Audio", Tensor, NDArray[Any])
 
-EXAMPLE_FILE = Path(__file__).parent / "data" / "speech" / "valid" / "flite-rms-01.flac"
 EXAMPLE_SPL = 65.0
 """Level of conversational speech in dB SPL."""
 
@@ -54,7 +53,8 @@ def load_audio(
 
     Example:
         >>> import hlsim
-        >>> speech, rate = hlsim.load_audio(hlsim.shortcuts.EXAMPLE_FILE, spl=65.0)
+        >>> from hlsim.data.bundled import EXAMPLE_FILE
+        >>> speech, rate = hlsim.load_audio(EXAMPLE_FILE, spl=65.0)
         >>> speech.ndim, rate
         (1, 16000)
     """
@@ -101,7 +101,7 @@ def simulate(
             mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         simulator: ``"msbg"``, the exact model; the name or folder of a checkpoint such as
-            ``"neuro-msbg"``; or a module.
+            ``"neuro-msbg"``; ``package.module:name``, a simulator of your own; or a module.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
 
     Returns:
@@ -116,7 +116,7 @@ def simulate(
         >>> perceived.shape
         torch.Size([64320])
     """
-    model = build_simulator(simulator, sample_rate, full_scale_spl)
+    model = load_simulator(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     with torch.no_grad():
         return _as_input(model(_as_finite_tensor(audio), ear), audio)
 

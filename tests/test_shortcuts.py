@@ -10,7 +10,7 @@ import torch
 
 import hlsim
 from hlsim.calibration import level_spl
-from hlsim.shortcuts import EXAMPLE_FILE
+from hlsim.data.bundled import EXAMPLE_FILE
 
 SPEECH = hlsim.example_speech()[8000:24000]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from compensators import load_compensator
 from hlsim import MSBG
 from hlsim.calibration import level_spl
-from hlsim.training.clips import Clips
+from hlsim.data.clips import Clips
 from tests.helpers import EXAMPLES, load_example
 
 WIDTH, TOKENS, PROMPT = 64, 12, [10, 11]

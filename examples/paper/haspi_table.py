@@ -14,16 +14,16 @@ import sys
 from pathlib import Path
 
 import torch
+from instances import Instances, draw_ears
 
 from compensators import load_compensator
 from hlsim.audio import write_audio
 from hlsim.audiogram.table import read_audiograms
+from hlsim.calibration import NEURO_RATE
 from hlsim.cli.progress import show_progress
+from hlsim.data.layouts import find_corpus
 from hlsim.evaluation import haspi_report
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.recordings import write_report
-from hlsim.training.corpora.instances import Instances, draw_ears
-from hlsim.training.corpora.layouts import find_corpus
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -14,7 +14,7 @@ from torchaudio.models import ConvTasNet
 
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.training.clips import Clips
+from hlsim.data.clips import Clips
 
 
 def conv_tasnet() -> ConvTasNet:

@@ -16,7 +16,7 @@ from examples.training.dead_region import DeadRegion
 from examples.training.filter_bank import SAMPLE_RATE, train_filter_bank
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.training.clips import Clips
+from hlsim.data.clips import Clips
 
 BANDS = {"under 1 kHz": (100, 1000), "1 to 2 kHz": (1000, 2000), "above 4 kHz": (4000, 8000)}
 """Lowest and highest frequency in Hz of the bands whose levels are printed."""

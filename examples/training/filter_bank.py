@@ -18,9 +18,9 @@ from torch.nn import functional
 from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
 from hlsim.metrics import haspi, hasqi
-from hlsim.training.clips import Clips
 
 SAMPLE_RATE = 16000
 FFT = 256

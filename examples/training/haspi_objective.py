@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import Audiogram, HASPILoss, HearingLossLoss
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.training.clips import Clips
+from hlsim.data.clips import Clips
 
 LOSSES: dict[str, Callable[[Audiogram], HearingLossLoss]] = {
     "default loss": HearingLossLoss,

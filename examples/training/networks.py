@@ -31,15 +31,15 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import Audiogram, HASPILoss, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.augment import mix
+from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
 from hlsim.evaluation.aids import AtLevelOf
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.study import Measure, run_study
-from hlsim.losses.band_levels import band_edges
 from hlsim.losses.waveform import noise_to_signal_db
 from hlsim.metrics import haspi, hasqi
-from hlsim.training.augment import mix
-from hlsim.training.clips import Clips
+from hlsim.metrics.band_levels import band_edges
 
 
 class Mask(nn.Module):

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.losses.band_levels import band_levels
+from hlsim.metrics.band_levels import band_levels
 
 SAMPLE_RATE = 16000
 

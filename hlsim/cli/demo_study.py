@@ -10,7 +10,8 @@ import torch
 from compensators import NALR, load_compensator
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import set_level
+from hlsim.calibration import NEURO_RATE, set_level
+from hlsim.data.bundled import SPEECH
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aid_properties import measure_aids, measure_gain_curve
 from hlsim.evaluation.aids import AtLevelOf, Unaided
@@ -20,7 +21,6 @@ from hlsim.evaluation.measures import LEVELS, MEASURES, NORMAL, PERCEPTION, perc
 from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.demo import (
     NAL_R,
     NAL_R_AT_LEVEL,
@@ -34,9 +34,6 @@ from hlsim.report.players import NORMAL_EAR
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
-
-SPEECH = Path(__file__).parents[1] / "data" / "speech"
-"""Folder of the bundled speech, of which ``train`` is trained on, and ``valid`` is scored."""
 
 _SPEECH_LEVEL = 65.0
 """Level of the utterances in dB SPL, without an aid and as input of the aids."""

@@ -48,15 +48,12 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         )
     check_extras("eval")
     from compensators import load_compensator
-    from hlsim.calibration import PASCAL_SPL
     from hlsim.evaluation.simulators import evaluate_simulators
-    from hlsim.losses.frozen_simulator import build_simulator
-    from hlsim.neuro.config import NEURO_RATE
     from hlsim.report.simulators import simulators_page
+    from hlsim.simulators import load_simulator
 
     simulators = {
-        label: build_simulator(name, NEURO_RATE, PASCAL_SPL)
-        for label, name in _read_labels(options.names).items()
+        label: load_simulator(name) for label, name in _read_labels(options.names).items()
     }
     arguments = _arguments(options, evaluate_simulators)
     if options.compensator:

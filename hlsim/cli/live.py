@@ -56,9 +56,9 @@ def _live(options: argparse.Namespace) -> None:
     ears: Any = read_ears(options)
     import torch
 
+    from hlsim.calibration import NEURO_RATE
     from hlsim.cli.microphone import Live, SimulatedStream, play
     from hlsim.neuro import load_pretrained
-    from hlsim.neuro.config import NEURO_RATE
 
     torch.set_num_threads(1)  # Threads would wait for each other for more than 4 ms.
     scale = options.full_scale_spl

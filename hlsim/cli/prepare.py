@@ -40,7 +40,7 @@ def prepare(parser: Parser) -> None:
 
 
 def _prepare(options: argparse.Namespace) -> None:
-    from hlsim.training.corpora.layouts import prepare
+    from hlsim.data.layouts import prepare
 
     folders = options.folders.split("/") if options.folders else None
     print(prepare(options.corpus, options.out, folders=folders, valid_share=options.valid_share))

@@ -62,9 +62,11 @@ def _declare_files(
 
 def _simulate(options: argparse.Namespace) -> None:
     def build(rate: int) -> Any:
-        from hlsim.losses.frozen_simulator import build_simulator
+        from hlsim.simulators import load_simulator
 
-        return build_simulator(options.simulator, rate, options.full_scale_spl)
+        return load_simulator(
+            options.simulator, sample_rate=rate, full_scale_spl=options.full_scale_spl
+        )
 
     _process(options, build, {})
 

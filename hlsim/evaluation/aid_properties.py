@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.parallel import describe_error, one_thread
 from hlsim.evaluation.study import cut_output
-from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.metrics.band_levels import band_centres, band_levels, threshold_in_quiet
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """Frequencies of steady tones in Hz. All but 3001 Hz have the same phase in frames that are

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,11 @@ from torch import Tensor, nn
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.evaluation.aid_properties import measure_gain_curve
-from hlsim.losses.band_levels import band_centres
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.metrics.band_levels import band_centres
 from hlsim.plugins import WaveformPlugin
 
 _EQUALISER_TAPS = 513
@@ -30,7 +29,6 @@ _EQUALISER_TAPS = 513
 _LOWEST_GAIN_DB = -100.0
 """Lowest gain of an equaliser in dB."""
 
-_SPEECH_FILE = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
 """Speech at 16 kHz on which an enhancer is tried when it is loaded."""
 
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
@@ -213,7 +211,7 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
     >>> load_enhancers([])
     {}
     """
-    speech = set_level(read_audio(_SPEECH_FILE)[0][0, : 2 * NEURO_RATE], 65.0)
+    speech = set_level(read_audio(EXAMPLE_FILE)[0][0, : 2 * NEURO_RATE], 65.0)
     enhancers: dict[str, WaveformPlugin] = {}
     for name in names:
         enhancer = WaveformPlugin(name, "enhancer")

@@ -13,6 +13,8 @@ from torch import nn
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
+from hlsim.calibration import NEURO_RATE
+from hlsim.data.clips import Clips
 from hlsim.evaluation.aid_properties import (
     measure_aids,
     measure_gain_curve,
@@ -26,9 +28,7 @@ from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.neuro import load_pretrained
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
-from hlsim.training.clips import Clips
 
 UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
 """Names of the conditions with which every compensator is compared."""
@@ -101,7 +101,7 @@ def evaluate_compensators(
         ValueError: Data or settings are not valid, or no item has all its scores.
         MissingExtraError: A package is not installed.
 
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
     >>> evaluation = evaluate_compensators(
     ...     {"mine": NALR()}, speech=speech, audiogram=Audiogram.standard("N3"), **settings

@@ -14,13 +14,12 @@ from torch import Tensor, nn
 from compensators.nalr import NALR
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.audiogram.table import read_audiograms
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.checks import check_names, check_number
+from hlsim.data.augment import compress, mix
+from hlsim.data.clips import Clips
+from hlsim.data.ears import MILDER, draw_thresholds
 from hlsim.evaluation.study import Item
-from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.augment import compress, mix
-from hlsim.training.clips import Clips
-from hlsim.training.ears import MILDER, draw_thresholds
 
 SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 """Levels of the input in dB SPL that items for simulators have in turn."""
@@ -64,7 +63,7 @@ def draw_simulator_items(
     Returns: Items at 16 kHz. Their facts are ``severity``, ``input_level`` (dB SPL), ``speech``
         (clean or noisy), ``noise_snr`` (dB, NaN if clean) and ``audiogram``.
 
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> settings = {"items": 2, "seconds": 1.0, "seed": 0}
     >>> items = draw_simulator_items(EXAMPLE_FILE.parent, None, "standard", **settings)
     >>> [item.name for item in items]
@@ -117,7 +116,7 @@ def draw_aid_items(
     Returns: Items at 16 kHz. Their facts are ``ear``, ``severity``, ``input_level`` (dB SPL),
         ``speech`` (clean or noisy), ``snr`` (dB, NaN if clean) and ``audiogram``.
 
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> settings = {"items": 1, "seconds": 1.0, "seed": 0}
     >>> (item,) = draw_aid_items(EXAMPLE_FILE.parent, None, read_ears(None), **settings)
     >>> item.facts["ear"], item.facts["input_level"]

@@ -19,13 +19,13 @@ from hlsim.checks import check_names, loud_outputs
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
-from hlsim.losses.band_levels import (
+from hlsim.metrics import fidelity
+from hlsim.metrics.band_levels import (
     audibility_threshold,
     audibility_weights,
     band_level_loss,
     band_levels,
 )
-from hlsim.metrics import fidelity
 from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi

@@ -226,7 +226,7 @@ def haspi_report(
             scored.
         MissingExtraError: The package of a measure is not installed.
 
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
     >>> report = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
     >>> round(float(report.table["stoi"].mean()), 3)
@@ -293,7 +293,7 @@ def score_recordings(
     Raises:
         ValueError: Nothing could be scored, or ``better_ear`` is set and an utterance lacks an ear.
 
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> outputs = {"unaided": EXAMPLE_FILE}
     >>> recording = Recording("s01", EXAMPLE_FILE, outputs, Audiogram.standard("N3"))
     >>> evaluation = score_recordings(

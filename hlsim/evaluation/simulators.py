@@ -17,17 +17,17 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
+from hlsim.calibration import NEURO_RATE
+from hlsim.checks import loud_outputs
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
-from hlsim.evaluation.measures import load_measure, perceive
+from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item, Measure, Values
 from hlsim.extras import is_installed
 from hlsim.metrics import fidelity
-from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.teacher import PluginTeacher, find_teacher
-from hlsim.version import __version__
+from hlsim.simulators import load_simulator
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -63,8 +63,8 @@ def evaluate_simulators(
         store: File of scores, which is created if it does not exist; None stores nothing.
         noise: Folder of recordings of noise. Every second item is then noisy, at signal-to-noise
             ratios of 2.5 to 17.5 dB.
-        teacher: The simulator to compare with: ``"msbg"``, the exact one, or
-            ``package.module:name``.
+        teacher: Name of the simulator to compare with, ``"msbg"`` or another one that
+            ``load_simulator`` accepts.
         measures: Further measures, ``package.module:name``.
         items: Number of items, each of which is measured for each of ``inputs``.
         seconds: Length of an item in seconds; PESQ and STOI need 2 or more.
@@ -88,7 +88,7 @@ def evaluate_simulators(
         MissingExtraError: pandas is not installed. Without pesq, that measure is left out.
 
     >>> from hlsim import MSBG
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
     >>> evaluation = evaluate_simulators(
     ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
@@ -120,11 +120,11 @@ def evaluate_simulators(
     return replace(evaluation, groups=groups)
 
 
-def _teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
-    """Return the output of a teacher, or of the exact MSBG if it is None, for an item."""
-    if teacher is None:
-        return perceive(item.signal, item.ear, item.sample_rate)
-    return teacher(item.signal[None], torch.tensor([item.ear.thresholds]))[0]
+def _teacher_output(teacher: nn.Module, item: Item) -> Tensor:
+    """Return the output of a teacher for an item, without a gradient. Shape: (time,)."""
+    with torch.no_grad(), loud_outputs():
+        output: Tensor = teacher(item.signal, item.ear)
+    return output
 
 
 def _fidelity_to(teacher_name: str) -> Measure:
@@ -137,7 +137,7 @@ def _fidelity_to(teacher_name: str) -> Measure:
     Args:
         teacher_name: Name of the teacher, see ``evaluate_simulators``.
     """
-    teacher = find_teacher(teacher_name)
+    teacher = load_simulator(teacher_name)
     packages = ["pystoi"]
     scores = {"stoi": fidelity.stoi}
     if is_installed("pesq"):
@@ -159,8 +159,7 @@ def _fidelity_to(teacher_name: str) -> Measure:
                 values |= {f"{name}_teacher": of_teacher, f"{name}_simulator": of_simulator}
         return values
 
-    settings = f"msbg {__version__}" if teacher is None else fingerprint(teacher.plugin)
-    return Measure("fidelity", compute, packages=packages, settings=settings)
+    return Measure("fidelity", compute, packages=packages, settings=fingerprint(teacher))
 
 
 def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
@@ -200,7 +199,7 @@ def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
     Returns: The item, and the output with shape (time,) at 16 kHz.
 
     >>> from hlsim import MSBG
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
     >>> evaluation = evaluate_simulators(
     ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
@@ -211,4 +210,4 @@ def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
     """
     rows = next(iter(evaluation.groups.values())).table.dropna(subset="snr")
     item = evaluation.items[rows["item"][rows["input_level"].idxmax()]].load()
-    return item, _teacher_output(find_teacher(evaluation.settings["teacher"]), item)
+    return item, _teacher_output(load_simulator(evaluation.settings["teacher"]), item)

@@ -19,14 +19,13 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checks import check_waveform, loud_outputs
 from hlsim.evaluation.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.parallel import Progress, describe_error, one_thread, run_parallel
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
-from hlsim.neuro.config import NEURO_RATE
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -3,7 +3,7 @@
 It compares the coherence and the level in each band with those for a normal ear.
 
 Coherence says how much of a signal is a fixed filter of the other: it is 1 for any gain and phase,
-and falls with noise. Both signals are divided into 24 bands (``hlsim.losses.band_levels``) and
+and falls with noise. Both signals are divided into 24 bands (``hlsim.metrics.band_levels``) and
 overlapping segments of 96 ms. Let ``H`` be the spectra in frames of 32 ms of what the impaired ear
 perceives, and ``R`` those of what a normal ear perceives. Each band and segment has
 
@@ -37,7 +37,7 @@ from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
-from hlsim.losses.band_levels import band_analysis, threshold_in_quiet
+from hlsim.metrics.band_levels import band_analysis, threshold_in_quiet
 from hlsim.torchtools import constant
 
 DEFAULT_WEIGHTS = {

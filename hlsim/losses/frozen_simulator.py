@@ -14,9 +14,8 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.devices import on_device
 from hlsim.checks import broadcast_shape
 from hlsim.dsp.resample import resample
-from hlsim.msbg import MSBG
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
-from hlsim.neuro import load_pretrained
+from hlsim.simulators import load_simulator
 from hlsim.torchtools import constant, flatten_items
 
 ReferenceName = Literal["clean", "normal-hearing"]
@@ -32,8 +31,7 @@ class FrozenSimulator:
     that the loss that owns it does not register these parameters.
 
     Args:
-        simulator: ``"msbg"``, the name or folder of a checkpoint, or a module, as in
-            ``HearingLossLoss``.
+        simulator: Name, folder or module, see ``load_simulator``.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
         normal: Normal ear that belongs to the simulator. By default, the simulator at 0 dB HL.
@@ -60,7 +58,9 @@ class FrozenSimulator:
         reference: ReferenceName | None,
         checkpoint: bool = False,
     ) -> None:
-        model: Any = build_simulator(simulator, sample_rate, full_scale_spl)
+        model: Any = load_simulator(
+            simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl
+        )
         self.simulator = model.eval().requires_grad_(False)
         if checkpoint:
             model.checkpoint = True
@@ -150,36 +150,6 @@ class FrozenSimulator:
             return clean
         low = resample(clean, self.sample_rate, round(self._band_rate))
         return resample(low, round(self._band_rate), self.sample_rate)[..., : clean.shape[-1]]
-
-
-def build_simulator(
-    simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float
-) -> nn.Module:
-    """Return the simulator that a name, a folder or a module describes.
-
-    Args:
-        simulator: ``"msbg"`` for the exact model, the name or the folder of a checkpoint, or a
-            module, which is validated and returned.
-        sample_rate: Sample rate in Hz.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
-
-    Raises:
-        ValueError: There is no such checkpoint, or the module was built for another rate or level,
-            or delays its output.
-
-    >>> build_simulator("msbg", sample_rate=16000, full_scale_spl=94.0)
-    MSBG(sample_rate=16000, full_scale_spl=94, aligned=True)
-    """
-    if isinstance(simulator, nn.Module):
-        settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
-        for name, value in settings.items():
-            setting = getattr(simulator, name, value)
-            if setting != value:
-                raise ValueError(f"expected a simulator with {name}={value}, got {setting}")
-        return simulator
-    if str(simulator) == "msbg":
-        return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
 def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:

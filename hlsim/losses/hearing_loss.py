@@ -14,7 +14,7 @@ from hlsim.audiogram.thresholds import (
     resolve_thresholds,
     store_thresholds,
 )
-from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import (
     Lengths,
     check_choice,
@@ -25,13 +25,12 @@ from hlsim.checks import (
 )
 from hlsim.dsp.resample import resample
 from hlsim.losses import coherent_bands
-from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.criteria import Criterion, read_criterion, weighted_sum
 from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceName, check_shape
+from hlsim.losses.interaural import interaural_loss
 from hlsim.losses.paper import paper_parts
-from hlsim.metrics.interaural import interaural_loss
-from hlsim.metrics.score_loss import SCORES, score_loss
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.losses.score_loss import SCORES, score_loss
+from hlsim.metrics.band_levels import band_level_loss
 from hlsim.torchtools import flatten_items, not_compiled
 
 _Reduction = Literal["mean", "none"]
@@ -80,11 +79,11 @@ class HearingLossLoss(nn.Module):
     The criterion is one of
 
     - ``"coherent-bands"``: coherence and level in bands (``hlsim.losses.coherent_bands``)
-    - ``"bands"``: levels in bands (``hlsim.losses.band_levels``)
+    - ``"bands"``: levels in bands (``hlsim.metrics.band_levels``)
     - ``"paper"``: Equations 2 to 9 of the Neuro-MSBG paper, which are not balanced between ears and
       levels (``hlsim.losses.paper``)
     - ``"haspi"`` and ``"hasqi"``: 1 minus the score of the compensated speech
-      (``hlsim.metrics.score_loss``). They do not penalise loudness, so combine them with another
+      (``hlsim.losses.score_loss``). They do not penalise loudness, so combine them with another
       criterion.
     - ``"interaural"``: change of the differences between the ears of a listener
       (``hlsim.metrics.interaural``), to be combined with another criterion
@@ -99,8 +98,9 @@ class HearingLossLoss(nn.Module):
             simulator, ``"msbg"`` included, receives the levels at eight frequencies,
             ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
-            exact model; or a module, which is called with a waveform and thresholds. The module
-            itself is frozen, so pass a copy of one that is still trained. It may have the
+            exact model; ``package.module:name``, a simulator of your own; or a module, which is
+            called with a waveform and thresholds. The module itself is frozen, so pass a copy of
+            one that is still trained. It may have the
             attributes ``sample_rate``, ``full_scale_spl`` and ``aligned`` (false if its output is
             delayed), which are validated; ``emulates_msbg``, true if its normal ear and its phases
             are those of MSBG; ``highest_frequency`` of its output in Hz; and

@@ -1,9 +1,10 @@
-"""Validation of the two signals that a score compares."""
+"""The two signals that a score compares: validated, cut, and scored item by item."""
 
 from __future__ import annotations
 
 import warnings
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -115,3 +116,43 @@ def match_pair(
         longest = torch.Size((*clean.shape[:-1], max(times)))
         lengths = check_lengths(lengths, longest).clamp_max(time)
     return processed, clean.to(torch.promote_types(clean.dtype, processed.dtype)), lengths
+
+
+def scores_or_errors(
+    score: Callable[..., Tensor],
+    processed: Tensor,
+    clean: Tensor,
+    ears: Tensor,
+    ends: Sequence[int],
+    **settings: Any,
+) -> list[Tensor | ValueError]:
+    """Compute the score of each item of a batch, or the error that says why it has none.
+
+    ``score`` raises an error for the whole batch if one item cannot be scored. In that case, each
+    item is scored on its own.
+
+    Args:
+        score: Function that computes the score, such as ``haspi``.
+        processed: Outputs of an aid. Shape: (items, time).
+        clean: Clean signals. Shape: (items, time).
+        ears: Thresholds of the ear of each item in dB HL. Shape: (items, 8).
+        ends: Number of samples of each item before padding.
+        settings: Further keyword arguments of ``score``.
+
+    >>> from hlsim.metrics import haspi
+    >>> silence = torch.zeros(1, 16000)
+    >>> errors = scores_or_errors(haspi, silence, silence, torch.zeros(1, 8), [16000])
+    >>> type(errors[0]).__name__
+    'UnscorableError'
+    """
+    try:
+        return list(score(processed, clean, ears, lengths=ends, **settings))
+    except ValueError as error:
+        if len(clean) == 1:
+            return [error]
+    results = []
+    for item in zip(
+        processed.split(1), clean.split(1), ears.split(1), [[end] for end in ends], strict=True
+    ):
+        results += scores_or_errors(score, *item, **settings)
+    return results

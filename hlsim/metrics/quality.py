@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from compensators.nalr import nalr_gains_db
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics.ear import fine_structure

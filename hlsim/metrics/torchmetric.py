@@ -21,8 +21,7 @@ from hlsim.extras import require
 from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
-from hlsim.metrics.pair import check_pair
-from hlsim.metrics.score_loss import scores_or_errors
+from hlsim.metrics.pair import check_pair, scores_or_errors
 
 _Metric: Any = require("torchmetrics", "train").Metric
 

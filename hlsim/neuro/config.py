@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_origin, get_type_hints
 
+from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_choice, check_names, check_number, describe
 from hlsim.dsp.stft import STFT
-
-NEURO_RATE = 16000
-"""Sample rate in Hz at which the networks work."""
 
 Block = Literal["cnn", "mamba", "lstm", "transformer"]
 Structure = Literal["dual-path", "monolithic", "bands"]

@@ -8,13 +8,13 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.audiogram.thresholds import interpolate
-from hlsim.calibration import PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import SIMULATOR, read_checkpoint
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.bands import BandCorrection
 from hlsim.neuro.blocks import DualPathBlock
-from hlsim.neuro.config import NEURO_RATE, NeuroConfig
+from hlsim.neuro.config import NeuroConfig
 from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import (
     AudiogramEncoder,

@@ -9,11 +9,11 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
-from hlsim.calibration import check_full_scale, gain_to_pascals
+from hlsim.calibration import NEURO_RATE, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
-from hlsim.neuro.config import NEURO_RATE, NetworkConfig
+from hlsim.neuro.config import NetworkConfig
 from hlsim.torchtools import flatten_items
 
 # On a CPU, larger feature maps take time because the C library returns their memory to the system

@@ -27,7 +27,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.audiogram.thresholds import interpolation_weights
-from hlsim.calibration import PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
@@ -36,7 +36,6 @@ from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
 from hlsim.msbg.smearing import BROADENING, roex_filters, smear_spectrum, smearing_from_filters
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)

@@ -51,7 +51,7 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
     >>> import tempfile
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
     >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
     >>> with tempfile.TemporaryDirectory() as out:
@@ -70,7 +70,7 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
     >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
     >>> report_page(evaluation).title

@@ -274,7 +274,7 @@ def score_details(evaluation: Evaluation) -> Section:
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
     >>> evaluation = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
     >>> [section.title for section in score_details(evaluation).sections]

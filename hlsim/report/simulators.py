@@ -72,7 +72,7 @@ def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
 
     >>> from hlsim import MSBG
     >>> from hlsim.evaluation.simulators import evaluate_simulators
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
     >>> evaluation = evaluate_simulators(
     ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings

@@ -12,25 +12,24 @@ from typing import Any
 
 import lightning as L
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
-from hlsim.calibration import set_level
-from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.augment import (
+from hlsim.calibration import NEURO_RATE, set_level
+from hlsim.data.augment import (
     augment_speech,
     draw_uniform,
     equalise_share,
     mix,
     replace_share,
 )
-from hlsim.training.clips import Clips, Source
-from hlsim.training.corpora.manifest import read_manifest
-from hlsim.training.ears import draw_thresholds
+from hlsim.data.clips import Clips, Source
+from hlsim.data.ears import draw_thresholds
+from hlsim.data.manifest import read_manifest
+from hlsim.data.tones_and_clicks import draw_sounds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
-from hlsim.training.tones_and_clicks import draw_sounds
 
 Batch = dict[str, Tensor]
 """Tensors by name.
@@ -293,6 +292,8 @@ class BatchData(L.LightningDataModule):
 
     @torch.no_grad()
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        if isinstance(self.teacher, nn.Module):
+            self.teacher.to(batch["signal"].device)
         if self.teacher is None:
             return batch
         return batch | {"impaired": self.teacher(batch["signal"], batch["thresholds"])}
@@ -315,8 +316,8 @@ def simulator_data(data: TrainingData, recipe: SimulatorRecipe, teacher: Teacher
         ValueError: Files are missing or invalid, or used for both training and validation.
 
     >>> from hlsim import MSBG
-    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
-    >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe(), MSBG())
+    >>> from hlsim.data.bundled import SPEECH
+    >>> batches = simulator_data(TrainingData(SPEECH), SimulatorRecipe(), MSBG())
     >>> list(batches.training[0])
     ['signal', 'thresholds']
     """
@@ -345,8 +346,8 @@ def compensator_data(
         ValueError: Files are missing or invalid, or used for both training and validation, or the
             recipe requires noise and there is none.
 
-    >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
-    >>> batches = compensator_data(TrainingData(speech), CompensatorRecipe(), ear=None)
+    >>> from hlsim.data.bundled import SPEECH
+    >>> batches = compensator_data(TrainingData(SPEECH), CompensatorRecipe(), ear=None)
     >>> len(batches.validation)  # of 4 items each
     2
     """

@@ -8,9 +8,8 @@ from torch.nn import functional
 
 from compensators.filter_bank import HISTORY, HOP, band_powers, frame_power
 from compensators.hearing_aid import HearingAid
-from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.metrics.score_loss import score_loss
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, level_spl, set_level
+from hlsim.losses.score_loss import score_loss
 
 _POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
 """Power in Pa^2 (0 dB SPL) that is added to speech and noise, so that silence is not attenuated."""

@@ -14,13 +14,11 @@ from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
-from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.simulators import EXACT, PluginSimulator, load_simulator
 from hlsim.training.batches import Batch, TrainingData, simulator_data
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
-from hlsim.training.teacher import find_teacher
 from hlsim.training.trainer import train_network
 
 _POWER_FLOOR = 1e-18
@@ -98,7 +96,8 @@ def train_simulator(
         data: Speech, noise and ears for training and validation.
         recipe: Network, criteria and number of steps.
         out: Folder for the results. A training that was interrupted resumes from it.
-        teacher: ``"msbg"``, the exact MSBG, or the name of a plug-in, see ``PluginTeacher``.
+        teacher: ``"msbg"``, the exact model, or the name of another simulator, see
+            ``load_simulator``.
         options: ``max_minutes`` and options of Lightning's ``Trainer``, see ``train_network``.
 
     Returns:
@@ -112,13 +111,13 @@ def train_simulator(
     ...     recipe = SimulatorRecipe(steps=1000)
     ...     return load_pretrained(train_simulator(TrainingData(Path(speech)), recipe, out=out))
     """
-    plugin = find_teacher(teacher)
+    simulator = load_simulator(teacher)
     about = {"data": data.identity()}
-    if plugin is not None:
-        about["teacher"] = str(plugin)
+    if teacher != EXACT:
+        about["teacher"] = str(simulator) if isinstance(simulator, PluginSimulator) else teacher
     return train_network(
         SimulatorTraining(recipe),
-        simulator_data(data, recipe, plugin or MSBG(sample_rate=NEURO_RATE)),
+        simulator_data(data, recipe, simulator),
         SIMULATOR,
         out=out,
         about=about,

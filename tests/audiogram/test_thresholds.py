@@ -10,8 +10,8 @@ from compensators import NALR, load_compensator
 from hlsim import MSBG, load_pretrained
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.audiogram.thresholds import as_thresholds, interpolate, interpolation_weights
+from hlsim.data.ears import draw_thresholds
 from hlsim.metrics import haspi
-from hlsim.training.ears import draw_thresholds
 
 
 def test_thresholds_for_a_simulator() -> None:

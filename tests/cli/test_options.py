@@ -16,7 +16,7 @@ FUNCTIONS = {
     "evaluate-compensator": "hlsim.evaluation.compensators:evaluate_compensators",
     "evaluate-simulator": "hlsim.evaluation.simulators:evaluate_simulators",
     "clarity": "hlsim.evaluation.clarity:evaluate_scenes",
-    "prepare": "hlsim.training.corpora.layouts",
+    "prepare": "hlsim.data.layouts",
     "train-compensator": "hlsim.training.compensator",
     "train-simulator": "hlsim.training.simulator",
 }

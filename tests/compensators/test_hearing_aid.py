@@ -9,7 +9,7 @@ from torch import Tensor
 from compensators import WDRC, HearingAid, load_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.training.ears import draw_thresholds
+from hlsim.data.ears import draw_thresholds
 from tests.compensators.aids import EAR, tone, varied_hearing_aid
 
 

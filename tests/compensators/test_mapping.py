@@ -8,8 +8,8 @@ from torch import Tensor
 from compensators import NALR, MappingCompensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl
-from hlsim.losses.band_levels import band_levels
-from hlsim.training.ears import draw_thresholds
+from hlsim.data.ears import draw_thresholds
+from hlsim.metrics.band_levels import band_levels
 from tests.compensators.aids import EAR, SMALL, tone, varied_mapping
 
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from compensators import NALR
-from compensators.nalr import nalr_gains_db
 from hlsim import Audiogram
 from hlsim.audiogram import FREQUENCIES
-from hlsim.training.ears import draw_thresholds
+from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.data.ears import draw_thresholds
 
 
 def pyclarity_nalr(waveform: Tensor, ear: Audiogram, rate: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import torch
 
 from compensators import WDRC
 from compensators.filter_bank import band_centres, band_powers, speech_band_levels
-from compensators.nalr import nalr_gains_db
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import interpolate
 from tests.compensators.aids import tone
 

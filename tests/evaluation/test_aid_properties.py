@@ -23,7 +23,7 @@ from hlsim.evaluation.aid_properties import (
 )
 from hlsim.evaluation.aids import EqualiserLike, Unaided, _equalise_bands
 from hlsim.evaluation.measures import NORMAL
-from hlsim.losses.band_levels import band_edges
+from hlsim.metrics.band_levels import band_edges
 
 N3 = Audiogram.standard("N3")
 COUNT = len(TONES)

@@ -15,18 +15,18 @@ import soundfile
 import torch
 from torch import Tensor
 
-import hlsim
 from hlsim.audio import read_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.cli.main import main
+from hlsim.data import bundled
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import evaluate_scenes
 from hlsim.report.recordings import _conditions_table
 
 RATE = 44100
 LOW_RATE = 16000
-SPEECH = Path(hlsim.__file__).parent / "data" / "speech" / "valid"
+SPEECH = bundled.SPEECH / "valid"
 CFS = [250, 500, 1000, 2000, 3000, 4000, 6000, 8000]
 EARS = {
     "L0001": ([35, 35, 35, 40, 50, 55, 60, 65], [20, 20, 25, 35, 45, 50, 55, 55]),

@@ -15,10 +15,10 @@ from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss, Listener, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
-from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.coherent_bands import coherent_band_parts
 from hlsim.losses.criteria import CRITERIA
 from hlsim.losses.paper import paper_parts
+from hlsim.metrics.band_levels import band_level_loss
 from hlsim.msbg.response import apply_bank_phase
 from tests.losses.signals import add_noise, excerpt, gain_slope
 

@@ -6,7 +6,8 @@ from torch import Tensor
 
 from hlsim import Audiogram, HearingLossLoss, Listener
 from hlsim.calibration import set_level
-from hlsim.metrics.interaural import OCTAVES, interaural, interaural_change, interaural_loss
+from hlsim.losses.interaural import interaural_loss
+from hlsim.metrics.interaural import OCTAVES, interaural, interaural_change
 
 EAR = Audiogram.standard("N3")
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from functools import cache, partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from torch.nn import functional
 import hlsim
 from hlsim import Audiogram
 from hlsim.audio import read_audio
+from hlsim.data import bundled
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.extent import Extent
@@ -24,7 +24,7 @@ from hlsim.metrics.quality import _nalr_taps, _scale_motion_to_level
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
-SPEECH = Path(hlsim.__file__).parent / "data" / "speech" / "valid"
+SPEECH = bundled.SPEECH / "valid"
 NH, N1, N2, N3, N4, N5, N6, S2 = (
     Audiogram.standard(name) for name in ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "S2")
 )

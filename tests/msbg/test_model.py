@@ -17,11 +17,11 @@ from hlsim import Listener
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.ears import draw_thresholds
 from hlsim.msbg import MSBG, estimate_delay
 from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.msbg.overlapping_blocks import block_bounds
 from hlsim.msbg.smearing import HOP
-from hlsim.training.ears import draw_thresholds
 from tests.pyclarity import STRIDE, PyclarityOutputs, msbg
 
 EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}

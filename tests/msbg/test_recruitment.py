@@ -11,6 +11,7 @@ from torch.overrides import TorchFunctionMode
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import gain_to_pascals
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP
@@ -22,7 +23,6 @@ from hlsim.msbg.recruitment import (
     interpolate,
     interpolation_kernel,
 )
-from hlsim.training.ears import draw_thresholds
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")

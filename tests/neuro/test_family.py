@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from hlsim import Audiogram, NeuroMSBG
+from hlsim.data.ears import draw_thresholds
 from hlsim.neuro import NeuroConfig
-from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import SimulatorRecipe
 
 yaml = pytest.importorskip("yaml")

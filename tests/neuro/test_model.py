@@ -9,12 +9,12 @@ from torch import Tensor, nn
 from compensators import MappingCompensator
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.losses.waveform import noise_to_signal_db
 from hlsim.neuro import NeuroConfig, network
 from hlsim.neuro.blocks import BidirectionalLSTM, EncoderLayer
 from hlsim.neuro.decoders import phase_factor
-from hlsim.training.ears import draw_thresholds
 
 N3 = Audiogram.standard("N3")
 

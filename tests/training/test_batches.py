@@ -14,8 +14,8 @@ from hlsim.audio import write_audio
 pytest.importorskip("lightning")
 
 from hlsim.calibration import level_spl
+from hlsim.data.manifest import Utterance, write_manifest
 from hlsim.training.batches import BatchData, TrainingData, compensator_data, simulator_data
-from hlsim.training.corpora.manifest import Utterance, write_manifest
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 SMALL = SimulatorRecipe(batch=2, seconds=0.25, validation_items=8)

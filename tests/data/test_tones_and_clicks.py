@@ -2,7 +2,7 @@
 
 import torch
 
-from hlsim.training.tones_and_clicks import draw_sounds
+from hlsim.data.tones_and_clicks import draw_sounds
 
 
 def draw(items: int, samples: int = 16000, seed: int = 0) -> torch.Tensor:

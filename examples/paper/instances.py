@@ -16,14 +16,13 @@ from torch.utils.data import Dataset
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
+from hlsim.data.clips import read_noisy
+from hlsim.data.ears import draw_thresholds
+from hlsim.data.manifest import Utterance
 from hlsim.dsp.active_level import active_level_db
 from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
-from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.clips import read_noisy
-from hlsim.training.corpora.manifest import Utterance
-from hlsim.training.ears import draw_thresholds
 
 _Input = Literal["clean", "noisy"]
 """Version of an utterance that an instance processes."""
@@ -54,9 +53,9 @@ class Instances(Dataset[dict[str, Tensor]]):
         root: Folder to which their paths are relative.
         ears: Ears, which are assigned to the utterances in turn, such as those of ``draw_ears``.
 
-    >>> speech = Path(__file__).parents[2] / "data" / "speech"
+    >>> from hlsim.data.bundled import SPEECH
     >>> rows = [Utterance("train/flite-slt-01.flac")]
-    >>> instances = Instances(rows, speech, draw_ears(2, "train"))
+    >>> instances = Instances(rows, SPEECH, draw_ears(2, "train"))
     >>> len(instances), list(instances[0])
     (2, ['clean', 'signal', 'impaired', 'thresholds'])
     """

@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.dsp.active_level import active_level_db
-from hlsim.neuro.config import NEURO_RATE
 
 HIGHEST_LEVEL = 115.0
 """Highest RMS level of a training signal in dB SPL."""

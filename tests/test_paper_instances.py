@@ -8,10 +8,12 @@ import torch
 from hlsim import MSBG, Audiogram
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import PASCAL_SPL
+from hlsim.data.layouts import recognise
+from hlsim.data.manifest import Utterance
 from hlsim.dsp.active_level import active_level_db
-from hlsim.training.corpora.instances import Instances, draw_ears
-from hlsim.training.corpora.layouts import recognise
-from hlsim.training.corpora.manifest import Utterance
+from tests.helpers import load_example
+
+PAPER = load_example("paper/instances.py")
 
 
 @pytest.mark.parametrize(
@@ -27,7 +29,7 @@ def test_voicebank_demand_gives_the_papers_number_of_instances(
         for number in range(utterances)
     ]
     _, rows = recognise(files)
-    items = Instances(rows, "", draw_ears(20, split))
+    items = PAPER.Instances(rows, "", PAPER.draw_ears(20, split))
     assert len(items) == instances
     assert len({(row.path, ear.levels, name) for row, ear, name in items.items}) == instances
 
@@ -42,7 +44,7 @@ def test_an_instance_is_what_an_ear_perceives_aligned_with_its_input(
         write_audio(tmp_path / row.path, clean, rate)
         write_audio(tmp_path / row.noisy, clean + 0.01 * torch.randn_like(clean), rate)
     ears = [Audiogram.standard(name) for name in ("N1", "N3", "N5")]
-    instances = Instances(rows, tmp_path, ears)
+    instances = PAPER.Instances(rows, tmp_path, ears)
     assert [ear for _, ear, _ in instances.items] == [ears[i] for i in (0, 0, 1, 1, 2, 2, 0, 0)]
     assert [name for *_, name in instances.items] == ["clean", "noisy"] * 4
     for index, (row, ear, name) in enumerate(instances.items):
@@ -59,8 +61,8 @@ def test_an_instance_is_what_an_ear_perceives_aligned_with_its_input(
 
 
 def test_drawn_ears_are_different_and_disjoint_between_splits() -> None:
-    train, valid, test = (draw_ears(150, split) for split in ("train", "valid", "test"))
+    train, valid, test = (PAPER.draw_ears(150, split) for split in ("train", "valid", "test"))
     assert [ear.severity for ear in train[:4]] == ["mild", "moderate", "severe", "mild"]
     assert not {ear.levels for ear in train + valid} & {ear.levels for ear in test}
     assert len({ear.levels for ear in train}) > 140
-    assert train == draw_ears(150, "train")
+    assert train == PAPER.draw_ears(150, "train")

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import dbfs, level_spl
+from hlsim.data.augment import HIGHEST_LEVEL, augment_speech, compress, equalise, mix
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.active_level import active_level_db
-from hlsim.training.augment import HIGHEST_LEVEL, augment_speech, compress, equalise, mix
-from hlsim.training.ears import draw_thresholds
 
 
 def tones(*hz: float, rate: int = 16000, seconds: float = 0.5) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.metrics.score_loss import SCORES, score_loss
+from hlsim.losses.score_loss import SCORES, score_loss
 
 N3 = torch.tensor(Audiogram.standard("N3").thresholds)
 TIME = 12000

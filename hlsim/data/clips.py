@@ -52,8 +52,8 @@ class Clips:
     Raises:
         ValueError: There are no files, or the folder does not exist.
 
-    >>> folder = Path(__file__).parents[1] / "data" / "speech" / "train"
-    >>> clips = Clips(folder, sample_rate=16000, seconds=0.5)
+    >>> from hlsim.data.bundled import SPEECH
+    >>> clips = Clips(SPEECH, sample_rate=16000, seconds=0.5)
     >>> clips.draw(3, torch.Generator()).shape
     torch.Size([3, 8000])
     """
@@ -177,7 +177,7 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
         ValueError: The file cannot be read, or differs in length, channels or sample rate from the
             clean speech.
 
-    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> read_noisy(EXAMPLE_FILE, clean=torch.zeros(1, 64320), clean_rate=16000).shape
     torch.Size([1, 64320])
     """

@@ -13,7 +13,7 @@ from pathlib import Path
 from random import Random
 
 from hlsim.audio import find_audio
-from hlsim.training.corpora.manifest import (
+from hlsim.data.manifest import (
     SPLITS,
     Utterance,
     check_utterances,
@@ -131,7 +131,8 @@ def find_corpus(
     Raises:
         ValueError: The layout is unknown or contradictory.
 
-    >>> layout, utterances = find_corpus(Path(__file__).parents[2] / "data" / "speech")
+    >>> from hlsim.data.bundled import SPEECH
+    >>> layout, utterances = find_corpus(SPEECH)
     >>> layout
     'folders train, valid, test'
     """

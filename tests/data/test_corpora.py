@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hlsim.training.corpora.layouts import find_corpus, hold_out_speakers, prepare, recognise
-from hlsim.training.corpora.manifest import (
+from hlsim.data.layouts import find_corpus, hold_out_speakers, prepare, recognise
+from hlsim.data.manifest import (
     Utterance,
     check_utterances,
     read_manifest,

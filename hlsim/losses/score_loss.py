@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +10,7 @@ from torch import Tensor
 from hlsim.metrics.ear.clean_speech import UnscorableError
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
+from hlsim.metrics.pair import scores_or_errors
 
 SCORES: dict[str, Callable[..., Tensor]] = {"haspi": haspi, "hasqi": hasqi}
 """Functions that compute scores from 0 to 1, the higher the better, under the score's name."""
@@ -62,41 +62,3 @@ def score_loss(
         else:
             raise score
     return torch.where(finite, torch.stack(losses), torch.nan)
-
-
-def scores_or_errors(
-    score: Callable[..., Tensor],
-    processed: Tensor,
-    clean: Tensor,
-    ears: Tensor,
-    ends: Sequence[int],
-    **settings: Any,
-) -> list[Tensor | ValueError]:
-    """Compute the score of each item of a batch, or the error that says why it has none.
-
-    One item without a score stops a batch, so then the items are scored one by one.
-
-    Args:
-        score: Function that computes the score, such as ``haspi``.
-        processed: Outputs of an aid. Shape: (items, time).
-        clean: Clean signals. Shape: (items, time).
-        ears: Thresholds of the ear of each item in dB HL. Shape: (items, 8).
-        ends: Number of samples of each item before padding.
-        settings: Further keyword arguments of ``score``.
-
-    >>> silence = torch.zeros(1, 16000)
-    >>> errors = scores_or_errors(haspi, silence, silence, torch.zeros(1, 8), [16000])
-    >>> type(errors[0]).__name__
-    'UnscorableError'
-    """
-    try:
-        return list(score(processed, clean, ears, lengths=ends, **settings))
-    except ValueError as error:
-        if len(clean) == 1:
-            return [error]
-    results = []
-    for item in zip(
-        processed.split(1), clean.split(1), ears.split(1), [[end] for end in ends], strict=True
-    ):
-        results += scores_or_errors(score, *item, **settings)
-    return results

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import write_audio
-from hlsim.training.clips import Clips
+from hlsim.data.clips import Clips
 
 
 def folder_with(tmp_path: Path, **waves: Tensor) -> Path:
@@ -53,7 +53,7 @@ def test_other_rates_are_resampled_and_the_first_channel_is_taken(tmp_path: Path
 
 
 def test_no_drawn_clip_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hlsim.training.clips.MAX_FAILURES", 300)
+    monkeypatch.setattr("hlsim.data.clips.MAX_FAILURES", 300)
     wave = torch.zeros(40000)
     wave[20000:24000] = torch.randn(4000).clamp(-1, 1)
     folder = folder_with(tmp_path, a=wave)
@@ -71,7 +71,7 @@ def test_memory_is_limited_and_changes_no_draw(
     unlimited = Clips(folder, sample_rate=16000, seconds=0.1)
     expected = unlimited.draw(20, torch.Generator().manual_seed(3))
     assert len(unlimited._recordings) == 3
-    monkeypatch.setattr("hlsim.training.clips.MAX_SAMPLES_IN_MEMORY", 5000)
+    monkeypatch.setattr("hlsim.data.clips.MAX_SAMPLES_IN_MEMORY", 5000)
     limited = Clips(folder, sample_rate=16000, seconds=0.1)
     assert torch.equal(limited.draw(20, torch.Generator().manual_seed(3)), expected)
     assert sum(map(len, limited._recordings.values())) <= 5000

@@ -10,7 +10,7 @@ from scipy.signal import get_window
 from torch import Tensor
 
 from hlsim.calibration import set_level
-from hlsim.losses.band_levels import (
+from hlsim.metrics.band_levels import (
     BANDS,
     audibility_threshold,
     audibility_weights,

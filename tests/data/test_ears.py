@@ -3,7 +3,7 @@
 import torch
 
 from hlsim.audiogram import severity_index
-from hlsim.training.ears import draw_thresholds
+from hlsim.data.ears import draw_thresholds
 
 
 def test_drawn_ears_look_like_measured_ones() -> None:

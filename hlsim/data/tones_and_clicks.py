@@ -9,8 +9,8 @@ import math
 import torch
 from torch import Tensor
 
-from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.augment import draw_uniform
+from hlsim.calibration import NEURO_RATE
+from hlsim.data.augment import draw_uniform
 
 _LOWEST_TONE, _HIGHEST_TONE = 100.0, 7500.0  # in Hz
 _MAX_TONES = 4

@@ -1,0 +1,1 @@
+"""Speech, noise and ears from which trainings and evaluations draw, and bundled speech."""

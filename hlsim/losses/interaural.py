@@ -1,0 +1,50 @@
+"""The interaural criterion: how much an aid changes the differences between two ears."""
+
+import torch
+from torch import Tensor
+
+from hlsim.dsp.fft import power
+from hlsim.metrics.interaural import POWER_FLOOR, spectra_of_ears
+
+HALF_WEIGHT_RATIO = 1e-4
+"""Power of an octave relative to the loudest octave at which the octave has half its weight."""
+
+
+def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
+    """Compute how much an aid changes the differences between the ears, as a loss for training.
+
+    Gains and delays that are equal in both ears are ignored. The loss of an octave is the error of
+    the level difference in bels (10 dB), plus 1 minus the cosine of the error of the phase
+    difference. The result is a mean over octaves, in which octaves where clean speech is soft have
+    less weight.
+
+    Args:
+        processed: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).
+        clean: Clean speech at the left and the right ear in Pa. Shape: (..., 2, time).
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Losses. Shape: (...).
+
+    >>> noise = torch.randn(2, 16000)
+    >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)
+    True
+    """
+    left, right, cross, octaves = spectra_of_ears(processed, sample_rate)
+    clean_left, clean_right, clean_cross, _ = spectra_of_ears(clean, sample_rate)
+    left_level = torch.log10(left @ octaves + POWER_FLOOR)
+    right_level = torch.log10(right @ octaves + POWER_FLOOR)
+    clean_left_level = torch.log10(clean_left @ octaves + POWER_FLOOR)
+    clean_right_level = torch.log10(clean_right @ octaves + POWER_FLOOR)
+    level_error = (left_level - right_level - clean_left_level + clean_right_level).abs()
+    # The added power is proportional to those of the ears. With a constant instead, the phase of an
+    # ear that is nearly silent would have a gradient of a million.
+    cross_floor = POWER_FLOOR * (left + right + POWER_FLOOR)
+    phase = cross / (power(cross) + cross_floor).sqrt()
+    magnitude = (power(clean_cross) + POWER_FLOOR**2).sqrt() @ octaves
+    cosine = (phase * clean_cross.conj()).real @ octaves / magnitude
+    clean_power = (clean_left + clean_right).detach() @ octaves
+    power_of_half_weight = HALF_WEIGHT_RATIO * clean_power.amax(-1, keepdim=True)
+    weights = clean_power / (clean_power + power_of_half_weight + POWER_FLOOR)
+    error = level_error + 1.0 - cosine
+    return (weights * error).sum(-1) / (weights.sum(-1) + POWER_FLOOR)

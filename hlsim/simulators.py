@@ -1,0 +1,141 @@
+"""The door to all simulators: the exact MSBG, trained networks, and simulators of your own."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
+from hlsim.calibration import (
+    NEURO_RATE,
+    PASCAL_SPL,
+    check_full_scale,
+    gain_to_pascals,
+    set_level,
+)
+from hlsim.checks import broadcast_shape, check_rate, check_waveform
+from hlsim.dsp.resample import resample
+from hlsim.msbg import MSBG
+from hlsim.neuro import load_pretrained
+from hlsim.plugins import WaveformPlugin
+from hlsim.torchtools import flatten_items
+
+EXACT = "msbg"
+"""Name of the exact MSBG."""
+
+
+class PluginSimulator(nn.Module):
+    """Simulator of hearing loss of your own, loaded by its name.
+
+    Your simulator is a function ``(waveform, audiogram) -> waveform``, or a class whose objects can
+    be called in this way and which is constructed without arguments. It receives signals in pascals
+    with shape (items, time) and thresholds in dB HL with shape (items, 8), and returns the
+    perceived signals, time-aligned with its input. Gradients pass through it if it has any. Its
+    sample rate is its attribute ``sample_rate``, or else 16000 Hz. It may have the attributes
+    ``emulates_msbg``, ``highest_frequency`` and ``needs_exact_lengths``, see ``HearingLossLoss``.
+
+    Args:
+        name: ``package.module:name`` or ``path/to/file.py:name``.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Signals are resampled
+            to the rate of your simulator and back.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: There is no such simulator, or its output for half a second of noise has another
+            shape, is delayed or is not finite.
+
+    >>> simulator = PluginSimulator("hlsim:MSBG")
+    >>> simulator(torch.randn(1, 16000), "N3").shape
+    torch.Size([1, 16000])
+    """
+
+    def __init__(
+        self, name: str, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
+    ) -> None:
+        super().__init__()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+        self.plugin = WaveformPlugin(name, "simulator")
+        function = self.plugin.function
+        if isinstance(function, nn.Module):
+            function.requires_grad_(False)
+        self.plugin_rate: int = getattr(function, "sample_rate", NEURO_RATE)
+        self.emulates_msbg: bool = getattr(function, "emulates_msbg", False)
+        self.needs_exact_lengths: bool = getattr(function, "needs_exact_lengths", False)
+        highest_frequency = getattr(function, "highest_frequency", math.inf)
+        self.highest_frequency = min(highest_frequency, self.plugin_rate / 2.0)
+        noise = torch.randn(1, self.plugin_rate // 2, generator=torch.Generator().manual_seed(0))
+        no_loss = torch.zeros(1, len(FREQUENCIES))
+        self.plugin.check_aligned(set_level(noise, 65.0), self.plugin_rate, no_loss)
+
+    def __str__(self) -> str:
+        return str(self.plugin)
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
+        """Simulate what ears perceive.
+
+        Shape: (..., time) -> (..., time).
+
+        Args:
+            waveform: Input signals.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) in dB HL broadcasts
+                over the leading dimensions of the waveform.
+
+        Raises:
+            ValueError: A threshold is outside -10 to 100 dB HL, shapes do not broadcast, or your
+                simulator fails.
+        """
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
+        thresholds = resolve_thresholds(None, audiogram, waveform)
+        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
+        gain = gain_to_pascals(self.full_scale_spl)
+        signals = flatten_items(waveform, batch, waveform.dtype) * gain
+        ears = flatten_items(thresholds, batch, waveform.dtype)
+        inputs = resample(signals, self.sample_rate, self.plugin_rate)
+        perceived = self.plugin.call(inputs, ears)
+        output = resample(perceived, self.plugin_rate, self.sample_rate)
+        return output[..., : waveform.shape[-1]].reshape(*batch, -1) / gain
+
+
+def load_simulator(
+    simulator: str | Path | nn.Module,
+    *,
+    sample_rate: int = NEURO_RATE,
+    full_scale_spl: float = PASCAL_SPL,
+) -> nn.Module:
+    """Return the simulator that a name, a folder or a module describes.
+
+    Args:
+        simulator: ``"msbg"``, the exact model; the name of a checkpoint that ships with hlsim, such
+            as ``"neuro-msbg"``, or the folder of a checkpoint; ``package.module:name`` or
+            ``path/to/file.py:name``, a simulator of your own (``PluginSimulator``); or a module,
+            which is validated and returned.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: There is no such simulator, or the module was built for another rate or level,
+            or delays its output.
+
+    >>> load_simulator("msbg")
+    MSBG(sample_rate=16000, full_scale_spl=94, aligned=True)
+    """
+    if isinstance(simulator, nn.Module):
+        settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
+        for name, value in settings.items():
+            setting = getattr(simulator, name, value)
+            if setting != value:
+                raise ValueError(f"expected a simulator with {name}={value}, got {setting}")
+        return simulator
+    if str(simulator) == EXACT:
+        return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    is_folder = Path(simulator).is_dir()
+    if ":" in str(simulator) and not is_folder:
+        return PluginSimulator(
+            str(simulator), sample_rate=sample_rate, full_scale_spl=full_scale_spl
+        )
+    return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)

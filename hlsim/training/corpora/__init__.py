@@ -1,1 +1,0 @@
-"""Corpora of speech: their layouts, manifests and training instances."""

@@ -1,0 +1,84 @@
+"""All names of simulators lead through one door, and a simulator of your own serves everywhere."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import hlsim
+from hlsim import MSBG, HearingLossLoss
+from hlsim.calibration import set_level
+from hlsim.simulators import PluginSimulator, load_simulator
+
+PLUGIN = """
+class Quieter:
+    sample_rate = 44100
+    def __call__(self, waveform, audiogram):
+        return 0.5 * waveform * 10 ** (-audiogram[:, :1] / 20)
+
+def late(waveform, audiogram):
+    return waveform.roll(320, -1)
+
+def broken(waveform, audiogram):
+    return waveform / 0.0
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path) -> str:
+    (tmp_path / "plugin.py").write_text(PLUGIN)
+    return f"{tmp_path}/plugin.py"
+
+
+def test_a_plug_in_is_called_at_its_own_rate(plugin: str) -> None:
+    simulator = load_simulator(f"{plugin}:Quieter")
+    speech = set_level(torch.randn(2, 16000), 65.0)
+    # the band that both rates hold
+    low = torch.fft.irfft(torch.fft.rfft(speech) * (torch.arange(8001) < 6000), 16000)
+    perceived = simulator(low, torch.tensor([[0.0] * 8, [20.0] * 8]))
+    expected = low * torch.tensor([[0.5], [0.05]])
+    assert float((perceived - expected)[:, 400:-400].norm() / expected.norm()) < 1e-3
+    assert str(simulator) == f"{plugin}:Quieter"
+
+
+def test_a_plug_in_gets_pascals_whatever_the_full_scale(plugin: str) -> None:
+    speech = 0.05 * torch.randn(8000)
+    in_pascals = PluginSimulator("hlsim:MSBG")(speech, "N3")
+    louder_scale = PluginSimulator("hlsim:MSBG", full_scale_spl=114.0)(speech / 10.0, "N3")
+    torch.testing.assert_close(louder_scale, in_pascals / 10.0)
+    torch.testing.assert_close(in_pascals, MSBG("N3")(speech))
+
+
+def test_a_plug_in_is_the_ear_of_a_loss_with_its_gradient(plugin: str) -> None:
+    loss = HearingLossLoss("N3", simulator="hlsim:MSBG", criterion="bands")
+    exact = HearingLossLoss("N3", simulator=MSBG(), criterion="bands")
+    clean = hlsim.example_speech()[:16000]
+    gradients = []
+    for criterion in (loss, exact):
+        output = (0.5 * clean).requires_grad_()
+        criterion(output, clean).backward()
+        gradients.append(output.grad)
+    torch.testing.assert_close(*gradients)
+    assert bool(gradients[0].any())
+
+
+def test_a_plug_in_is_the_ear_of_simulate(plugin: str) -> None:
+    clean = hlsim.example_speech()[:16000]
+    perceived = hlsim.simulate(clean, "N3", simulator=f"{plugin}:Quieter")
+    assert perceived.shape == clean.shape and float(perceived.norm()) < 0.5 * float(clean.norm())
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("late", "delays by"), ("nobody", "nobody"), ("broken", "NaN or infinite")],
+)
+def test_invalid_plug_ins_are_rejected(plugin: str, name: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        load_simulator(f"{plugin}:{name}")
+
+
+def test_unknown_names_and_modules_of_another_rate_are_rejected() -> None:
+    with pytest.raises(ValueError, match="pyclarty"):
+        load_simulator("pyclarty")
+    with pytest.raises(ValueError, match="sample_rate=16000, got 44100"):
+        load_simulator(MSBG(sample_rate=44100))
