@@ -126,16 +126,14 @@ def load_simulator(
     """
     if isinstance(simulator, nn.Module):
         settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
-        for name, value in settings.items():
-            setting = getattr(simulator, name, value)
+        for attribute, value in settings.items():
+            setting = getattr(simulator, attribute, value)
             if setting != value:
-                raise ValueError(f"expected a simulator with {name}={value}, got {setting}")
+                raise ValueError(f"expected a simulator with {attribute}={value}, got {setting}")
         return simulator
-    if str(simulator) == EXACT:
+    name = str(simulator)
+    if name == EXACT:
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    is_folder = Path(simulator).is_dir()
-    if ":" in str(simulator) and not is_folder:
-        return PluginSimulator(
-            str(simulator), sample_rate=sample_rate, full_scale_spl=full_scale_spl
-        )
+    if ":" in name and not Path(name).is_dir():
+        return PluginSimulator(name, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)

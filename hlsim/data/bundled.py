@@ -1,4 +1,8 @@
-"""Paths of the synthetic speech that hlsim ships."""
+"""Paths of the synthetic speech that hlsim ships.
+
+>>> EXAMPLE_FILE.name
+'flite-rms-01.flac'
+"""
 
 from pathlib import Path
 

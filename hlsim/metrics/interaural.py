@@ -126,8 +126,11 @@ def spectra_of_ears(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor,
     Shape: (..., 2, time) -> (..., frequencies), (..., frequencies), complex (..., frequencies),
         (frequencies, 5).
 
-    Returns: Powers of the left and of the right ear, the cross spectrum, and the frequencies of
-        each octave as 0 or 1.
+    Returns: Powers of the left and of the right ear in Pa^2, the cross spectrum, and the
+        frequencies of each octave as 0 or 1.
+
+    >>> spectra_of_ears(torch.randn(2, 16000), 16000)[0].shape
+    torch.Size([257])
     """
     hop = round(0.016 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
