@@ -12,7 +12,6 @@ PATTERNS = (
     "checkpoints/*/README.md",
     "examples/**/*.py",
     "examples/**/*.yaml",
-    "examples/*.sh",
     "examples/*.csv",
     "CHANGELOG.md",
     "CONTRIBUTING.md",

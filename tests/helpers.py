@@ -11,7 +11,9 @@ import soundfile
 
 from hlsim import Audiogram
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+FIGURES = ROOT / "docs" / "figures"
 
 
 def touch_files(folder: Path, files: Iterable[str]) -> Path:
@@ -50,7 +52,19 @@ def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
 
 def load_example(name: str) -> ModuleType:
     """Import a file of the folder ``examples``."""
-    spec = importlib.util.spec_from_file_location(Path(name).stem, EXAMPLES / name)
+    return load_file(EXAMPLES / name)
+
+
+def load_figure(name: str) -> ModuleType:
+    """Import a script of the folder ``docs/figures``."""
+    return load_file(FIGURES / name)
+
+
+def load_file(path: Path) -> ModuleType:
+    """Import a Python file, which may import others from its folder."""
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses and pickle look for it

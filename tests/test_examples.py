@@ -10,7 +10,7 @@ from compensators import HearingAid, load_compensator, save_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, example_speech
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import level_spl, set_level
-from tests.helpers import EXAMPLES, load_example, write_ears
+from tests.helpers import EXAMPLES, load_example, load_figure, write_ears
 
 
 def test_own_network_trains(
@@ -86,7 +86,7 @@ def test_delay_by_frequency(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib")
-    example = load_example("delay.py")
+    example = load_figure("delay.py")
     bursts = example.make_bursts()
     assert example.measure_delays(bursts.roll(-7, -1), bursts) == [-7] * len(example.HERTZ)
     monkeypatch.setattr(example, "draw", lambda path: None)
@@ -96,7 +96,7 @@ def test_delay_by_frequency(
 
 def test_pictures_of_perceived_speech(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
-    example = load_example("heard.py")
+    example = load_figure("heard.py")
     short = example.read_speech()[8000:12000]
     monkeypatch.setattr(example, "read_speech", lambda: short)
     example.main(tmp_path)
@@ -114,7 +114,7 @@ def test_parity(
     ears = write_ears(tmp_path / "ears.csv", "N2")
     arguments = ["parity.py", str(speech_dir / "valid"), str(ears), "1"]
     monkeypatch.setattr("sys.argv", arguments)
-    load_example("parity.py").main()
+    load_figure("parity.py").main()
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(", ")[0] for line in lines] == ["44.1 kHz", "16 kHz"] * 2
     assert all("80 to 115 dB SPL" in line for line in lines[2:])
@@ -122,7 +122,7 @@ def test_parity(
 
 
 def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    example = load_example("other_sounds.py")
+    example = load_figure("other_sounds.py")
     ear, exact = Audiogram.standard("N3"), MSBG("N3", sample_rate=16000)
     # This simulator is 3 dB too loud.
     row = example.make_row(exact, lambda x, _: 2**0.5 * exact(x), ear)
@@ -136,7 +136,7 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 
 def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) -> None:
     """The example ranks some degradations of one synthetic voice as HASPI and HASQI do."""
-    example = load_example("validity.py")
+    example = load_figure("validity.py")
     ear, generator = Audiogram.standard("N3"), torch.Generator().manual_seed(0)
     clean = set_level(speech[0][0][0, 8000:28000], 65.0)
     noise = set_level(example.draw_noise(clean, generator), 65.0)
@@ -165,7 +165,7 @@ def test_benchmark_prints_a_table_of_each_kind(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("clarity")
-    example = load_example("benchmark.py")
+    example = load_figure("benchmark.py")
     monkeypatch.setattr(example, "LOSS_SIMULATORS", ("neuro-msbg-light",))
     tables, simulators = ["simulators", "loss", "step"], ["--simulators", "neuro-msbg-light"]
     example.main(["--repeats", "1", "--seconds", "0.2", "--what", *tables, *simulators])
@@ -183,7 +183,7 @@ def test_alignment_by_structure_and_by_an_impulse_agree(speech_dir: Path, tmp_pa
 
 
 def test_prompt_gains_give_the_output_of_the_network() -> None:
-    example = load_example("gains_over_time.py")
+    example = load_figure("gains_over_time.py")
     ear, speech = Audiogram.standard("N3"), example_speech()[:32000]
     with torch.no_grad():
         reference = load_compensator("compensator-general")(speech, ear)

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 from torch import Tensor, nn
 
-from tests.helpers import load_example
+from tests.helpers import load_figure
 
 SMALL = ["--device", "cpu", "--small", "--minutes", "5", "--out"]
 
 
 @pytest.fixture
 def example() -> ModuleType:
-    return load_example("gpu.py")
+    return load_figure("gpu.py")
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

@@ -11,11 +11,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-FOLDERS = ("compensators", "examples", "hlsim", "tests")
+FOLDERS = ("compensators", "docs/figures", "examples", "hlsim", "tests")
 
 # Files that need not keep the rules. Remove yours when it is finished.
 UNFINISHED = {
-    "examples/machine_listener.py",
+    "docs/figures/machine_listener.py",
     "tests/test_language.py",  # It contains the phrases that it rejects.
     "tests/test_listening_page.py",
     "tests/test_machine_listener.py",

@@ -1,4 +1,4 @@
-"""The machine listener of examples/machine_listener.py, with a recogniser that needs no Whisper."""
+"""The machine listener of docs/figures/machine_listener.py, with a recogniser that needs no Whisper."""
 
 import doctest
 from pathlib import Path
@@ -16,15 +16,15 @@ from hlsim.audio import write_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.study import Item
-from tests.helpers import load_example, write_ears
+from tests.helpers import FIGURES, load_figure, write_ears
 
-FILE = Path(__file__).parents[1] / "examples" / "machine_listener.py"
+FILE = FIGURES / "machine_listener.py"
 TEXT = "one two three four five six seven eight"
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    return load_example("machine_listener.py")
+    return load_figure("machine_listener.py")
 
 
 def recognise_loud_eighths(waveform: np.ndarray) -> str:

@@ -16,7 +16,7 @@ from compensators import load_compensator
 from hlsim import MSBG
 from hlsim.calibration import level_spl
 from hlsim.data.clips import Clips
-from tests.helpers import EXAMPLES, load_example
+from tests.helpers import FIGURES, load_figure
 
 WIDTH, TOKENS, PROMPT = 64, 12, [10, 11]
 EARS = torch.full((3, 8), 50.0)
@@ -25,8 +25,8 @@ EARS = torch.full((3, 8), 50.0)
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(EXAMPLES)
-        return load_example("train_by_recogniser.py")
+        patch.syspath_prepend(FIGURES)
+        return load_figure("train_by_recogniser.py")
 
 
 @pytest.fixture(scope="module")

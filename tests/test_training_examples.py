@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers import EXAMPLES, load_example
+from tests.helpers import EXAMPLES, load_example, load_figure
 
 TRAINING = EXAMPLES / "training"
 
@@ -36,7 +36,7 @@ def test_networks_are_trained_and_compared_with_nalr(
     monkeypatch.syspath_prepend(TRAINING)
     folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
     options = f"--loss {loss} --steps 1 --rate 1e-9 --items 1 --noisy".split()
-    load_example("training/networks.py").main(["train", *folders, network, *options])
+    load_figure("networks.py").main(["train", *folders, network, *options])
     out = capsys.readouterr()
     assert out.err.startswith("step 1: ")
     name, unaided, nalr, aided, _, _, *_, follows, as_it_is = out.out.strip("| \n").split(" | ")
@@ -52,8 +52,8 @@ def test_saved_networks_are_judged_at_the_level_of_nalr(
 ) -> None:
     pytest.importorskip("pandas")
     monkeypatch.syspath_prepend(TRAINING)
-    listener = load_example("machine_listener.py")
-    networks = load_example("training/networks.py")
+    listener = load_figure("machine_listener.py")
+    networks = load_figure("networks.py")
     sentence = listener.Sentence("flite-rms-01.flac", 0.0, 1.0, "a b")
     monkeypatch.setattr(listener, "Whisper", lambda folder: lambda waveform: "a")
     monkeypatch.setattr(listener, "read_sentences", lambda path: [sentence])
@@ -70,7 +70,7 @@ def test_saved_networks_are_judged_at_the_level_of_nalr(
 def test_a_mask_looks_one_window_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(TRAINING)
     torch.manual_seed(0)
-    network = load_example("training/networks.py").gru_mask(128)
+    network = load_figure("networks.py").gru_mask(128)
     torch.nn.init.normal_(network.layers[-1].weight)
     signal = torch.randn(1, 1600)
     changed = signal.clone()

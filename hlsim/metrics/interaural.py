@@ -1,7 +1,7 @@
 """Differences of level and time between two ears, by which listeners localise sounds.
 
-They are computed in five octaves around 250 Hz to 4 kHz. ``hlsim.losses.interaural`` compares them in
-a training loss.
+They are computed in five octaves around 250 Hz to 4 kHz. A training loss,
+``hlsim.losses.interaural``, compares them.
 """
 
 from __future__ import annotations

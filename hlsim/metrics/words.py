@@ -1,6 +1,6 @@
 """Prediction of the share of words that a listener understands, from HASPI, with its uncertainty.
 
-The model was fitted by ``examples/fit_words.py``, which describes it, to 2001 responses of 22
+The model was fitted by ``docs/figures/fit_words.py``, which describes it, to 2001 responses of 22
 hearing-impaired listeners to sentences through ten hearing aids.
 
 - HASPI was that of the better ear at pyclarity's default level, computed for standard ears of three

@@ -51,7 +51,7 @@ STRUCTURAL_DELAY = 1047
 
 The three linear-phase filters delay by 507 + 507 + 66 = 1080 samples. The filter bank takes some of
 that back, less at high frequencies and with more loss: without a loss 186 at 200 Hz, 33 at 750 Hz,
-21 at 1 kHz and 0 at 8 kHz, with N4 50 at 200 Hz and 32 at 300 Hz (examples/delay.py).
+21 at 1 kHz and 0 at 8 kHz, with N4 50 at 200 Hz and 32 at 300 Hz (docs/figures/delay.py).
 """
 
 _POWER_FLOOR = 1e-30

@@ -14,9 +14,10 @@ from hlsim.audio import read_audio
 from hlsim.dsp.resample import resample
 from hlsim.metrics import mbstoi, mbstoi_score
 from tests import pyclarity as reference
+from tests.helpers import FIGURES
 from tests.pyclarity import PyclarityOutputs
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "mbstoi_parity.py"
+EXAMPLE = FIGURES / "mbstoi_parity.py"
 
 # Directions of speech and noise in degrees, and the SNR in dB.
 SCENES = ((0.0, 90.0, -8.0), (-40.0, 30.0, 0.0), (70.0, 160.0, 8.0))

@@ -1,14 +1,14 @@
 """The model of the words understood equals a new fit and predicts a listener left out of it."""
 
 import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hlsim.metrics.words import load_curve, simulate_proportions, words_change
+from tests.helpers import FIGURES
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "fit_words.py"
+EXAMPLE = FIGURES / "fit_words.py"
 
 
 @pytest.mark.slow

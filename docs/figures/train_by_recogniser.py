@@ -9,7 +9,7 @@ frequency bands and loudness with a normal ear's, and contain HASPI (see `loss_t
 It needs `pip install faster-whisper` and a folder with a Whisper model for CTranslate2 in float16
 or float32 (model.bin, config.json, tokenizer.json, vocabulary.txt):
 
-    python examples/train_by_recogniser.py speech/train noise/train --model TINY \\
+    python docs/figures/train_by_recogniser.py speech/train noise/train --model TINY \\
         --audiograms audiograms/train.csv --device cuda --out trained
 
 A step of 32 clips needs 6 GB of memory. On a CPU, take smaller steps, such as `--batch 4`.
@@ -17,7 +17,7 @@ A step of 32 clips needs 6 GB of memory. On a CPU, take smaller steps, such as `
 An aid is not to be judged by the recogniser that trained it. Judge it by another one, on other
 speakers:
 
-    python examples/machine_listener.py compare speech/valid noise/valid --model BASE \\
+    python docs/figures/machine_listener.py compare speech/valid noise/valid --model BASE \\
         --audiograms audiograms/valid.csv --aids hearing-aid ./trained nalr --out judged
 """
 

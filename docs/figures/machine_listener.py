@@ -8,8 +8,8 @@ the words of a sentence that it recognises, *words correct*, depends on level, n
 It needs `pip install faster-whisper` and a folder with a Whisper model for CTranslate2 (model.bin,
 config.json, tokenizer.json, vocabulary.txt), and runs offline.
 
-    python examples/machine_listener.py transcribe speech/valid --models TINY BASE --out FILE.csv
-    python examples/machine_listener.py compare speech/valid noise/valid --model TINY \\
+    python docs/figures/machine_listener.py transcribe speech/valid --models TINY BASE --out FILE.csv
+    python docs/figures/machine_listener.py compare speech/valid noise/valid --model TINY \\
         --audiograms audiograms/valid.csv --aids hearing-aid nalr --out listened
 
 `transcribe` cuts recordings at pauses and keeps the pieces in which two models recognise the same
@@ -25,7 +25,7 @@ The measure also scores recorded files, whose sentences are found by their names
 columns item and text:
 
     export WHISPER_MODEL=TINY WHISPER_SENTENCES=FILE.csv
-    hlsim haspi-report --manifest items.csv --measure examples/machine_listener.py:WordsCorrect
+    hlsim haspi-report --manifest items.csv --measure docs/figures/machine_listener.py:WordsCorrect
 
 Whisper is not a person. It was trained on noisy speech, and noise may disturb it less than a person.
 """

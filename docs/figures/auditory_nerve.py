@@ -1,7 +1,7 @@
 """Aids compared by a model of the auditory nerve: is the response closer to that of a normal ear?
 
     pip install brucezilany
-    python examples/auditory_nerve.py speech/valid noise/valid audiograms/valid.csv [EARS]
+    python docs/figures/auditory_nerve.py speech/valid noise/valid audiograms/valid.csv [EARS]
 
 The model by Bruce, Erfani and Zilany (2018, Hearing Research 360) is independent of MSBG and HASPI.
 Two thirds of each loss are assigned to outer hair cells, or as much as they can cause, and the rest

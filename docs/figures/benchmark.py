@@ -1,8 +1,8 @@
 """Times of simulators, loss, training step and metrics, and their ratios to pyclarity's.
 
-    python examples/benchmark.py
-    python examples/benchmark.py --what simulators --simulators neuro-msbg runs/mine/checkpoint
-    OMP_NUM_THREADS=1 python examples/benchmark.py --what loss step --seconds 2 --batch 8
+    python docs/figures/benchmark.py
+    python docs/figures/benchmark.py --what simulators --simulators neuro-msbg runs/mine/checkpoint
+    OMP_NUM_THREADS=1 python docs/figures/benchmark.py --what loss step --seconds 2 --batch 8
 
 Every round times all rows of a table in turn, so that a ratio compares calls within seconds of each
 other. The first round is not counted. Tables show the median (minimum to maximum) of the other

@@ -1,6 +1,6 @@
 """Fit and cross-validate the curve from HASPI to words in ``hlsim/metrics/words.json``.
 
-    python examples/fit_words.py [FILE]
+    python docs/figures/fit_words.py [FILE]
 
 It requires pyclarity, takes about two minutes, and writes the fit to FILE. The data are those of
 the Clarity prediction challenges in pyclarity: responses of hearing-impaired listeners to sentences

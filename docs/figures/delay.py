@@ -71,7 +71,7 @@ def main() -> None:
         ear = Audiogram.standard(name)
         delays = measure_delays(MSBG(ear, sample_rate=MSBG_RATE)(make_bursts()), make_bursts())
         print(f"| {name} | {ear.severity} |" + "".join(f" {samples:+d} |" for samples in delays))
-    draw(Path(__file__).parents[1] / "docs" / "delay.png")
+    draw(Path(__file__).parents[1] / "delay.png")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """MBSTOI of hlsim compared with that of pyclarity: errors, and speed on one thread.
 
-    python examples/mbstoi_parity.py SPEECH NOISE [PAIRS [RATE]]
+    python docs/figures/mbstoi_parity.py SPEECH NOISE [PAIRS [RATE]]
 
 The signals are 3 s of speech from one direction and noise from another, at the ears of a spherical
 head, with -10 to 10 dB SNR over both ears.

@@ -1,6 +1,6 @@
 """The hearing aid's noise reduction in noise, in babble, with a second talker and in a room.
 
-    python examples/noise_reduction.py speech/valid noise/valid audiograms/valid.csv [ITEMS]
+    python docs/figures/noise_reduction.py speech/valid noise/valid audiograms/valid.csv [ITEMS]
 
 For each scene, it prints wide-band PESQ and STOI for a normal ear without amplification, and HASPI
 of the aid for measured ears with noise reduction on and off, at the output level of clean speech.

@@ -2,7 +2,7 @@
 # The paper's Tables I, III and IV, and a comparison of normalisations.
 #
 #   [STEPS=10000] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:model.phase=input:seed=1"] \
-#       examples/tables.sh CORPORA OUT [ITEMS]
+#       docs/figures/tables.sh CORPORA OUT [ITEMS]
 #
 # Trains each row on one thread, and compares the rows. If it is stopped, the same command continues. Results are in
 # docs/paper-tables.md, except for the paper's rows at full width, which require a GPU.

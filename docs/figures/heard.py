@@ -1,7 +1,7 @@
 """Draw docs/heard.png, speech as a normal ear and an N4 ear perceive it, without an aid and with
 three, and docs/family.png, an N2 ear by simulator.
 
-python examples/heard.py
+python docs/figures/heard.py
 """
 
 from io import BytesIO
@@ -20,7 +20,7 @@ from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.report.players import spectrogram_levels
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 RATE = 16000
 EXACT = "exact MSBG"
 RANGE_DB = 75.0

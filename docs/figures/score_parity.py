@@ -1,6 +1,6 @@
 """HASPI, HASQI and HAAQI compared with those of pyclarity: errors with the same seed, and speed.
 
-    python examples/score_parity.py SPEECH [ITEMS]
+    python docs/figures/score_parity.py SPEECH [ITEMS]
 
 The items are 3 s of speech at 16 kHz and 50 to 80 dB SPL, for the ears N1 to N6 and S1 to S3. The
 output is clean, noisy (-5 to 20 dB SNR), amplified by NAL-R, clipped, low-passed, or noisy and

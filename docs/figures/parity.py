@@ -1,6 +1,6 @@
 """Relative error of the exact MSBG with respect to pyclarity's.
 
-    python examples/parity.py SPEECH_DIR AUDIOGRAMS.csv [CASES]
+    python docs/figures/parity.py SPEECH_DIR AUDIOGRAMS.csv [CASES]
 
 At 44.1 kHz, outputs are compared sample by sample, with the delay and the rescaling of the
 reference. At 16 kHz, the reference processes the resampled input, its output is aligned and

@@ -1,4 +1,4 @@
-"""Errors of Neuro-MSBG for sounds that are not speech: python examples/other_sounds.py [NAME OR
+"""Errors of Neuro-MSBG for sounds that are not speech: python docs/figures/other_sounds.py [NAME OR
 FOLDER]
 
 The sounds are steady tones, white noise and a click at 50, 65 and 80 dB SPL. The table shows

@@ -1,6 +1,6 @@
 """Compare gradients through the networks with those through the exact MSBG.
 
-    python examples/gradients.py SPEECH_DIR NOISE_DIR AUDIOGRAMS.csv [ITEMS]
+    python docs/figures/gradients.py SPEECH_DIR NOISE_DIR AUDIOGRAMS.csv [ITEMS]
 
 It prints the cosine between the gradients of ``HearingLossLoss`` with respect to the output of an
 aid, through a network and through the exact MSBG, as the median over the items. The last row

@@ -1,4 +1,4 @@
-"""Rank correlation of criteria with HASPI and HASQI: python examples/validity.py SPEECH [NOISE]
+"""Rank correlation of criteria with HASPI and HASQI: python docs/figures/validity.py SPEECH [NOISE]
 
 The signals are clean speech and seventeen degradations of it: 3 s at 65 dB SPL by four talkers, for
 the ears N2, N3 and N4. Each passes one of two fixed equalisers. With one, the ear perceives the

@@ -1,7 +1,7 @@
 """Train networks through the default loss or another one, and compare them with NAL-R.
 
-    python examples/training/networks.py train TRAIN_SPEECH VALID_SPEECH NETWORK [--ear N3]
-    PYTHONPATH=examples python examples/training/networks.py judge \\
+    python docs/figures/networks.py train TRAIN_SPEECH VALID_SPEECH NETWORK [--ear N3]
+    python docs/figures/networks.py judge \\
         TRAINED VALID_SPEECH VALID_NOISE --model WHISPER [--ear N3]
 
 The networks are ``gru-mask``, ``gru-mask-8ms``, ``conv-mask``, ``waveform`` and ``conv-tasnet``.
@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from conv_tasnet import conv_tasnet
-from filter_bank import SAMPLE_RATE
 from torch import Tensor, nn
 
 from compensators import NALR
+from examples.training.conv_tasnet import conv_tasnet
+from examples.training.filter_bank import SAMPLE_RATE
 from hlsim import Audiogram, HASPILoss, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import mix

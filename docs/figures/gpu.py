@@ -1,6 +1,6 @@
 """Measure hlsim on one GPU: equality with the CPU, speed, memory, waits, CUDA graphs, training.
 
-    python examples/gpu.py --out DIR [--minutes 8] [--device cpu] [--small] [--only SECTION ...]
+    python docs/figures/gpu.py --out DIR [--minutes 8] [--device cpu] [--small] [--only SECTION ...]
 
 DIR/rows.jsonl gets one line per row as soon as it is measured. A row that is there is not measured
 again, so an interrupted run continues where it stopped; delete a line to measure it again. A row
@@ -17,8 +17,8 @@ Predictions, made before the first run on a GPU
 -----------------------------------------------
 ``PREDICTIONS`` holds, for a call with one item of 4 s, the number of operations that launch a
 kernel and the megabytes that they read and write, as counted on a CPU by
-``python examples/gpu.py --device cpu --only operations --out DIR``. (The count is that of torch's
-profiler; an operation is one without children that is no view, and it writes as much as its largest
+``python docs/figures/gpu.py --device cpu --only operations --out DIR``. (The count is that of
+torch's profiler; an operation is one without children that is no view, and it writes as much as its largest
 input holds. On a CPU Mamba works in more and smaller blocks than on a GPU, so that its operations
 are upper bounds. Those of HASPI, HASQI and MBSTOI were counted on a pretended device.) We assume 8
 microseconds of host time per operation and 2 terabytes per second. The expected time of a call is
@@ -621,7 +621,7 @@ def counted_waits() -> Iterator[Counter[str]]:
 
 def calling_line() -> str:
     """The innermost line of hlsim on the stack, or "elsewhere" if there is none."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     frame: Any = sys._getframe()
     while frame is not None:
         path = Path(frame.f_code.co_filename)

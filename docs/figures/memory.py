@@ -1,6 +1,6 @@
 """Memory that HearingLossLoss takes for its gradient, with and without ``checkpoint=True``.
 
-    python examples/memory.py [--items 16] [--seconds 4]
+    python docs/figures/memory.py [--items 16] [--seconds 4]
 
 The items are white noise at 65 dB SPL for an N3 ear, and three times as loud before the loss. Each
 case runs in a process of its own. Prints a Markdown table in MB (10^6 bytes) with
