@@ -11,7 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import check_extras, read_ears, warn_of_other_ears
-from hlsim.cli.options import EARS_TABLE, Parser, count, input_path, positive_number
+from hlsim.cli.options import (
+    EARS_TABLE,
+    Parser,
+    count,
+    full_scale,
+    input_path,
+    positive_number,
+    seed,
+    sound_level,
+)
 from hlsim.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -163,7 +172,8 @@ def clarity(parser: Parser) -> None:
     option("--every", count, text, 1, dest="stride")
     parser.enhancers("waveforms with shape (2, time) in pascals")
     parser.linked("")
-    option("--full-scale-spl", float, "level in dB SPL of a file whose RMS is 1.0", 100.0)
+    text = "level in dB SPL of a file whose RMS is 1.0"
+    option("--full-scale-spl", full_scale, text, 100.0)
     _declare_study(parser)
 
 
@@ -181,12 +191,14 @@ def _clarity(options: argparse.Namespace) -> None:
 def _read_labels(texts: Sequence[str]) -> dict[str, str]:
     """Return names or folders by their label in tables, from texts NAME or LABEL=NAME.
 
+    A folder that exists, such as ``runs/lr=0.1``, has no label.
+
     Raises:
         ValueError: Two names have the same label.
     """
     labels: dict[str, str] = {}
     for text in texts:
-        label, _, name = text.partition("=")
+        label, _, name = (text, "", "") if Path(text).exists() else text.partition("=")
         if label in labels:
             raise ValueError(
                 f"two of the names have the same label, {label}; write one of them as LABEL=NAME "
@@ -210,7 +222,9 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
     option("--speech", input_path, text, required=True)
     text = "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB"
     option("--noise", input_path, text)
-    option("--levels", float, f"levels of the {levelled} in dB SPL, in turn", levels, nargs="+")
+    option(
+        "--levels", sound_level, f"levels of the {levelled} in dB SPL, in turn", levels, nargs="+"
+    )
     option("--items", count, "number of items", items)
     option("--seconds", positive_number, "length of an item in seconds", 3.0)
 
@@ -222,10 +236,10 @@ def _declare_study(parser: Parser) -> None:
         "function (item, output) -> dict of numbers"
     )
     parser.option("--measure", str, text, [], nargs="+", dest="own_measures")
-    parser.option("--jobs", int, "number of processes; all cores by default")
+    parser.option("--jobs", count, "number of processes; all cores by default")
     text = "address of a Dask scheduler, such as tcp://host:8786, whose workers are used"
     parser.option("--dask", str, text)
-    parser.option("--seed", int, "seed of every random draw", 0)
+    parser.option("--seed", seed, "seed of every random draw", 0)
     parser.option("--out", Path, "folder for the results", required=True)
 
 

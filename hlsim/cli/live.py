@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ears
-from hlsim.cli.options import Parser, positive_number
+from hlsim.cli.options import Parser, full_scale, positive_number
 
 
 def live(parser: Parser) -> None:
@@ -33,7 +33,7 @@ def live(parser: Parser) -> None:
     text = (
         "level in dB SPL of samples whose RMS is 1.0, at microphone and headphones, to be measured"
     )
-    option("--full-scale-spl", float, text, 100.0)
+    option("--full-scale-spl", full_scale, text, 100.0)
     text = "{}, by number or part of the name that python -m sounddevice prints"
     option("--input", _read_device, text.format("microphone"))
     option("--output", _read_device, text.format("headphones"))

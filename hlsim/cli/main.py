@@ -1,10 +1,12 @@
-"""The program ``hlsim``. Bad input ends with exit status 2 and a message of one line."""
+"""The program ``hlsim``. Every error ends with exit status 2 and a message of one line."""
 
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
@@ -39,6 +41,12 @@ The module has a function of the command's name that declares the options.
 COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 """Module and description of each command."""
 
+TRACEBACK_VARIABLE = "HLSIM_TRACEBACK"
+"""Environment variable that, unless empty, adds the traceback to the message of an error."""
+
+_EXPECTED_ERRORS = (ValueError, ImportError, OSError)
+"""Exceptions whose message is written for users; others are errors of hlsim or of a plug-in."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program ``hlsim``.
@@ -57,17 +65,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The backend of a notebook may be missing in this environment.
         os.environ["MPLBACKEND"] = "Agg"
     warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
+    for stream in (sys.stdout, sys.stderr):
+        # A character that the encoding lacks, in the name of a file, must not end the command.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
         options.run(options)
-    except (ValueError, ImportError, OSError) as error:
-        print(f"hlsim: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         text = "stopped; run the same command again to continue a training or an evaluation"
         print(f"\nhlsim: {text}", file=sys.stderr)
         return 130
+    except Exception as error:
+        if os.environ.get(TRACEBACK_VARIABLE):
+            traceback.print_exc()
+        print(f"hlsim: error: {_describe(error)}", file=sys.stderr)
+        return 2
     return 0
+
+
+def _describe(error: Exception) -> str:
+    """Return the message of an exception in one line, with its type if it is unexpected."""
+    text = " ".join(str(error).split())
+    if isinstance(error, _EXPECTED_ERRORS) and text:
+        return text
+    if isinstance(error, MemoryError):
+        return f"out of memory {text}".rstrip()
+    kind = type(error).__name__
+    return f"unexpected {kind}: {text}; {TRACEBACK_VARIABLE}=1 hlsim ... shows where it was raised"
 
 
 def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:

@@ -161,8 +161,8 @@ class Parser(argparse.ArgumentParser):
         """
         group = self.add_mutually_exclusive_group()
         text = "level in dB SPL of a file whose RMS is 1.0"
-        self.option("--full-scale-spl", float, text, 94.0, group=group)
-        self.option("--spl", float, f"level in dB SPL of {signal}", group=group)
+        self.option("--full-scale-spl", full_scale, text, 94.0, group=group)
+        self.option("--spl", sound_level, f"level in dB SPL of {signal}", group=group)
 
     def linked(self, condition: str) -> None:
         """Declare ``--linked``, which gives both ears the same gains.
@@ -189,9 +189,9 @@ class Parser(argparse.ArgumentParser):
     def sliders(self) -> None:
         """Declare ``--noise-reduction`` and ``--amplification``, the sliders of a hearing aid."""
         text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 0.5)"
-        self.option("--noise-reduction", float, text)
+        self.option("--noise-reduction", share, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
-        self.option("--amplification", float, text)
+        self.option("--amplification", share, text)
 
 
 def _checked_type(
@@ -227,10 +227,29 @@ def ear(text: str) -> str | list[float] | dict[float, float]:
     """
     if ":" in text:
         points = [point.split(":") for point in text.split(",")]
-        return {float(frequency): float(level) for frequency, level in points}
+        levels = {float(frequency): float(level) for frequency, level in points}
+        if len(levels) < len(points):
+            raise argparse.ArgumentTypeError(
+                f"got {text!r}, expected one level for each frequency; leave all but one out"
+            )
+        return levels
     return [float(level) for level in text.split(",")] if "," in text else text
 
 
+def _limited(
+    read: Callable[[str], Any], noun: str, lowest: float, highest: float
+) -> Callable[[str], Any]:
+    """Make a function that converts the text of an option to a number in a closed range."""
+    expected = f"{noun} from {lowest:,g} to {highest:,g}"
+    return _checked_type(read, lambda value: lowest <= value <= highest, expected)
+
+
 positive_number = _checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
+minutes = _checked_type(float, lambda value: 0 < value <= 1e6, "above 0 and at most 1,000,000")
 count = _checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
+share = _limited(float, "a number", 0, 1)
+sound_level = _limited(float, "a level in dB SPL", -20, 140)
+full_scale = _limited(float, "a level in dB SPL", 0, 200)
+workers = _limited(int, "a whole number", 0, 1024)
+seed = _limited(int, "a whole number", 0, 2**32 - 1)
 input_path = _checked_type(Path, lambda path: path.exists(), "an existing file or folder")

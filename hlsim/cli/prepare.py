@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hlsim.cli.options import Parser, input_path
+from hlsim.cli.options import Parser, input_path, share
 
 
 def prepare(parser: Parser) -> None:
@@ -31,7 +31,7 @@ def prepare(parser: Parser) -> None:
     )
     option(
         "--valid-share",
-        float,
+        share,
         "share of the training speakers that are used for validation, if the corpus has no "
         "validation split",
         0.0,

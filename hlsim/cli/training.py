@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_extras, read_ears
-from hlsim.cli.options import Parser, count, input_path, positive_number
+from hlsim.cli.options import Parser, count, input_path, minutes, workers
 from hlsim.cli.recipes import add_recipe, make_recipe
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
@@ -66,11 +66,11 @@ def _declare_common(parser: Parser) -> None:
         "time limit in minutes, including the time before a resumption; the learning rate "
         "does not depend on it"
     )
-    option("--max-minutes", positive_number, text)
+    option("--max-minutes", minutes, text)
     option("--device", str, "device of the training", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "number of GPUs or processes; each draws its own batches", 1)
     text = "number of processes that draw batches, in addition to the one that trains"
-    option("--workers", int, text, 0)
+    option("--workers", workers, text, 0)
     option("--out", Path, "folder for the results", required=True)
 
 

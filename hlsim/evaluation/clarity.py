@@ -199,13 +199,30 @@ def _read_pairs(
 def _read_names(path: Path) -> list[tuple[str, str]]:
     """Return the names of scenes and listeners in ``scenes_listeners.json``."""
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-        return [(scene, name) for scene, listeners in entries.items() for name in listeners]
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+        text = path.read_text(encoding="utf-8")
+        entries = json.loads(text, object_pairs_hook=_unique_keys)
+        pairs = [(scene, name) for scene, listeners in entries.items() for name in listeners]
+        # A text instead of a list of names would give its letters.
+        if any(isinstance(listeners, str) for listeners in entries.values()):
+            raise ValueError("a scene has a text instead of a list")
+        if not all(isinstance(name, str) for _, name in pairs):
+            raise ValueError("a name is not a text")
+        if len({*pairs}) < len(pairs):
+            raise ValueError("a scene has the same listener twice")
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(
-            f"{path}: cannot be read ({error}); expected an object with a list of listeners for "
-            "each scene"
+            f"{path}: cannot be read ({error}); expected an object with a list of the names of "
+            "listeners for each scene"
         ) from error
+    return pairs
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the members of a JSON object; of equal keys, Python would take the last one."""
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        raise ValueError("an object has the same key twice")
+    return entries
 
 
 def _make_conditions(

@@ -1,5 +1,6 @@
 """The command line: outputs, and errors of one line after which no files remain."""
 
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.checkpoint import save_checkpoint
+from hlsim.cli.evaluation import _read_labels
 from hlsim.cli.main import main
 from tests.helpers import write_table
 
@@ -54,7 +56,18 @@ def check_output(path: Path, expected: Tensor, atol: float = 1e-6) -> None:
 ERRORS = """simulat | COMMAND
 simulate | hlsim simulate
 simulate {speech} b --audiogram N3 --loud | --loud
-simulate {speech} {out} --audiogram N3 --full-scale-spl nan | full_scale_spl
+simulate {speech} {out} --audiogram N3 --full-scale-spl nan | --full-scale-spl
+simulate {speech} {out} --audiogram N3 --spl 1e4 | a level in dB SPL from -20 to 140
+simulate {speech} {out} --audiogram N3 --spl -300 | a level in dB SPL from -20 to 140
+simulate {speech} {out} --audiogram 500:30,4000:60,500.0:60 | one level for each frequency
+train-simulator --speech {folder} --max-minutes 1e300 --out {out} | at most 1,000,000
+train-simulator --speech {folder} --workers -1 --out {out} | from 0 to 1,024
+train-simulator --speech {folder} --recipe.seconds 1e9 --out {out} | seconds is
+train-simulator --speech {folder} --recipe.seed -1 --out {out} | seed is -1
+evaluate-compensator nalr --speech {folder} --seed 99999999999 --out {out} | --seed
+evaluate-compensator nalr --speech {folder} --jobs 0 --out {out} | --jobs
+evaluate-compensator nalr --speech {folder} --levels 65 1e9 --out {out} | --levels
+prepare {folder} --valid-share nan --out {out} | a number from 0 to 1
 simulate {speech} b --audiogram N3 --spl 65 --full-scale-spl 94 | --full-scale-spl
 compensate {speech} {out} --audiogram N3 --amplification 2 | from 0 to 1
 compensate {speech} b --audiogram N3 --listener c | --listener
@@ -243,6 +256,49 @@ def test_a_missing_extra_names_the_command_that_installs_it(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert "pip install 'hlsim[eval]'" in error_of(capsys, "demo", "--out", tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, RuntimeError, MemoryError, RecursionError])
+def test_an_unexpected_exception_is_one_line_with_a_traceback_on_request(
+    tmp_path: Path,
+    utterance: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: type[Exception],
+) -> None:
+    monkeypatch.setattr("hlsim.cli.processing._process", Mock(side_effect=error("some\nlines")))
+    call = ("simulate", utterance, tmp_path / "out.wav", "--audiogram", "N3")
+    monkeypatch.delenv("HLSIM_TRACEBACK", raising=False)
+    text = error_of(capsys, *call)
+    assert "some lines" in text and ("out of memory" if error is MemoryError else "HLSIM_") in text
+    monkeypatch.setenv("HLSIM_TRACEBACK", "1")
+    assert run(*call) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("Traceback") and lines[-1] == text
+
+
+def test_names_that_stdout_cannot_encode_are_escaped(
+    tmp_path: Path, utterance: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "in").mkdir()
+    for name in ("\u03b1.flac", "\u03b2.flac"):
+        (tmp_path / "in" / name).write_bytes(utterance.read_bytes())
+    (tmp_path / "in" / "\u03b3.wav").write_text("this is no audio")
+    for stream in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, stream, io.TextIOWrapper(io.BytesIO(), encoding="cp1252"))
+    options = ("--audiogram", "N3", "--compensator", "nalr")
+    assert run("compensate", tmp_path / "in", tmp_path / "out", *options) == 2
+    sys.stdout.seek(0)
+    sys.stderr.seek(0)
+    assert "\\u03b1.wav" in (text := sys.stdout.read()) and "\\u03b2.wav" in text
+    assert "\\u03b3.wav" in sys.stderr.read()
+
+
+def test_a_folder_that_exists_has_no_label(tmp_path: Path) -> None:
+    folder = tmp_path / "lr=0.1"
+    folder.mkdir()
+    labels = _read_labels([str(folder), f"mine={folder}", "other=nalr"])
+    assert labels == {str(folder): str(folder), "mine": str(folder), "other": "nalr"}
 
 
 MANIFEST = """listener,ear,condition,clean,processed,audiogram
