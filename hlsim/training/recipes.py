@@ -63,7 +63,7 @@ class TrainingRecipe:
             self._require(name, getattr(self, name) >= 1, "1 or more")
         self._require("seconds", 0.0 < self.seconds <= 600.0, "above 0 and at most 600")
         self._require("learning_rate", self.learning_rate > 0.0, "a number above 0")
-        self._require("seed", 0 <= self.seed < 2**32, "a whole number from 0 to 4294967295")
+        self._require("seed", abs(self.seed) < 2**32, "a whole number below 2**32 in magnitude")
         for name in _SHARES:
             self._require(name, 0.0 <= getattr(self, name, 0.0) <= 1.0, "a share from 0 to 1")
         for name, weight in self.weights.items():

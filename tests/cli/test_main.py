@@ -63,7 +63,7 @@ simulate {speech} {out} --audiogram 500:30,4000:60,500.0:60 | one level for each
 train-simulator --speech {folder} --max-minutes 1e300 --out {out} | at most 1,000,000
 train-simulator --speech {folder} --workers -1 --out {out} | from 0 to 1,024
 train-simulator --speech {folder} --recipe.seconds 1e9 --out {out} | seconds is
-train-simulator --speech {folder} --recipe.seed -1 --out {out} | seed is -1
+train-simulator --speech {folder} --recipe.seed 99999999999 --out {out} | seed is
 evaluate-compensator nalr --speech {folder} --seed 99999999999 --out {out} | --seed
 evaluate-compensator nalr --speech {folder} --jobs 0 --out {out} | --jobs
 evaluate-compensator nalr --speech {folder} --levels 65 1e9 --out {out} | --levels
