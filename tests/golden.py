@@ -403,28 +403,28 @@ def haspi_loss(simulator: str) -> Arrays:
 def metric(name: str, dtype: torch.dtype, rate: int = 16000) -> Arrays:
     function, ears = getattr(hlsim.metrics, name), thresholds("N2", "N4")
     clean = two_voices(0.8, rate).to(dtype)
-    processed = clean + noise(*clean.shape, level=0.01)
-    return with_gradient(lambda x: function(x, clean, ears, sample_rate=rate), processed)
+    output = clean + noise(*clean.shape, level=0.01)
+    return with_gradient(lambda x: function(x, clean, ears, sample_rate=rate), output)
 
 
 def metric_with_noise(name: str, kind: str) -> Arrays:
     """Score two items, with the seeds 1 and 2."""
     function, ears, clean = getattr(hlsim.metrics, name), thresholds("N2", "N4"), two_voices(0.8)
     clean = clean.double()
-    processed = clean + noise(*clean.shape, level=0.01)
+    output = clean + noise(*clean.shape, level=0.01)
 
     def score(x: Tensor) -> Tensor:
         scores = [function(x[i], clean[i], ears[i], noise=kind, seed=1 + i) for i in range(2)]
         return torch.stack(scores)
 
-    return with_gradient(score, processed)
+    return with_gradient(score, output)
 
 
 def metric_lengths(name: str) -> Arrays:
     function, clean = getattr(hlsim.metrics, name), two_voices(0.8)
     lengths = torch.tensor([12800, 11500])
-    processed = clean + noise(12800, level=0.01)
-    return {"scores": function(processed, clean, ear("N3"), lengths=lengths)}
+    output = clean + noise(12800, level=0.01)
+    return {"scores": function(output, clean, ear("N3"), lengths=lengths)}
 
 
 def hasqi_parts() -> Arrays:
@@ -436,8 +436,8 @@ def hasqi_parts() -> Arrays:
 def binaural(rate: int) -> Arrays:
     source = speech(0.8, rate)
     clean = torch.stack([source, 0.7 * source.roll(6)])
-    processed = clean + noise(*clean.shape, level=0.01)
-    return with_gradient(lambda x: hlsim.metrics.mbstoi(x, clean, sample_rate=rate), processed)
+    output = clean + noise(*clean.shape, level=0.01)
+    return with_gradient(lambda x: hlsim.metrics.mbstoi(x, clean, sample_rate=rate), output)
 
 
 # Resampling and statistics

@@ -87,32 +87,32 @@ def msbg(audiogram: Audiogram, waveform: Array, stride: int = 1) -> Array:
         logging.disable(logging.NOTSET)
 
 
-def haspi(clean: Array, processed: Array, audiogram: Audiogram, rate: int, seed: int) -> float:
+def haspi(clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int) -> float:
     module = pytest.importorskip("clarity.evaluator.haspi")
     with numpy_seed(seed):
-        score = module.haspi_v2(clean, rate, processed, rate, audiogram.to_clarity(), level1=94.0)
+        score = module.haspi_v2(clean, rate, output, rate, audiogram.to_clarity(), level1=94.0)
     return float(score[0])
 
 
-def hasqi(clean: Array, processed: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
+def hasqi(clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
     """Combined, nonlinear and linear score."""
     module = pytest.importorskip("clarity.evaluator.hasqi.hasqi")
     with numpy_seed(seed):
-        scores = module.hasqi_v2(clean, rate, processed, rate, audiogram.to_clarity(), level1=94.0)
+        scores = module.hasqi_v2(clean, rate, output, rate, audiogram.to_clarity(), level1=94.0)
     return np.array(scores[:3], dtype=np.float64)
 
 
-def haaqi(clean: Array, processed: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
+def haaqi(clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
     """Combined, nonlinear and linear score."""
     module = pytest.importorskip("clarity.evaluator.haaqi")
     with numpy_seed(seed):
         scores = module.haaqi_v1(
-            clean, rate, processed, rate, audiogram.to_clarity(), equalisation=1, level1=94.0
+            clean, rate, output, rate, audiogram.to_clarity(), equalisation=1, level1=94.0
         )
     return np.array(scores[:3], dtype=np.float64)
 
 
-def mbstoi(clean: Array, processed: Array, rate: int) -> float:
+def mbstoi(clean: Array, output: Array, rate: int) -> float:
     """Compute pyclarity's MBSTOI of signals (2, time), left ear first."""
     module = pytest.importorskip("clarity.evaluator.mbstoi")
-    return float(module.mbstoi(*clean, *processed, rate))
+    return float(module.mbstoi(*clean, *output, rate))

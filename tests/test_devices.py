@@ -38,7 +38,7 @@ class Call(NamedTuple):
 
     Attributes:
         build: Function that returns the module on the CPU.
-        call: Function of the module, processed and clean speech (4, time), and ears (4, 8).
+        call: Function of the module, output and clean speech (4, time), and ears (4, 8).
         waits: Number of times that the host may wait for the device.
     """
 

@@ -134,9 +134,9 @@ REJECTED: dict[str, tuple[Callable[[Path], object], str]] = {
         "from 0 to 1, got 70",
     ),
     "a rate in place of the ear": (lambda _: haspi(SPEECH, SPEECH, 16000), "expected an audiogram"),
-    "one processed signal for two": (
+    "one output for two clean signals": (
         lambda _: haspi(SPEECH, torch.stack([SPEECH, SPEECH]), "N3"),
-        "expected processed and clean of the same shape",
+        "expected output and clean of the same shape",
     ),
     "channels last, to write": (lambda path: write_audio(path, SPEECH[:, None], 16000), "x.T"),
     "frequencies in kHz": (lambda _: NALR({0.25: 20, 1: 30, 4: 50}), "multiply kHz by 1000"),

@@ -161,7 +161,7 @@ class Subject:
     Attributes:
         name: Name of the call in tables.
         build: Function that returns the module, on the CPU and in float32.
-        call: Function of the module, processed and clean speech (items, time), and ears (items, 8).
+        call: Function of the module, output and clean speech (items, time), and ears (items, 8).
         rate: Sample rate in Hz.
     """
 
@@ -313,7 +313,7 @@ class Call:
             return self.value()
 
     def both(self) -> tuple[Tensor, Tensor]:
-        """Value, and gradient with respect to the processed speech.
+        """Value, and gradient with respect to the output.
 
         The gradient is that of a waveform's energy, or of the sum of scores or losses.
         """

@@ -49,7 +49,7 @@ def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: 
 
 def _score_signal(name: str, score: Callable[..., float], item: Item, output: Tensor) -> Values:
     """Compute STOI or PESQ, which do not depend on the ear."""
-    return {name: score(item.clean, output, item.sample_rate)}
+    return {name: score(output, item.clean, item.sample_rate)}
 
 
 # NumPy draws the noise of the scores for an ear.

@@ -153,9 +153,9 @@ def _fidelity_to(teacher_name: str) -> Measure:
         }
         for name, score in scores.items():
             with suppress(ValueError):  # the score of one of the two outputs is not defined
-                score_teacher = partial(score, item.clean, expected, NEURO_RATE)
+                score_teacher = partial(score, expected, item.clean, NEURO_RATE)
                 of_teacher = item.once(name, score_teacher)
-                of_simulator = score(item.clean, output, NEURO_RATE)
+                of_simulator = score(output, item.clean, NEURO_RATE)
                 values |= {f"{name}_teacher": of_teacher, f"{name}_simulator": of_simulator}
         return values
 

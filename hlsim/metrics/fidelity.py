@@ -123,14 +123,14 @@ def _band_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarra
     return np.diff(cumulative_power[edges])
 
 
-def stoi(clean: Signal, output: Signal, sample_rate: int) -> float:
+def stoi(output: Signal, clean: Signal, sample_rate: int) -> float:
     """Compute the short-time objective intelligibility (STOI), about 0 to 1, with pystoi.
 
     Source: Taal, Hendriks, Heusdens and Jensen (2011).
 
     Args:
-        clean: Clean speech. Shape: (time,).
         output: Speech to score. Shape: (time,).
+        clean: Clean speech. Shape: (time,).
         sample_rate: Sample rate in Hz.
 
     Raises:
@@ -146,7 +146,7 @@ def stoi(clean: Signal, output: Signal, sample_rate: int) -> float:
     return _score("STOI", lambda x, y: pystoi.stoi(x, y, sample_rate), clean, output)
 
 
-def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> float:
+def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
     """Compute wide-band PESQ, the quality of speech from about 1 to 4.6, with the package pesq.
 
     Signals are resampled to 16 kHz. Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts,
@@ -156,8 +156,8 @@ def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> float:
     Source: ITU-T P.862.2.
 
     Args:
-        clean: Clean speech. Shape: (time,).
         output: Speech to score. Shape: (time,).
+        clean: Clean speech. Shape: (time,).
         sample_rate: Sample rate in Hz.
 
     Raises:

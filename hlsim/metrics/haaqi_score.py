@@ -58,7 +58,7 @@ MODULATION_ORDER = 128
 
 @not_compiled  # tracing takes minutes
 def haaqi(
-    processed: Tensor,
+    output: Tensor,
     clean: Tensor,
     audiogram: AudiogramLike,
     *,
@@ -69,14 +69,14 @@ def haaqi(
     seed: int = 0,
     whole_khz: bool = False,
 ) -> Tensor:
-    """Compute HAAQI version 1 of each item: how good processed music sounds, from 0 to 1.
+    """Compute HAAQI version 1 of each item: how good the output of an aid sounds, from 0 to 1.
 
-    The score compares the processed music with clean music that NAL-R has amplified for the same
-    impaired ear, and is differentiable in ``processed``. Stereo signals have one score per ear:
+    The score compares the output with clean music that NAL-R has amplified for the same
+    impaired ear, and is differentiable in ``output``. Stereo signals have one score per ear:
     take the better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
 
     Args:
-        processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
+        output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
         clean: Clean music, not amplified. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
@@ -104,7 +104,7 @@ def haaqi(
     >>> bool(scores[0] > scores[1])
     True
     """
-    processed, clean, lengths = match_pair(processed, clean, sample_rate, lengths)
+    output, clean, lengths = match_pair(output, clean, sample_rate, lengths)
     reference = HaaqiReference(
         clean,
         audiogram,
@@ -114,7 +114,7 @@ def haaqi(
         whole_khz=whole_khz,
         keep=False,
     )
-    return reference.score(processed, noise=noise, seed=seed)
+    return reference.score(output, noise=noise, seed=seed)
 
 
 def _split_by_rate(waves: Tensor) -> Tensor:

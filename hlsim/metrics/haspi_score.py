@@ -3,7 +3,7 @@
 The score is that of pyclarity 0.9.0, with a gradient. Please note:
 
 - HASPI rewards gain: 20 dB took one utterance from 0.53 to 0.99. Report the level beside the score.
-- White noise in place of the processed speech should score 0. It does to within 0.05 on utterances
+- White noise in place of the output should score 0. It does to within 0.05 on utterances
   of 3 s and more, but scores up to 0.3 on 1.2 s, 0.45 on 0.7 s and 0.99 on 0.2 s. Signals shorter
   than 0.7 s are rejected.
 - If the reference is below the threshold of hearing, every signal has the same score. References
@@ -46,7 +46,7 @@ from hlsim.torchtools import constant_like, not_compiled
 
 @not_compiled  # tracing takes minutes
 def haspi(
-    processed: Tensor,
+    output: Tensor,
     clean: Tensor,
     audiogram: AudiogramLike,
     *,
@@ -63,7 +63,7 @@ def haspi(
     A delay of the output has no effect. A silent output has the score of the ear's internal noise.
     ``HaspiReference`` prepares clean speech once for many scores.
 
-    The score is differentiable in ``processed``. The delays that align the output are constants for
+    The score is differentiable in ``output``. The delays that align the output are constants for
     the gradient, and bands that are inaudible have no gradient.
 
     The result is float64 if one of the signals is, and float32 otherwise. On CUDA, leave
@@ -71,7 +71,7 @@ def haspi(
     a GPU are not read by the host: if they are out of range, the score is NaN.
 
     Args:
-        processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
+        output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
         clean: Clean speech, not amplified. Shape: (..., time). Lengths of both that differ by 0.1 s
             at most are cut to the shorter one, with a warning.
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item. Shape of a
@@ -99,7 +99,7 @@ def haspi(
     >>> bool(haspi(speech, speech, "N4") < haspi(speech, speech, "NH"))
     True
     """
-    processed, clean, lengths = match_pair(processed, clean, sample_rate, lengths)
+    output, clean, lengths = match_pair(output, clean, sample_rate, lengths)
     reference = HaspiReference(
         clean,
         sample_rate=sample_rate,
@@ -108,7 +108,7 @@ def haspi(
         whole_khz=whole_khz,
         keep=False,
     )
-    return reference.score(processed, audiogram, noise=noise, seed=seed)
+    return reference.score(output, audiogram, noise=noise, seed=seed)
 
 
 class HaspiReference(Reference):
@@ -183,12 +183,12 @@ class HaspiReference(Reference):
         )
 
     def _compare(
-        self, batch: PreparedBatch, processed: Tensor, noise: Noise, seed: int, *ears: HairCells
+        self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
         """Compute the ten features of HASPI for each item. Shape: -> (items, 10)."""
         extent, ear = batch.clean.audible, ears[0][batch.clean.items]
         contributions = [
-            (clean.amplitude, clean.cepstrum, _cepstrum(clean, processed, ear, extent))
+            (clean.amplitude, clean.cepstrum, _cepstrum(clean, output, ear, extent))
             for clean in batch.features
         ]
         amplitude, *cepstra = (reduce(add, parts) for parts in zip(*contributions, strict=True))
@@ -197,13 +197,13 @@ class HaspiReference(Reference):
         if noise == "expected":
             return envelopes.expected_correlation(x, y, audible)
         if noise == "seeded":
-            clean_noise, processed_noise = _draw_noise(seed, extent, audible, x)
-            x, y = x + clean_noise, y + processed_noise
+            clean_noise, output_noise = _draw_noise(seed, extent, audible, x)
+            x, y = x + clean_noise, y + output_noise
         return envelopes.correlation(x, y, audible)
 
     def score(
         self,
-        processed: Tensor,
+        output: Tensor,
         audiogram: AudiogramLike,
         *,
         noise: Noise = "expected",
@@ -212,7 +212,7 @@ class HaspiReference(Reference):
         """Return the HASPI of each output of an aid.
 
         Args:
-            processed: Outputs of the shape, rate and scale of the clean speech. Shape: (..., time).
+            output: Outputs of the shape, rate and scale of the clean speech. Shape: (..., time).
             audiogram: The impaired ear, or one for each item, as in ``haspi``.
             noise: Internal noise of the ear: ``"expected"``, its mean effect; ``"seeded"``, the
                 noise that pyclarity draws; or ``"none"``.
@@ -226,7 +226,7 @@ class HaspiReference(Reference):
                 seed out of range.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
-        return _intelligibility(self._compare_all(processed, noise, seed, ears))
+        return _intelligibility(self._compare_all(output, noise, seed, ears))
 
 
 class _Channels(NamedTuple):
@@ -247,10 +247,10 @@ class _Channels(NamedTuple):
     cepstrum: Tensor
 
 
-def _cepstrum(clean: _Channels, processed: Tensor, ear: HairCells, extent: Extent) -> Tensor:
+def _cepstrum(clean: _Channels, output: Tensor, ear: HairCells, extent: Extent) -> Tensor:
     """Return the contribution of some channels to the cepstrum of the output's frames."""
     channels = clean.channels
-    power = ear_model.simulate_cochlea(processed, ear, channels, extent).power
+    power = ear_model.simulate_cochlea(output, ear, channels, extent).power
     envelope = power.detach().sqrt()
     power = ear_model.align_channels(power, envelope, clean.spectrum, extent)
     levels = ear_model.nerve_levels(power, ear.inner[:, channels])

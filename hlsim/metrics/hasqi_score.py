@@ -22,7 +22,7 @@ from hlsim.torchtools import not_compiled
 
 @not_compiled  # tracing takes minutes
 def hasqi(
-    processed: Tensor,
+    output: Tensor,
     clean: Tensor,
     audiogram: AudiogramLike,
     *,
@@ -36,10 +36,10 @@ def hasqi(
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean speech that NAL-R has amplified for the same impaired
-    ear, and is differentiable in ``processed``.
+    ear, and is differentiable in ``output``.
 
     Args:
-        processed: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
+        output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
         clean: Clean speech, not amplified. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
@@ -63,7 +63,7 @@ def hasqi(
     >>> round(float(hasqi(speech, speech, "NH")), 2)
     0.99
     """
-    processed, clean, lengths = match_pair(processed, clean, sample_rate, lengths)
+    output, clean, lengths = match_pair(output, clean, sample_rate, lengths)
     reference = HasqiReference(
         clean,
         audiogram,
@@ -73,7 +73,7 @@ def hasqi(
         whole_khz=whole_khz,
         keep=False,
     )
-    return reference.score(processed, noise=noise, seed=seed)
+    return reference.score(output, noise=noise, seed=seed)
 
 
 class HasqiReference(QualityReference):

@@ -3,13 +3,14 @@
 The score is that of pyclarity 0.9.0, with a gradient. In 15 one-third-octave bands and segments of
 0.4 s, a model of the brain delays the signal of one ear, changes its level and subtracts it from
 that of the other ear, with the errors that listeners make. The delay and the level are those that
-maximise the ratio of clean to processed modulation. Where one ear has a larger ratio, that ear
-counts. The score is the mean correlation of the clean and the processed envelopes. Please note:
+maximise the ratio of the modulation of clean speech to that of the output. Where one ear has a
+larger ratio, that ear counts. The score is the mean correlation of the envelopes of clean speech
+and output. Please note:
 
 - MBSTOI assumes normal hearing and ignores the level. For a listener with a hearing loss, apply a
-  simulator to the processed signals first.
-- Signals are not aligned. Align ``processed`` with ``clean`` first.
-- The bands end at 4.3 kHz. A band in which ``processed`` is silent has an arbitrary correlation,
+  simulator to the outputs first.
+- Signals are not aligned. Align ``output`` with ``clean`` first.
+- The bands end at 4.3 kHz. A band in which ``output`` is silent has an arbitrary correlation,
   that of rounding errors.
 
 Source: Andersen, de Haan, Tan and Jensen 2018, "Refinement and validation of the binaural short
@@ -63,7 +64,7 @@ their cross-spectrum. The two products are the squared powers of the left and of
 """
 
 
-def mbstoi(processed: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor:
+def mbstoi(output: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor:
     """Compute MBSTOI of each item: the intelligibility of speech at two ears, about 0 to 1.
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
@@ -72,8 +73,8 @@ def mbstoi(processed: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Ten
     score by up to 0.007, so score the items of a padded batch one by one.
 
     Args:
-        processed: Processed speech at the left and the right ear. Shape: (..., 2, time).
-        clean: Clean speech at the left and the right ear, time-aligned with ``processed``. Shape:
+        output: Output of an aid at the left and the right ear. Shape: (..., 2, time).
+        clean: Clean speech at the left and the right ear, time-aligned with ``output``. Shape:
             (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
@@ -89,12 +90,12 @@ def mbstoi(processed: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Ten
     >>> round(float(mbstoi(clean, clean)), 2)
     1.0
     """
-    processed, clean, _ = match_pair(processed, clean, sample_rate)
+    output, clean, _ = match_pair(output, clean, sample_rate)
     check_two_channels(clean)
     *items, _, time = clean.shape
-    precision = torch.float32 if processed.device.type == "mps" else torch.float64
-    signals = torch.stack([clean, processed], -3).to(precision).reshape(-1, 2, 2, time)
-    check_finite("processed or clean", signals)
+    precision = torch.float32 if output.device.type == "mps" else torch.float64
+    signals = torch.stack([clean, output], -3).to(precision).reshape(-1, 2, 2, time)
+    check_finite("output or clean", signals)
     is_sounding = signals[:, 0].flatten(1).any(-1).tolist()
     if not all(is_sounding):
         index = is_sounding.index(False)
@@ -110,8 +111,8 @@ def _score_batch(signals: Tensor, rate: int) -> Tensor:
     """Compute MBSTOI of items at once.
 
     Args:
-        signals: Clean, then processed speech at the left, then the right ear. Shape: (items, 2, 2,
-            time).
+        signals: Clean speech, then the output, at the left, then the right ear. Shape: (items, 2,
+            2, time).
         rate: Sample rate in Hz.
 
     Returns:
@@ -138,7 +139,7 @@ def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
     """Remove the frames where clean speech is silent at both ears, and overlap and add the others.
 
     Args:
-        signals: Clean signals of the left and the right ear, then the processed ones. Shape:
+        signals: Clean signals of the left and the right ear, then the outputs. Shape:
             (2, 2, items, time).
 
     Returns:
@@ -195,11 +196,11 @@ def _band_features(frames: Tensor) -> Tensor:
     """Compute the four features of each band in each frame, see ``LEFT_PAIR``.
 
     Args:
-        frames: Windowed frames of clean, then processed speech at the left, then the right ear.
-            Shape: (2, 2, frames, 256).
+        frames: Windowed frames of clean speech, then of the output, at the left, then the right
+            ear. Shape: (2, 2, frames, 256).
 
     Returns:
-        Features of clean, then processed speech. Shape: (frames, bands, 8).
+        Features of clean speech, then of the output. Shape: (frames, bands, 8).
     """
     left, right = rfft(functional.pad(frames, (0, POINTS - FRAME))).unbind(1)
     cross = left * right.conj()
@@ -240,10 +241,10 @@ def _band_matrix() -> NDArray[np.float64]:
 
 
 def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
-    """Compute the mean correlation of clean and processed envelopes over bands, for each segment.
+    """Compute the correlation of the envelopes of clean speech and output in each segment.
 
-    The envelopes are those after equalisation and cancellation with the best delay and level, or
-    those of one ear if it is better.
+    The correlation is a mean over bands. The envelopes are those after equalisation and
+    cancellation with the best delay and level, or those of one ear if it is better.
 
     Args:
         windows: Segments of the output of ``_band_features``. Shape: (segments, bands, 8, frames).
@@ -255,52 +256,52 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
     centred = windows - windows.mean(-1, keepdim=True)
     products = centred @ centred.transpose(-1, -2)
     first, second = torch.triu_indices(4, 4, device=windows.device)
-    clean, both, processed = (
+    clean, both, output = (
         (part + part.transpose(-1, -2))[..., first, second]
         for part in (products[..., :4, :4], products[..., :4, 4:], products[..., 4:, 4:])
     )
     grid = constant_like(windows, _cancellation_weights)
     with torch.no_grad():
-        ratio, index = _find_largest_ratio(clean, processed, grid)
-        is_silent = ~(clean.any(-1) & processed.any(-1))
+        ratio, index = _find_largest_ratio(clean, output, grid)
+        is_silent = ~(clean.any(-1) & output.any(-1))
         ratio = torch.where(is_silent, 0.0, ratio)
-        left, right = (clean[..., pair] / processed[..., pair] for pair in (LEFT_PAIR, RIGHT_PAIR))
+        left, right = (clean[..., pair] / output[..., pair] for pair in (LEFT_PAIR, RIGHT_PAIR))
         # The ratio of an ear where both signals are silent is NaN, which is not larger.
         one_ear_is_better = (torch.maximum(left, right) > ratio) & may_use_one_ear[:, None]
         better_ear = torch.where(left > right, LEFT_PAIR, RIGHT_PAIR).unsqueeze(-1)
     weights = grid[torch.arange(BANDS, device=index.device), :, index]
-    cancelled = _correlation(*((part * weights).sum(-1) for part in (both, clean, processed)))
+    cancelled = _correlation(*((part * weights).sum(-1) for part in (both, clean, output)))
     cancelled = torch.where(is_silent, -1.0, cancelled)
     one_ear = _correlation(
-        *(part.take_along_dim(better_ear, -1)[..., 0] for part in (both, clean, processed))
+        *(part.take_along_dim(better_ear, -1)[..., 0] for part in (both, clean, output))
     )
     return torch.where(one_ear_is_better, one_ear, cancelled).mean(-1)
 
 
-def _correlation(both: Tensor, clean: Tensor, processed: Tensor) -> Tensor:
+def _correlation(both: Tensor, clean: Tensor, output: Tensor) -> Tensor:
     """Divide covariances by standard deviations; 0 where a signal has no modulation.
 
     Args:
-        both: Covariances of clean and processed envelopes.
-        clean, processed: Variances of both.
+        both: Covariances of the envelopes of clean speech and output.
+        clean, output: Variances of both.
     """
-    is_varying = (clean > 0.0) & (processed > 0.0)
-    clean, processed = (torch.where(is_varying, part, 1.0) for part in (clean, processed))
-    return torch.where(is_varying, both * clean.rsqrt() * processed.rsqrt(), 0.0)
+    is_varying = (clean > 0.0) & (output > 0.0)
+    clean, output = (torch.where(is_varying, part, 1.0) for part in (clean, output))
+    return torch.where(is_varying, both * clean.rsqrt() * output.rsqrt(), 0.0)
 
 
-def _find_largest_ratio(clean: Tensor, processed: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the delay and level with the largest ratio of clean to processed modulation.
+def _find_largest_ratio(clean: Tensor, output: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the delay and level with the largest ratio of modulation, clean speech to output.
 
     Args:
-        clean, processed: Products of features. Shape: (segments, bands, pairs).
+        clean, output: Products of features. Shape: (segments, bands, pairs).
         grid: Output of ``_cancellation_weights``. Shape: (bands, pairs, delays * levels).
 
     Returns:
         Largest ratios, and the indices of their delays and levels. Shape: (segments, bands) each.
     """
     largest = [
-        (clean[:, band] @ weights).div_(processed[:, band] @ weights).max(-1)
+        (clean[:, band] @ weights).div_(output[:, band] @ weights).max(-1)
         for band, weights in enumerate(grid)
     ]
     ratios, indices = zip(*largest, strict=True)

@@ -48,20 +48,20 @@ def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, 
     return min(lengths)
 
 
-def check_pair(processed: Tensor, clean: Tensor) -> None:
+def check_pair(output: Tensor, clean: Tensor) -> None:
     """Raise ValueError unless two signals have the same shape and are on the same device.
 
     Args:
-        processed: Output of an aid.
+        output: Output of an aid.
         clean: Clean signal.
 
     >>> check_pair(torch.ones(2, 9000), torch.ones(2, 9000))
     """
-    if processed.shape != clean.shape or processed.device != clean.device:
+    if output.shape != clean.shape or output.device != clean.device:
         raise ValueError(
-            f"expected processed and clean of the same shape on the same device, got "
-            f"{tuple(processed.shape)} on {processed.device} and {tuple(clean.shape)} on "
-            f"{clean.device}; pass one clean signal for each processed one"
+            f"expected output and clean of the same shape on the same device, got "
+            f"{tuple(output.shape)} on {output.device} and {tuple(clean.shape)} on "
+            f"{clean.device}; pass one clean signal for each output"
         )
 
 
@@ -83,14 +83,14 @@ def check_finite(name: str, signals: Tensor) -> None:
 
 
 def match_pair(
-    processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None = None
+    output: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None = None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Cut an output and a clean signal to one length, and validate that they can be compared.
 
     The precision of the clean signal becomes that of the output if this is higher.
 
     Args:
-        processed: Output of an aid. Shape: (..., time).
+        output: Output of an aid. Shape: (..., time).
         clean: Clean signal. Shape: (..., time), where ``time`` may differ by 0.1 s.
         sample_rate: Sample rate in Hz.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
@@ -106,21 +106,21 @@ def match_pair(
     >>> clean.dtype
     torch.float64
     """
-    check_waveform(processed, "processed")
+    check_waveform(output, "output")
     check_waveform(clean, "clean")
-    times = processed.shape[-1], clean.shape[-1]
-    time = common_length(times, check_rate(sample_rate), ("processed", "clean"))
-    processed, clean = processed[..., :time], clean[..., :time]
-    check_pair(processed, clean)
+    times = output.shape[-1], clean.shape[-1]
+    time = common_length(times, check_rate(sample_rate), ("output", "clean"))
+    output, clean = output[..., :time], clean[..., :time]
+    check_pair(output, clean)
     if lengths is not None:
         longest = torch.Size((*clean.shape[:-1], max(times)))
         lengths = check_lengths(lengths, longest).clamp_max(time)
-    return processed, clean.to(torch.promote_types(clean.dtype, processed.dtype)), lengths
+    return output, clean.to(torch.promote_types(clean.dtype, output.dtype)), lengths
 
 
 def scores_or_errors(
     score: Callable[..., Tensor],
-    processed: Tensor,
+    output: Tensor,
     clean: Tensor,
     ears: Tensor,
     ends: Sequence[int],
@@ -133,7 +133,7 @@ def scores_or_errors(
 
     Args:
         score: Function that computes the score, such as ``haspi``.
-        processed: Outputs of an aid. Shape: (items, time).
+        output: Outputs of an aid. Shape: (items, time).
         clean: Clean signals. Shape: (items, time).
         ears: Thresholds of the ear of each item in dB HL. Shape: (items, 8).
         ends: Number of samples of each item before padding.
@@ -146,13 +146,13 @@ def scores_or_errors(
     'UnscorableError'
     """
     try:
-        return list(score(processed, clean, ears, lengths=ends, **settings))
+        return list(score(output, clean, ears, lengths=ends, **settings))
     except ValueError as error:
         if len(clean) == 1:
             return [error]
     results = []
     for item in zip(
-        processed.split(1), clean.split(1), ears.split(1), [[end] for end in ends], strict=True
+        output.split(1), clean.split(1), ears.split(1), [[end] for end in ends], strict=True
     ):
         results += scores_or_errors(score, *item, **settings)
     return results

@@ -65,22 +65,22 @@ class _Comparison(NamedTuple):
     """Features of a clean signal and of the output of an aid in some channels of one ear.
 
     Attributes:
-        clean_levels, processed_levels: Levels in dB over threshold, smoothed over segments of 16 ms
+        clean_levels, output_levels: Levels in dB over threshold, smoothed over segments of 16 ms
             (HASQI) or 8 ms (HAAQI). Shape: (items, channels, segments).
         coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
             (items, channels, segments).
         energy: Mean square of the clean signal in each segment of 16 ms. Shape: (items, channels,
             segments).
-        clean_spectrum, processed_spectrum: Long-term levels in dB over threshold. Shape: (items,
+        clean_spectrum, output_spectrum: Long-term levels in dB over threshold. Shape: (items,
             channels).
     """
 
     clean_levels: Tensor
-    processed_levels: Tensor
+    output_levels: Tensor
     coherence: Tensor
     energy: Tensor
     clean_spectrum: Tensor
-    processed_spectrum: Tensor
+    output_spectrum: Tensor
 
 
 class QualityReference(Reference):
@@ -118,11 +118,11 @@ class QualityReference(Reference):
     split_by_rate: ClassVar[Any] = None
     """Function that divides fluctuations of envelopes into bands of modulation."""
 
-    def score(self, processed: Tensor, *, noise: Noise = "expected", seed: int = 0) -> Tensor:
+    def score(self, output: Tensor, *, noise: Noise = "expected", seed: int = 0) -> Tensor:
         """Return the score of each output of an aid.
 
         Args:
-            processed: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
+            output: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
@@ -134,13 +134,13 @@ class QualityReference(Reference):
         Raises:
             ValueError: Outputs of another shape, not finite or on another device.
         """
-        return self.parts(processed, noise=noise, seed=seed).combined
+        return self.parts(output, noise=noise, seed=seed).combined
 
-    def parts(self, processed: Tensor, *, noise: Noise = "expected", seed: int = 0) -> QualityParts:
+    def parts(self, output: Tensor, *, noise: Noise = "expected", seed: int = 0) -> QualityParts:
         """Return the score of each output of an aid with its nonlinear and its linear part.
 
         Args:
-            processed: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
+            output: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
@@ -149,7 +149,7 @@ class QualityReference(Reference):
         Raises:
             ValueError: Outputs of another shape, not finite or on another device.
         """
-        return QualityParts(*self._compare_all(processed, noise, seed).unbind(-1))
+        return QualityParts(*self._compare_all(output, noise, seed).unbind(-1))
 
     @staticmethod
     @abstractmethod
@@ -206,41 +206,41 @@ class QualityReference(Reference):
         return fine_structure.smooth_levels(delayed, extent, self.envelope_segment), motion
 
     def _compare(
-        self, batch: PreparedBatch, processed: Tensor, noise: Noise, seed: int, *ears: HairCells
+        self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
         """Compute the score of each item, its nonlinear and its linear part.
 
         Shape: -> (items, 3).
         """
         extent = batch.clean.audible
-        noises = _threshold_noise(noise, seed, extent, processed)
+        noises = _threshold_noise(noise, seed, extent, output)
         comparisons = [
-            self._compare_channels(clean, processed, batch.cells, noises, extent)
+            self._compare_channels(clean, output, batch.cells, noises, extent)
             for clean in batch.features
         ]
         joined = _Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
         envelopes = fine_structure.envelope_correlation(
             joined.clean_levels,
-            joined.processed_levels,
+            joined.output_levels,
             fine_structure.segments_of(extent, self.envelope_segment),
             self.split_by_rate,
         )
         counts = fine_structure.segments_of(extent)
         fine = fine_structure.synchrony(joined.coherence, joined.energy, counts)
         x = fine_structure.channel_shares(joined.clean_spectrum)
-        y = fine_structure.channel_shares(joined.processed_spectrum)
+        y = fine_structure.channel_shares(joined.output_spectrum)
         return torch.stack(self._combine(envelopes, fine, x, y), -1)
 
     def _compare_channels(
         self,
         clean: _Channels,
-        processed: Tensor,
+        output: Tensor,
         cells: HairCells,
         noises: tuple[Tensor | None, Tensor | None],
         extent: Extent,
     ) -> _Comparison:
         channels, inner = clean.channels, cells[..., clean.channels].inner
-        cochlea = ear_model.simulate_cochlea(processed, cells, channels, extent, motion=True)
+        cochlea = ear_model.simulate_cochlea(output, cells, channels, extent, motion=True)
         power, motion = cochlea.power, cochlea.motion
         envelope = power.detach().sqrt()
         power = ear_model.align_channels(power, envelope, clean.envelope, extent)
@@ -256,11 +256,11 @@ class QualityReference(Reference):
         counts = fine_structure.segments_of(extent)
         return _Comparison(
             clean_levels=clean.smooth_levels,
-            processed_levels=levels,
+            output_levels=levels,
             coherence=fine_structure.coherence(clean_segments, segments, counts),
             energy=clean_segments[1],
             clean_spectrum=clean.level,
-            processed_spectrum=cochlea.level,
+            output_spectrum=cochlea.level,
         )
 
     def _segment_spectra(
@@ -349,8 +349,8 @@ def _threshold_noise(
         for item, end in enumerate(extent.ends):
             random = np.random.RandomState(seed)
             drawn[:, item, :, :end] = torch.from_numpy(random.standard_normal((2, CHANNELS, end)))
-        clean_noise, processed_noise = drawn.to(like.device)
-        return clean_noise, processed_noise
+        clean_noise, output_noise = drawn.to(like.device)
+        return clean_noise, output_noise
     if noise == "expected":
         # The same noise every time: each channel takes its part of one signal. Only audible parts
         # of the clean signal count, and the noise is far below them.

@@ -183,13 +183,13 @@ class Reference(ABC):
 
     @abstractmethod
     def _compare(
-        self, batch: PreparedBatch, processed: Tensor, noise: Noise, seed: int, *ears: HairCells
+        self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
         """Compare outputs of aids with the clean signals of a batch.
 
         Args:
             batch: The clean signals.
-            processed: Aligned outputs behind the middle ear. Shape: (items, padded).
+            output: Aligned outputs behind the middle ear. Shape: (items, padded).
             noise: Kind of the internal noise of the ear.
             seed: Seed of the noise.
             ears: For HASPI one argument, the hair cells of the impaired ears of all items, with
@@ -200,17 +200,17 @@ class Reference(ABC):
             Numbers for each item from which its score follows. Shape: (items, numbers).
         """
 
-    def _compare_all(self, processed: Tensor, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
+    def _compare_all(self, output: Tensor, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
         """Validate outputs, and compare them with the clean signals.
 
         The arguments are those of ``_compare``. Shape: (..., time) -> (..., numbers).
         """
         check_choice("noise", noise, Noise)
         check_number("seed", seed, 0, 2**32 - 1, whole=True)
-        check_waveform(processed, "processed", full_scale_spl=self._full_scale_spl)
-        check_pair(processed, self._clean)
-        rows = processed.reshape(self._rows.shape)
-        check_finite("processed", rows)
+        check_waveform(output, "output", full_scale_spl=self._full_scale_spl)
+        check_pair(output, self._clean)
+        rows = output.reshape(self._rows.shape)
+        check_finite("output", rows)
 
         def compare(group: int) -> Tensor:
             batch = self._batches[group] if self._batches else self._prepare(self._groups[group])
@@ -218,7 +218,7 @@ class Reference(ABC):
 
         with torch.autocast(rows.device.type, enabled=False):
             numbers = map_on_cores(compare, range(len(self._groups)), rows)
-        return torch.cat(numbers).reshape(*processed.shape[:-1], -1)
+        return torch.cat(numbers).reshape(*output.shape[:-1], -1)
 
 
 def map_on_cores(

@@ -85,7 +85,7 @@ class _MeanScore(_Metric):
     @torch.no_grad()
     def update(
         self,
-        processed: Tensor,
+        output: Tensor,
         clean: Tensor,
         audiogram: AudiogramLike,
         lengths: Lengths | None = None,
@@ -93,11 +93,11 @@ class _MeanScore(_Metric):
         """Score a batch, and add the scores to the mean.
 
         An item that cannot be scored (clean speech that is silent or soft, NaN, less than 0.7 s) is
-        left out with a warning and counted in ``failed``. Silence in place of processed speech is
+        left out with a warning and counted in ``failed``. A silent output is
         scored. With two channels, left and right, the score and the level of the better ear count.
 
         Args:
-            processed: Outputs of the compensator. Shape: (time,), (batch, time) or, for two ears,
+            output: Outputs of the compensator. Shape: (time,), (batch, time) or, for two ears,
                 (batch, 2, time).
             clean: Clean speech of the same shape.
             audiogram: One ear, or one per item. For two channels a ``Listener``, a pair of left
@@ -109,18 +109,18 @@ class _MeanScore(_Metric):
             ValueError: The shapes do not fit, the signals are not what ``haspi`` accepts, or
                 ``audiogram`` or ``lengths`` are not as described.
         """
-        check_waveform(processed, "processed")
+        check_waveform(output, "output")
         check_waveform(clean, "clean")
-        check_pair(processed, clean)
-        two_ears = processed.ndim == 3 and processed.shape[1] == 2
-        if processed.ndim > 2 and not two_ears:
+        check_pair(output, clean)
+        two_ears = output.ndim == 3 and output.shape[1] == 2
+        if output.ndim > 2 and not two_ears:
             raise ValueError(
-                "expected processed and clean of shape (time,), (batch, time) or (batch, 2, time), "
-                f"got {tuple(processed.shape)}"
+                "expected output and clean of shape (time,), (batch, time) or (batch, 2, time), "
+                f"got {tuple(output.shape)}"
             )
-        sides, time = 2 if two_ears else 1, processed.shape[-1]
+        sides, time = 2 if two_ears else 1, output.shape[-1]
         outputs, references = (
-            signal.double().reshape(-1, sides, time) for signal in (processed, clean)
+            signal.double().reshape(-1, sides, time) for signal in (output, clean)
         )
         items = len(outputs)
         ears = _thresholds(audiogram, items, sides)
@@ -175,7 +175,7 @@ class _MeanScore(_Metric):
 
 
 class HASPI(_MeanScore):
-    """Mean HASPI v2, the intelligibility of processed speech, over all items since ``reset``.
+    """Mean HASPI v2, the intelligibility of outputs, over all items since ``reset``.
 
     HASPI rewards any gain, so log the mean level of the outputs, the attribute ``level``, as well.
     The score of an item is that of ``haspi`` with the same settings, in double precision. On a CPU
@@ -213,7 +213,7 @@ class HASPI(_MeanScore):
 
 
 class HASQI(_MeanScore):
-    """Mean HASQI v2, the quality of processed speech, over all items since the last ``reset``.
+    """Mean HASQI v2, the quality of outputs, over all items since the last ``reset``.
 
     The arguments and attributes are those of ``HASPI``. Outputs are compared with clean speech that
     NAL-R has amplified, and every difference lowers the score. On a CPU one second of audio takes
@@ -229,7 +229,7 @@ class HASQI(_MeanScore):
 
 
 class HAAQI(_MeanScore):
-    """Mean HAAQI v1, the quality of processed music, over all items since the last ``reset``.
+    """Mean HAAQI v1, the quality of music, over all items since the last ``reset``.
 
     The arguments and attributes are those of ``HASPI``. Outputs are compared with clean music that
     NAL-R has amplified. With stereo music the better ear counts.

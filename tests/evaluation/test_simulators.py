@@ -48,8 +48,8 @@ def test_values_failures_and_page(options: dict[str, Any]) -> None:
         expected = MSBG()(item.signal, item.ear)
         output = study.conditions[0].output(item)
     assert row.snr == snr_db(expected, output) > 15.0
-    assert row.stoi_teacher == stoi(item.clean, expected, 16000)
-    assert row.stoi_simulator == stoi(item.clean, output, 16000)
+    assert row.stoi_teacher == stoi(expected, item.clean, 16000)
+    assert row.stoi_simulator == stoi(output, item.clean, 16000)
     assert row.pesq_teacher == pytest.approx(row.pesq_simulator, abs=0.3)
     exceeds = table.audiogram.map(lambda thresholds: thresholds[5] > 60.0)
     failed = (table.condition == "none") & exceeds

@@ -73,11 +73,11 @@ def test_scores_equal_those_of_their_packages(speech: list[tuple[Tensor, int]], 
     noisy = clean + 0.02 * torch.randn(clean.shape)
     expected = pystoi.stoi(clean.numpy(), noisy.numpy(), rate)
     assert 0.3 < expected < 0.99
-    assert stoi(clean, noisy, rate) == pytest.approx(expected, abs=1e-12)
+    assert stoi(noisy, clean, rate) == pytest.approx(expected, abs=1e-12)
     at_16_khz = [resample(signal, rate, 16000).numpy() for signal in (clean, noisy)]
     expected = pesq.pesq(16000, *at_16_khz, "wb")
     assert 1.0 < expected < 4.0
-    assert pesq_wb(clean, noisy, rate) == pytest.approx(expected, abs=1e-12)
+    assert pesq_wb(noisy, clean, rate) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -92,17 +92,17 @@ def test_scores_that_are_not_defined_raise_value_error(
 ) -> None:
     pytest.importorskip(package)
     clean, noisy = pair
-    short = clean[:2000], noisy[:2000]
+    short = noisy[:2000], clean[:2000]
     click = torch.where(torch.arange(len(noisy)) < 320, noisy, 0.0)  # without any utterance
-    for signals in ((clean, noisy * 0), (clean * 0, noisy), (clean, noisy / 0), short):
+    for signals in ((noisy * 0, clean), (noisy, clean * 0), (noisy / 0, clean), short):
         with pytest.raises(ValueError, match=r"silent|finite|is not defined"):
             measure(*signals, 16000)
     if measure is pesq_wb:
         with pytest.raises(ValueError, match="PESQ is not defined: No utterances detected"):
-            measure(click, noisy, 16000)
+            measure(noisy, click, 16000)
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(extras.MissingExtraError, match=rf"pip install 'hlsim\[{extra}\]'"):
-        measure(clean, noisy, 16000)
+        measure(noisy, clean, 16000)
 
 
 @pytest.mark.parametrize(

@@ -129,8 +129,8 @@ def test_two_ears_score_more_than_either(scenes: tuple[Tensor, Tensor]) -> None:
 
 def test_gradient_equals_finite_differences(scenes: tuple[Tensor, Tensor]) -> None:
     clean, noisy = (signal[1] for signal in scenes)
-    processed = noisy.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(mbstoi(processed, clean), processed)
+    output = noisy.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(mbstoi(output, clean), output)
     direction, step = torch.randn_like(noisy) * noisy.std(), 1e-7
     after, before = (mbstoi(noisy + sign * step * direction, clean) for sign in (1, -1))
     expected = float(after - before) / (2.0 * step)
@@ -139,29 +139,29 @@ def test_gradient_equals_finite_differences(scenes: tuple[Tensor, Tensor]) -> No
 
 def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
     clean, noisy = scenes
-    processed = noisy.clone()
-    processed[0] = 0.0
-    processed[1, 0] = 0.0
-    processed[2, :, 5000:15000] = 0.0
-    score = mbstoi(processed.requires_grad_(), clean)
+    output = noisy.clone()
+    output[0] = 0.0
+    output[1, 0] = 0.0
+    output[2, :, 5000:15000] = 0.0
+    score = mbstoi(output.requires_grad_(), clean)
     assert float(score[0].detach().abs()) < 0.02
-    (gradient,) = torch.autograd.grad(score.sum(), processed)
+    (gradient,) = torch.autograd.grad(score.sum(), output)
     assert bool(gradient.isfinite().all())
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"processed": torch.zeros(16000), "clean": torch.zeros(16000)},
+        {"output": torch.zeros(16000), "clean": torch.zeros(16000)},
         {"clean": torch.ones(3, 16000)},
         {"clean": torch.ones(2, 12000)},
-        {"processed": torch.full((2, 16000), math.nan)},
+        {"output": torch.full((2, 16000), math.nan)},
         {"clean": torch.zeros(2, 16000)},
-        {"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)},  # too short
+        {"output": torch.randn(2, 9), "clean": torch.randn(2, 9)},  # too short
         {"sample_rate": 8000},
     ],
 )
 def test_bad_arguments_raise_value_error(change: dict[str, Any]) -> None:
-    arguments = {"processed": torch.randn(2, 16000), "clean": torch.randn(2, 16000)} | change
+    arguments = {"output": torch.randn(2, 16000), "clean": torch.randn(2, 16000)} | change
     with pytest.raises(ValueError):
         mbstoi(**arguments)

@@ -72,7 +72,7 @@ def degrade(clean: Tensor) -> Tensor:
 
 
 def prepare(name: str, clean: Tensor, ears: Any = N3, **settings: Any) -> Callable[..., Tensor]:
-    """Return a function from processed signals to their scores."""
+    """Return a function from outputs to their scores."""
     if name == "haspi":
         return partial(HaspiReference(clean, **settings).score, audiogram=ears)
     kind = HasqiReference if name == "hasqi" else HaaqiReference
@@ -95,7 +95,7 @@ for kind, rate in product(("music", "speech"), (16000, 24000, 32000, 44100)):
 
 
 def signals_of(key: str) -> tuple[Tensor, Tensor]:
-    """Return the clean and the processed signal of a case of ``PARITY``."""
+    """Return the clean signal and the output of a case of ``PARITY``."""
     _, rate, change = PARITY[key]
     if "music" in key:
         clean = noisy = example_music(rate)
@@ -111,20 +111,20 @@ def signals_of(key: str) -> tuple[Tensor, Tensor]:
 def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, key: str) -> None:
     name = key.partition(",")[0]
     ear, rate, _ = PARITY[key]
-    clean, processed = signals_of(key)
-    arguments = clean.numpy(), processed.numpy(), ear, rate, 7
+    clean, output = signals_of(key)
+    arguments = clean.numpy(), output.numpy(), ear, rate, 7
     expected = np.atleast_1d(pyclarity(key, getattr(reference, name), *arguments)).tolist()
     settings = {"sample_rate": rate, "whole_khz": True}
     in_double = 1e-6 if name == "haaqi" else 1e-7
     for dtype, error in ((torch.float64, in_double), (torch.float32, 1e-4)):
-        x, y = clean.to(dtype), processed.to(dtype)
+        x, y = clean.to(dtype), output.to(dtype)
         if name == "haspi":
             values = [float(haspi(y, x, ear, noise="seeded", seed=7, **settings))]
         else:
             kind = HasqiReference if name == "hasqi" else HaaqiReference
             values = [float(v) for v in kind(x, ear, **settings).parts(y, noise="seeded", seed=7)]
         assert values == pytest.approx(expected, abs=error)
-    score = float(SCORES[name](processed, clean, ear, **settings))
+    score = float(SCORES[name](output, clean, ear, **settings))
     assert score == pytest.approx(expected[0], abs=7e-3 if name == "haspi" else 2e-3)
 
 
@@ -138,10 +138,10 @@ def test_identical_music_has_pyclaritys_score_below_1(
     clean, ear = example_music(24000), Audiogram.standard(name)
     taps = torch.from_numpy(_nalr_taps(torch.tensor(ear.thresholds, dtype=torch.float64)))
     by_nalr = functional.conv1d(clean[None], taps[None, None], padding="same")[0]
-    for kind, processed, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
-        arguments = clean.numpy(), processed.numpy(), ear, 24000, 7
+    for kind, output, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
+        arguments = clean.numpy(), output.numpy(), ear, 24000, 7
         expected = float(pyclarity(f"haaqi, {kind}, {name}", reference.haaqi, *arguments)[0])
-        result = haaqi(processed, clean, ear, sample_rate=24000, noise="seeded", seed=7)
+        result = haaqi(output, clean, ear, sample_rate=24000, noise="seeded", seed=7)
         assert float(result) == pytest.approx(expected, abs=1e-6)
         assert expected == pytest.approx(score, abs=0.005)
 
@@ -241,8 +241,8 @@ def test_references_of_inference_mode_serve_training_and_autocast_has_no_effect(
     clean, noisy = (signal[0] for signal in pair())
     with torch.inference_mode():
         prepared = prepare(name, clean)
-    processed = noisy.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(prepared(processed), processed)
+    output = noisy.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(prepared(output), output)
     assert bool(gradient.any())
     expected = SCORES[name](noisy, clean, N3)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -255,10 +255,10 @@ def test_references_of_inference_mode_serve_training_and_autocast_has_no_effect(
 @pytest.mark.parametrize(("ear", "gain"), [(N2, 1.0), (N3, 3.0)])
 def test_expected_noise_is_the_mean_over_seeds(ear: Audiogram, gain: float) -> None:
     clean, noisy = (signal[0].double() for signal in pair())
-    prepared, processed = HaspiReference(clean), gain * noisy
-    scores = [float(prepared.score(processed, ear, noise="seeded", seed=s)) for s in range(12)]
+    prepared, output = HaspiReference(clean), gain * noisy
+    scores = [float(prepared.score(output, ear, noise="seeded", seed=s)) for s in range(12)]
     error = max(3.0 * np.std(scores) / 12**0.5, 2e-4)
-    assert float(prepared.score(processed, ear)) == pytest.approx(np.mean(scores), abs=error)
+    assert float(prepared.score(output, ear)) == pytest.approx(np.mean(scores), abs=error)
     assert len(set(scores)) == 12
 
 
@@ -295,11 +295,11 @@ def test_gradient_is_finite(name: str, signal: str, noise: str) -> None:
     clean = pair()[0][0, :12000]
     gains = {"silence": 0.0, "equal": 1.0, "inaudible": 1e-4, "denormal": 1e-37, "loud": 1e3}
     click = functional.pad(torch.ones(1), (6000, 5999))
-    processed = click if signal == "click" else gains[signal] * clean
-    processed = processed.clone().requires_grad_()
+    output = click if signal == "click" else gains[signal] * clean
+    output = output.clone().requires_grad_()
     for ear in (N6,) if name == "haspi" else (NH, N6):
-        score = SCORES[name](processed, clean, ear, noise=noise)
-        (gradient,) = torch.autograd.grad(score, processed)
+        score = SCORES[name](output, clean, ear, noise=noise)
+        (gradient,) = torch.autograd.grad(score, output)
         assert 0.0 <= float(score.detach()) <= 1.0 and bool(gradient.isfinite().all())
 
 
@@ -327,9 +327,9 @@ BAD_ARGUMENTS: list[dict[str, Any]] = [
     {"clean": torch.full((16000,), torch.nan)},
     {"clean": 1e-5 * torch.randn(16000)},  # too soft
     {"clean": functional.pad(torch.ones(100), (8000, 8000))},  # a click
-    {"processed": torch.full((12800,), torch.inf)},
-    {"processed": torch.zeros(2, 12800)},
-    {"processed": torch.zeros(12800, device="meta")},
+    {"output": torch.full((12800,), torch.inf)},
+    {"output": torch.zeros(2, 12800)},
+    {"output": torch.zeros(12800, device="meta")},
     {"audiogram": torch.full((8,), 130.0)},
     {"audiogram": [N3, N3]},
     {"audiogram": None},
@@ -346,4 +346,4 @@ def test_bad_arguments_raise_value_error(name: str) -> None:
     for change in BAD_ARGUMENTS:
         clean = change.get("clean", pair()[0][0])
         with pytest.raises(ValueError):
-            SCORES[name](**{"processed": clean, "clean": clean, "audiogram": N3, **change})
+            SCORES[name](**{"output": clean, "clean": clean, "audiogram": N3, **change})

@@ -20,10 +20,10 @@ N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
 
 
 def expected_score(
-    clean: Tensor, processed: Tensor, ear: Audiogram, *, name: str = "haspi", **options: Any
+    clean: Tensor, output: Tensor, ear: Audiogram, *, name: str = "haspi", **options: Any
 ) -> float:
     function = getattr(hlsim.metrics, name)
-    return float(function(processed.double(), clean.double(), ear, **options))
+    return float(function(output.double(), clean.double(), ear, **options))
 
 
 @pytest.fixture(scope="module")
@@ -62,20 +62,20 @@ def test_the_mean_of_the_functions_scores(
 
 def test_the_better_ear_of_two_channels_counts(clean: Tensor) -> None:
     both = torch.stack([clean[0], clean[0]])[None]
-    processed = torch.stack([noisy(clean)[0], 3.0 * noisy(clean)[0]])[None]  # (batch, 2, time)
-    scores = [expected_score(clean[0], processed[0, i], ear) for i, ear in enumerate((N3, S2))]
+    output = torch.stack([noisy(clean)[0], 3.0 * noisy(clean)[0]])[None]  # (batch, 2, time)
+    scores = [expected_score(clean[0], output[0, i], ear) for i, ear in enumerate((N3, S2))]
     for ears in ([N3, S2], torch.tensor([[N3.levels, S2.levels]])):
         metric = HASPI(16000)
-        metric.update(processed, both, ears)
+        metric.update(output, both, ears)
         assert float(metric.compute()) == pytest.approx(max(scores), abs=1e-6)
     metric.reset()
-    processed[:, 0] = torch.nan  # an ear without a score does not count
-    metric.update(processed, both, [N3, S2])
+    output[:, 0] = torch.nan  # an ear without a score does not count
+    metric.update(output, both, [N3, S2])
     assert float(metric.compute()) == pytest.approx(scores[1], abs=1e-6)
     assert int(metric.failed) == 0
     for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
         with pytest.raises(ValueError, match=r"thresholds|audiogram"):
-            metric.update(processed, both, wrong)
+            metric.update(output, both, wrong)
 
 
 def test_limit_and_lengths(clean: Tensor) -> None:
@@ -129,12 +129,12 @@ def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> Non
     metric = HASPI(16000)
     for spoiled, reason in (
         ((clean[0] * 0, clean[0]), ".*is silent"),
-        ((clean[0], clean[0] / 0), "processed holds samples that are NaN"),
+        ((clean[0], clean[0] / 0), "output holds samples that are NaN"),
     ):
         metric.reset()
-        reference, processed = (torch.stack([signal, clean[1]]) for signal in spoiled)
+        reference, output = (torch.stack([signal, clean[1]]) for signal in spoiled)
         with pytest.warns(UserWarning, match=f"HASPI leaves out item 0: {reason}"):
-            metric.update(processed, reference, N3)
+            metric.update(output, reference, N3)
         assert (int(metric.failed), int(metric.count)) == (1, 1)
         expected = expected_score(clean[1], clean[1], N3)
         assert float(metric.compute()) == pytest.approx(expected, abs=1e-6)
@@ -151,13 +151,13 @@ def test_bad_arguments_raise_value_error() -> None:
     noise = torch.randn(2, 12800)
     for update in (
         {"clean": noise[:1]},
-        {"processed": noise.short()},
+        {"output": noise.short()},
         {"clean": noise.numpy()},
         {"audiogram": [N3]},
         {"lengths": torch.tensor([12801, 12800])},
     ):
         with pytest.raises(ValueError):
-            HASPI().update(**{"processed": noise, "clean": noise, "audiogram": N3, **update})
+            HASPI().update(**{"output": noise, "clean": noise, "audiogram": N3, **update})
     for settings in ({"limit": 0}, {"full_scale_spl": math.inf}, {"sample_rate": 8000}):
         with pytest.raises(ValueError):
             HASPI(**settings)

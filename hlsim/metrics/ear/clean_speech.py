@@ -102,17 +102,17 @@ class CleanBatch:
         audible = self.audible
         return shift(at_ear, delays, self._resampled.ends, audible.ends, audible.padded)
 
-    def align(self, processed: Tensor) -> Tensor:
+    def align(self, output: Tensor) -> Tensor:
         """Return the parts of outputs that match the audible parts of the clean signals.
 
         Args:
-            processed: Outputs for all items, not only those of this batch. Shape: (all items,
+            output: Outputs for all items, not only those of this batch. Shape: (all items,
                 time).
 
         Returns:
             Aligned parts behind the middle ear, in multiples of 20 uPa. Shape: (items, padded).
         """
-        at_ear = self._to_ear_rate(self._extent.cut(processed[self.items].double()))
+        at_ear = self._to_ear_rate(self._extent.cut(output[self.items].double()))
         waveform = at_ear.detach().to(self.dtype)
         delays = ear_input.bulk_delays(self._spectrum, waveform, self._resampled)
         return self.through_middle_ear(self._cut(at_ear, delays - self._first))

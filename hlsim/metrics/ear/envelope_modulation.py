@@ -40,7 +40,7 @@ WINDOW_STRIDES = -(-(WINDOW_SAMPLES + 2) // STRIDE)
 WINDOW_LEAD = WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES // 2 - 1
 
 SILENCE_DB = 2.5
-"""Level over threshold in dB that a frame of the reference must exceed to count."""
+"""Level over threshold in dB that a frame of clean speech must exceed to count."""
 
 COSINES = 5
 """Number of cepstral coefficients."""
@@ -195,19 +195,19 @@ class _Covariance(NamedTuple):
     spectra: tuple[Tensor, Tensor]
 
 
-def _modulation_covariance(reference: Tensor, processed: Tensor, extent: Extent) -> _Covariance:
+def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Covariance:
     """Filter the coefficients over time by ten band-passes without delay, and compute covariances.
 
     Args:
-        reference, processed: Cepstral coefficients of the audible frames. Shape: (items, 5,
+        clean, output: Cepstral coefficients of the audible frames. Shape: (items, 5,
             audible).
         extent: Number of audible frames of each item.
     """
     frames, points = extent.longest, _points(extent.longest)
-    waves = extent.centred(reference), extent.centred(processed)
+    waves = extent.centred(clean), extent.centred(output)
     a, b = (torch.fft.rfft(wave, points) for wave in waves)
-    responses = constant_like(reference, _responses, points)
-    filters_at_once = 1 if reference.device.type == "cpu" else len(responses)
+    responses = constant_like(clean, _responses, points)
+    filters_at_once = 1 if clean.device.type == "cpu" else len(responses)
     sums = []
     for part in responses.split(filters_at_once):
         x, y = (
@@ -283,14 +283,14 @@ def normalised_covariance(xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
     return torch.where(is_varying, xy.abs() / norm, 0.0)
 
 
-def correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
+def correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tensor:
     """Compute the features of HASPI: how much an output is correlated with clean speech.
 
     Both signals have no internal noise of the ear. The magnitude of the correlation is averaged
     over the five cepstral coefficients. A coefficient that is constant over time counts as 0.
 
     Args:
-        reference, processed: Cepstral coefficients of the audible frames of clean speech and of the
+        clean, output: Cepstral coefficients of the audible frames of clean speech and of the
             output. Shape: (items, 5, audible).
         extent: Number of audible frames of each item.
 
@@ -301,11 +301,11 @@ def correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
     >>> correlation(waves, waves, Extent((900,))).round(decimals=4)[0, :3]
     tensor([1., 1., 1.])
     """
-    covariance = _modulation_covariance(reference, processed, extent)
+    covariance = _modulation_covariance(clean, output, extent)
     return normalised_covariance(covariance.xx, covariance.yy, covariance.xy).mean(-1)
 
 
-def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
+def expected_correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tensor:
     """Compute the features of HASPI in the mean over the ear's internal noise, without drawing it.
 
     HASPI adds noise to the levels of both signals. The noise increases the energies by which the
@@ -314,7 +314,7 @@ def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -
     is that of a folded normal distribution.
 
     Args:
-        reference, processed: Cepstral coefficients of the audible frames of clean speech and of the
+        clean, output: Cepstral coefficients of the audible frames of clean speech and of the
             output. Shape: (items, 5, audible).
         extent: Number of audible frames of each item.
 
@@ -325,10 +325,10 @@ def expected_correlation(reference: Tensor, processed: Tensor, extent: Extent) -
     >>> expected_correlation(waves, waves, Extent((900,))).shape
     torch.Size([1, 10])
     """
-    covariance = _modulation_covariance(reference, processed, extent)
+    covariance = _modulation_covariance(clean, output, extent)
     variance = NOISE_DB**2
     energies = torch.from_numpy(np.stack([_noise_energy(frames) for frames in extent.ends]))
-    noise = variance * energies.to(reference).unsqueeze(-1)
+    noise = variance * energies.to(clean).unsqueeze(-1)
     xx, yy, xy = covariance.xx + noise, covariance.yy + noise, covariance.xy
     xx2, yy2, xy2, noise2 = _energies_filtered_twice(covariance, extent)
     noise2 = variance**2 * noise2

@@ -111,8 +111,8 @@ def _half_windows(segment: int) -> NDArray[np.float64]:
 
 
 def envelope_correlation(
-    reference: Tensor,
-    processed: Tensor,
+    clean: Tensor,
+    output: Tensor,
     counts: Extent,
     split_by_rate: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
@@ -123,7 +123,7 @@ def envelope_correlation(
     signal count; the value is 0 where there are fewer than two. The host waits for the device once.
 
     Args:
-        reference, processed: Levels of the clean signal and of the output by ``smooth_levels``.
+        clean, output: Levels of the clean signal and of the output by ``smooth_levels``.
             Shape: (items, 32, segments).
         counts: Number of segments of each item.
         split_by_rate: Function that divides fluctuations into bands of modulation, which are
@@ -136,13 +136,13 @@ def envelope_correlation(
     >>> envelope_correlation(levels, 2.0 * levels, Extent((5,))).round(decimals=4)
     tensor([1.])
     """
-    is_audible = _audible_segments(reference, counts)
+    is_audible = _audible_segments(clean, counts)
     audible = tuple(is_audible.sum(-1).tolist())
     extent = Extent(tuple(max(1, count) for count in audible))
     order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
-    basis = constant_like(reference, _cosines)
+    basis = constant_like(clean, _cosines)
     waves = []
-    for levels in (reference, processed):
+    for levels in (clean, output):
         wave = extent.centred(basis @ levels.take_along_dim(order, -1))
         if split_by_rate is not None:
             wave = extent.centred(split_by_rate(wave))
@@ -238,14 +238,14 @@ def _inside() -> NDArray[np.float64]:
 
 
 def coherence(
-    reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor], counts: Extent
+    clean: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor], counts: Extent
 ) -> Tensor:
     """Compute how similar the fine structures of two signals are in each segment of 16 ms.
 
     The similarity is the largest normalised cross-covariance over delays of up to 1 ms.
 
     Args:
-        reference, processed: Spectra and mean squares of both signals by ``segment_spectra``.
+        clean, output: Spectra and mean squares of both signals by ``segment_spectra``.
         counts: Number of segments of each item.
 
     Returns:
@@ -255,7 +255,7 @@ def coherence(
     >>> float(coherence(spectra, spectra, Extent((5,))).min()) > 0.99
     True
     """
-    (x, xx), (y, yy) = reference, processed
+    (x, xx), (y, yy) = clean, output
     kinds = _segment_kinds(counts, xx.device)
     weights = constant_like(xx, _lag_weights)[kinds][:, None]
     covariance = torch.fft.irfft(x * y.conj(), FFT_POINTS)

@@ -173,14 +173,14 @@ def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
     return torch.fft.rfft(extent.centred(signals.detach()), points)
 
 
-def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -> Tensor:
+def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> Tensor:
     """Return the delay that each output of an aid needs to lie 2 ms behind its clean signal.
 
     The delay is found by the largest magnitude of the cross-covariance of the whole signals.
 
     Args:
         reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``.
-        processed: Outputs at 24 kHz. Shape: (items, time).
+        output: Outputs at 24 kHz. Shape: (items, time).
         extent: Number of samples of each item, equal for clean signals and outputs.
 
     Returns:
@@ -192,7 +192,7 @@ def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -
     """
     time, points = extent.longest, fft_length(2 * extent.longest, 2)
     with torch.no_grad():
-        spectrum = reference_spectrum * spectrum_for_alignment(processed, extent).conj()
+        spectrum = reference_spectrum * spectrum_for_alignment(output, extent).conj()
         covariance = torch.fft.irfft(spectrum, points).abs()
         # in order of the lag, from 1 - time to time - 1
         by_lag = torch.cat((covariance[:, points - time + 1 :], covariance[:, :time]), -1)
