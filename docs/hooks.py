@@ -33,6 +33,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     The site has the pages of docs/ at its root, so a link must neither leave nor enter that folder.
     """
+    if page.file.src_uri == "CHANGELOG.md":
+        page.meta["search"] = {"exclude": True}  # its entries would hide the guides
     markdown = re.sub(r"(\]\([^)#:]+)\.ipynb\b", r"\1.md", markdown)  # notebooks are shown as pages
     up = "../" * page.file.src_uri.count("/")
     if page.file.src_dir == str(ROOT):

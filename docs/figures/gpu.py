@@ -16,10 +16,10 @@ and both extremes; every other section uses the defaults.
 Predictions, made before the first run on a GPU
 -----------------------------------------------
 ``PREDICTIONS`` holds, for a call with one item of 4 s, the number of operations that launch a
-kernel and the megabytes that they read and write, as counted on a CPU by
-``python docs/figures/gpu.py --device cpu --only operations --out DIR``. (The count is that of
-torch's profiler; an operation is one without children that is no view, and it writes as much as its
-largest input holds. On a CPU Mamba works in more and smaller blocks than on a GPU, so that its operations
+kernel and the megabytes that they read and write, as counted on a CPU by ``python
+docs/figures/gpu.py --device cpu --only operations --out DIR``. (The count is that of torch's
+profiler; an operation is one without children that is no view, and it writes as much as its largest
+input holds. On a CPU Mamba works in more and smaller blocks than on a GPU, so that its operations
 are upper bounds. Those of HASPI, HASQI and MBSTOI were counted on a pretended device.) We assume 8
 microseconds of host time per operation and 2 terabytes per second. The expected time of a call is
 the longer one of the two; the table of throughput shows it beside the measurement.
