@@ -1,4 +1,4 @@
-"""The machine listener of docs/figures/machine_listener.py, with a recogniser that needs no Whisper."""
+"""The machine listener of examples/machine_listener.py, with a recogniser that needs no Whisper."""
 
 import doctest
 from pathlib import Path
@@ -16,15 +16,15 @@ from hlsim.audio import write_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.study import Item
-from tests.helpers import FIGURES, load_figure, write_ears
+from tests.helpers import EXAMPLES, load_example, write_ears
 
-FILE = FIGURES / "machine_listener.py"
+FILE = EXAMPLES / "machine_listener.py"
 TEXT = "one two three four five six seven eight"
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    return load_figure("machine_listener.py")
+    return load_example("machine_listener.py")
 
 
 def recognise_loud_eighths(waveform: np.ndarray) -> str:
@@ -66,8 +66,12 @@ def test_internal_noise_has_the_levels_of_the_standard(example: ModuleType) -> N
 
 def test_threshold_is_interpolated(example: ModuleType) -> None:
     assert example.reception_threshold([10, 0, 5], [0.9, 0.1, 0.5], 0.4) == pytest.approx(3.75)
-    assert example.reception_threshold([0, 5], [0.5, 0.9], 0.4) is None
-    assert example.reception_threshold([0, 5], [0.1, 0.3], 0.4) is None
+    above = example.reception_threshold([0, 5], [0.5, 0.9], 0.4)
+    below = example.reception_threshold([0, 5], [0.1, 0.3], 0.4)
+    assert (above, below) == (-np.inf, np.inf)
+    assert example.describe(np.array([above, 1.0])) == "below all SNRs"
+    assert example.describe(np.array([below, 1.0])) == "not reached"
+    assert example.describe(np.array([2.0, 1.0, below]), ".1f") == "2.0 [1.0, inf]"
 
 
 def test_more_loss_costs_words_and_an_aid_returns_them(example: ModuleType) -> None:
@@ -166,6 +170,23 @@ def test_aids_are_compared_at_equal_level(
     for (*place, first), (*same_place, second) in zip(aided[::2], aided[1::2], strict=True):
         assert place == same_place
         assert float(first) == pytest.approx(float(second), abs=0.01)
+
+
+def test_measured_ears_without_names_remain_several(example: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "ears.csv").write_text("hl_500,hl_4000\n20,40\n30,50\n40,60\n50,70\n")
+    assert len(example.choose_ears(tmp_path / "ears.csv")) == 8
+
+
+def test_intervals_are_those_of_ears_too(example: ModuleType) -> None:
+    # All sentences are understood with one ear, and none with the other.
+    rows = [
+        {"sentence": s, "text": TEXT, "ear": e, "snr": 0.0, "condition": "aid", "words_correct": w}
+        for s in range(3)
+        for e, w in (("a", 1.0), ("b", 0.0))
+    ]
+    comparison = example.Comparison(pandas.DataFrame(rows))
+    assert example.describe(comparison.shares("aid", 0.0)) == "0.500 [0.000, 1.000]"
+    assert example.describe(comparison.shares("aid", 0.0, "a")) == "1.000 [1.000, 1.000]"
 
 
 def test_intervals_are_those_of_sentences(example: ModuleType) -> None:

@@ -52,7 +52,7 @@ def test_saved_networks_are_judged_at_the_level_of_nalr(
 ) -> None:
     pytest.importorskip("pandas")
     monkeypatch.syspath_prepend(TRAINING)
-    listener = load_figure("machine_listener.py")
+    listener = load_example("machine_listener.py")
     networks = load_figure("networks.py")
     sentence = listener.Sentence("flite-rms-01.flac", 0.0, 1.0, "a b")
     monkeypatch.setattr(listener, "Whisper", lambda folder: lambda waveform: "a")

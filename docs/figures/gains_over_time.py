@@ -5,7 +5,7 @@ A recogniser understands more of the output of `compensator-general` in noise th
 of its gains matters. They measure the gain of each band from its input and output, change it, and
 apply it. Each is an aid for `machine_listener.py`:
 
-    python docs/figures/machine_listener.py compare speech/valid noise/valid --model TINY \\
+    python examples/machine_listener.py compare speech/valid noise/valid --model TINY \\
         --audiograms audiograms/valid.csv --step 2 --snrs 5 --baseline compensator-general \\
         --aids hearing-aid@1 compensator-general docs/figures/gains_over_time.py:PromptGains \\
         docs/figures/gains_over_time.py:LateGains docs/figures/gains_over_time.py:SteadyGains \\

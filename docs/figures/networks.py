@@ -272,7 +272,7 @@ class SavedNetwork(nn.Module):
 
 def judge(options: argparse.Namespace) -> None:
     """Print HASPI and words correct of saved networks and NAL-R, and differences from both."""
-    import machine_listener as listener
+    from examples import machine_listener as listener
 
     nalr, ears = NALR(), {options.ear: Audiogram.standard(options.ear)}
     sentences = listener.read_sentences(listener.SENTENCES)
@@ -304,7 +304,7 @@ def print_differences(title: str, comparison: Any, aids: list[str], snrs: list[f
         aids: Names of the aids, NETWORK.LOSS or NAL-R.
         snrs: SNRs in dB. Their mean makes the last column.
     """
-    from machine_listener import describe, print_table
+    from examples.machine_listener import describe, print_table
 
     scores = {}
     for aid in aids:

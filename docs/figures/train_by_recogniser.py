@@ -17,7 +17,7 @@ A step of 32 clips needs 6 GB of memory. On a CPU, take smaller steps, such as `
 An aid is not to be judged by the recogniser that trained it. Judge it by another one, on other
 speakers:
 
-    python docs/figures/machine_listener.py compare speech/valid noise/valid --model BASE \\
+    python examples/machine_listener.py compare speech/valid noise/valid --model BASE \\
         --audiograms audiograms/valid.csv --aids hearing-aid ./trained nalr --out judged
 """
 
@@ -32,12 +32,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from machine_listener import PEAK, RATE, Whisper, agreed_text, internal_noise
 from torch import Tensor, nn
 from torch.nn import functional
 from whisper_likelihood import TextLikelihood, read_weights
 
 from compensators import HearingAid, load_compensator, save_compensator
+from examples.machine_listener import PEAK, RATE, Whisper, agreed_text, internal_noise
 from hlsim import MSBG
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level

@@ -1,33 +1,40 @@
-"""Words that Whisper recognises in the output of hearing aids, as an impaired ear perceives it.
+"""Words that a recogniser finds in the output of hearing aids, as an impaired ear perceives it.
 
 HASPI is no independent judge of an aid that was trained by it. This *machine listener* has learned
-from no simulator and no score. The exact MSBG simulates the impaired ear, the internal noise of the
-ear after ANSI S3.5-1997 hides what is inaudible, and Whisper writes down what is left. The share of
-the words of a sentence that it recognises, *words correct*, depends on level, noise and loss.
+from no simulator and no score. A simulator, by default the exact MSBG, is the impaired ear, the
+internal noise of the ear after ANSI S3.5-1997 hides what is inaudible, and Whisper or Moonshine
+writes down what is left. The share of the words of a sentence that it recognises, *words correct*,
+depends on level, noise and loss.
 
-It needs `pip install faster-whisper` and a folder with a Whisper model for CTranslate2 (model.bin,
-config.json, tokenizer.json, vocabulary.txt), and runs offline.
+Whisper needs `pip install faster-whisper` and a folder with a model for CTranslate2 (model.bin,
+config.json, tokenizer.json, vocabulary.txt). Moonshine needs `pip install moonshine_voice==0.0.48`,
+which contains the model `moonshine-tiny`. Both run offline.
 
-    python docs/figures/machine_listener.py transcribe speech/valid --models TINY BASE --out FILE.csv
-    python docs/figures/machine_listener.py compare speech/valid noise/valid --model TINY \\
+    python examples/machine_listener.py transcribe speech/valid --models TINY BASE --out FILE.csv
+    python examples/machine_listener.py compare speech/valid noise/valid --model TINY \\
         --audiograms audiograms/valid.csv --aids hearing-aid nalr --out listened
+    python examples/machine_listener.py compare speech/valid noise/valid --model moonshine-tiny \\
+        --simulator attenuation --audiograms audiograms/valid.csv --out listened-linear
 
 `transcribe` cuts recordings at pauses and keeps the pieces in which two models recognise the same
 words. `compare` processes these sentences by every aid for every ear, scales all outputs to the level
 of the first aid's output (unless `--own-levels` is given), and prints words correct with 95 %
-intervals (bootstrap over sentences), paired differences, and the speech reception threshold. A
-stopped comparison continues where it was.
+intervals (bootstrap over sentences and ears), paired differences, and the speech reception threshold.
+A stopped comparison continues where it was.
 
 An aid is a name that `load_compensator` takes, a plug-in `file.py:NAME` called with a waveform and an
-ear, or `unaided`; `hearing-aid@0.5` is an aid with half of its noise reduction.
+ear, or `unaided`; `hearing-aid@0.5` is an aid with half of its noise reduction, and
+`equaliser:hearing-aid` a fixed filter with the mean gain of an aid for the ear.
 
 The measure also scores recorded files, whose sentences are found by their names in a CSV file with the
 columns item and text:
 
     export WHISPER_MODEL=TINY WHISPER_SENTENCES=FILE.csv
-    hlsim haspi-report --manifest items.csv --measure docs/figures/machine_listener.py:WordsCorrect
+    hlsim haspi-report --manifest items.csv --measure examples/machine_listener.py:WordsCorrect
 
-Whisper is not a person. It was trained on noisy speech, and noise may disturb it less than a person.
+A recogniser is not a person. It was trained on noisy speech, and noise may disturb it less than a
+person. The recogniser is independent of hlsim, but the simulated ear is not: compare aids behind more
+than one.
 """
 
 from __future__ import annotations
@@ -40,6 +47,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -50,18 +58,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from compensators import load_compensator
-from hlsim import MSBG, Audiogram
+from hlsim import Audiogram
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.data.augment import mix
+from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.data.clips import Clips
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.aids import AtLevelOf, Unaided
+from hlsim.evaluation.aids import AtLevelOf, EqualiserLike, Unaided
+from hlsim.evaluation.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
 from hlsim.files import read_table, sha256
 from hlsim.plugins import load_plugin
+from hlsim.simulators import load_simulator
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -104,6 +115,13 @@ FRAMES_PER_STEP = 100
 """Inputs of Whisper have a multiple of this number of frames of 10 ms."""
 
 RESAMPLES = 2000
+
+EQUALISER = "equaliser:"
+"""Beginning of the name of an aid that is an equaliser."""
+
+EQUALISER_LEVELS = (50.0, 65.0, 80.0)
+"""Levels of speech in dB SPL over which an equaliser averages the gain of an aid."""
+
 PAUSE_SECONDS, PAUSE_DB = 0.15, -30.0
 """Shortest pause, and its highest level relative to the loudest 20 ms."""
 
@@ -235,6 +253,43 @@ class Whisper:
         return text
 
 
+class Moonshine:
+    """Recognition by a Moonshine model in English that the package moonshine_voice contains.
+
+    Args:
+        name: Folder of the model in the package.
+    """
+
+    def __init__(self, name: str = "tiny-en") -> None:
+        self.name = name
+
+    def __reduce__(self) -> Any:
+        return Moonshine, (self.name,)
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of the model and version of the package, which contains it."""
+        return f"{self.name} of moonshine_voice {version('moonshine_voice')}"
+
+    @cached_property
+    def _transcriber(self) -> Any:
+        from moonshine_voice import ModelArch, Transcriber, get_model_path
+
+        return Transcriber(str(get_model_path(self.name)), ModelArch.TINY)
+
+    def __call__(self, waveform: NDArray[np.float32]) -> str:
+        """Return the text of a waveform at 16 kHz. Shape: (time,)."""
+        scaled = waveform * (PEAK / np.abs(waveform).max())
+        padded = np.pad(scaled, (0, round(PADDING_SECONDS * RATE)))
+        transcript = self._transcriber.transcribe_without_streaming(padded.tolist(), RATE)
+        return " ".join(line.text for line in transcript.lines)
+
+
+def load_recogniser(name: str) -> Callable[[NDArray[np.float32]], str]:
+    """Return Moonshine for the name ``moonshine-tiny``, and Whisper for a folder."""
+    return Moonshine() if name == "moonshine-tiny" else Whisper(name)
+
+
 class WordsCorrect:
     """Measure of a study: the share of a sentence's words that the machine listener recognises.
 
@@ -244,24 +299,30 @@ class WordsCorrect:
         recognise: Function of samples at 16 kHz, (time,), that returns a text; by default Whisper
             from the folder in the environment variable ``WHISPER_MODEL``.
         sentences: Texts by utterance; by default those of the CSV file in ``WHISPER_SENTENCES``.
+        simulator: Name of the simulated ear, as in ``load_simulator``.
     """
 
     def __init__(
         self,
         recognise: Callable[[NDArray[np.float32]], str] | None = None,
         sentences: Mapping[str, str] | None = None,
+        simulator: str = "msbg",
     ) -> None:
-        self.recognise = recognise or Whisper(os.environ["WHISPER_MODEL"])
+        self.recognise = recognise or load_recogniser(os.environ["WHISPER_MODEL"])
         if sentences is None and "WHISPER_SENTENCES" in os.environ:
             rows = read_table(os.environ["WHISPER_SENTENCES"], "the sentences")
             sentences = {row["item"]: row["text"] for _, row in rows}
         self.sentences = sentences or {}
-        self.msbg = MSBG(sample_rate=RATE)
+        self.simulator = load_simulator(simulator, sample_rate=RATE)
 
     @property
     def fingerprint(self) -> str | None:
-        """Fingerprint of the recogniser; None if it states none."""
-        return getattr(self.recognise, "fingerprint", None)
+        """Fingerprint of recogniser, simulator and texts; None if one of them has none."""
+        recogniser = getattr(self.recognise, "fingerprint", None)
+        simulator = fingerprint(self.simulator)
+        if recogniser is None or simulator is None:
+            return None
+        return value_hash([recogniser, simulator, dict(self.sentences)])
 
     def __call__(self, item: Item, output: Tensor) -> dict[str, float]:
         text = item.facts.get("text") or self.sentences.get(str(item.facts.get("utterance")))
@@ -276,7 +337,7 @@ class WordsCorrect:
     @torch.no_grad()
     def perceive(self, output: Tensor, ear: Audiogram, seed: int) -> NDArray[np.float32]:
         """Return what an ear perceives, with its internal noise. Shape: (time,) in pascals."""
-        perceived: NDArray[np.float32] = self.msbg(output, ear).numpy()
+        perceived: NDArray[np.float32] = self.simulator(output, ear).numpy()
         return perceived + internal_noise(len(perceived), seed)
 
 
@@ -425,6 +486,10 @@ def load_aid(name: str) -> Any:
         return Unaided().eval()
     if ".py:" in name:
         return load_plugin(name, "aid")
+    if name.startswith(EQUALISER):
+        aid = load_aid(name.removeprefix(EQUALISER))
+        speech = torch.from_numpy(load_speech(EXAMPLE_FILE))
+        return EqualiserLike(aid, speech[None], EQUALISER_LEVELS).eval()
     name, at, slider = name.partition("@")
     aid = load_compensator(name).eval()
     return WithSlider(aid, float(slider)).eval() if at else aid
@@ -452,27 +517,32 @@ def make_conditions(aids: Sequence[str], *, own_levels: bool) -> list[Condition]
     return [AtEqualLevel(name, AtLevelOf(load_aid(name), first).eval()) for name in aids]
 
 
-def reception_threshold(
-    snrs_db: Sequence[float], shares: Sequence[float], target: float
-) -> float | None:
+def reception_threshold(snrs_db: Sequence[float], shares: Sequence[float], target: float) -> float:
     """Return the lowest SNR in dB at which the share of words reaches a target, by interpolation.
 
-    Returns: None if the shares do not cross the target.
+    Returns: Minus infinity if the share at the lowest SNR reaches the target, and infinity if no
+        share does.
 
     >>> reception_threshold([-5, 0, 5, 10], [0.125, 0.25, 0.5, 0.75], 0.375)
     2.5
+    >>> reception_threshold([0, 5], [0.5, 0.9], 0.4)
+    -inf
     """
     points = sorted(zip(snrs_db, shares, strict=True))
+    if points[0][1] >= target:
+        return -math.inf
     for (low, below), (high, above) in pairwise(points):
         if below < target <= above:
             return low + (high - low) * (target - below) / (above - below)
-    return None
+    return math.inf
 
 
 class Comparison:
-    """Words correct of a table of ``run_study``, with intervals by a bootstrap over sentences.
+    """Words correct of a table of ``run_study``, with intervals by a bootstrap.
 
-    A share is the number of correct words divided by the number of all words, over all ears.
+    A share is the number of correct words divided by the number of all words, over all ears. The
+    bootstrap draws sentences and, independently of them, ears, because results should hold for
+    other sentences and for other ears.
 
     Args:
         table: Rows of the study.
@@ -483,22 +553,30 @@ class Comparison:
         self.table = table.assign(words=table["text"].map(lambda text: len(split_words(text))))
         self.table["correct"] = self.table["words_correct"] * self.table["words"]
         self.sentences = sorted(self.table["sentence"].unique())
+        self.ears = sorted(self.table["ear"].unique())
         generator = np.random.default_rng(seed)
-        size = len(self.sentences)
-        drawn = generator.integers(0, size, (RESAMPLES, size))
-        # Row 0 counts every sentence once.
-        counts = [np.ones(size), *(np.bincount(row, minlength=size) for row in drawn)]
-        self.counts = np.stack(counts)
+        self.sentence_counts = draw_counts(generator, len(self.sentences))
+        self.ear_counts = draw_counts(generator, len(self.ears))
 
     def shares(self, condition: str, snr: float, ear: str | None = None) -> NDArray[np.float64]:
-        """Return the share of all sentences, and of each resample. Shape: -> (1 + resamples,)."""
+        """Return the share of all sentences, and of each resample. Shape: -> (1 + resamples,).
+
+        Args:
+            condition: Name of the aid.
+            snr: SNR in dB.
+            ear: Name of one ear, for which sentences alone are drawn; by default all ears.
+        """
         table = self.table
-        chosen = (table["condition"] == condition) & (table["snr"] == snr)
-        if ear is not None:
-            chosen &= table["ear"] == ear
-        sums = table[chosen].groupby("sentence")[["correct", "words"]].sum()
-        correct, words = (self.counts @ sums.reindex(self.sentences, fill_value=0.0).to_numpy()).T
-        # Of one ear, a resample may contain no sentence.
+        chosen = table[(table["condition"] == condition) & (table["snr"] == snr)]
+        ears = self.ears if ear is None else [ear]
+        ear_counts = self.ear_counts if ear is None else np.ones((1 + RESAMPLES, 1))
+        sums = []
+        for column in ("correct", "words"):
+            grid = chosen.pivot_table(column, "sentence", "ear", aggfunc="sum")
+            values = grid.reindex(index=self.sentences, columns=ears).fillna(0.0).to_numpy()
+            sums.append(((self.sentence_counts @ values) * ear_counts).sum(-1))
+        correct, words = sums
+        # A resample may contain no sentence of its ears.
         with np.errstate(invalid="ignore"):
             shares: NDArray[np.float64] = correct / words
         return shares
@@ -506,19 +584,39 @@ class Comparison:
     def thresholds(self, condition: str, target: float) -> NDArray[np.float64]:
         """Return the speech reception threshold in dB of all sentences, and of each resample.
 
-        NaN where the shares do not cross the target. Shape: -> (1 + resamples,).
+        The values of ``reception_threshold``, which may be infinite. Shape: -> (1 + resamples,).
         """
         snrs = sorted(snr for snr in self.table["snr"].unique() if math.isfinite(snr))
         shares = np.stack([self.shares(condition, snr) for snr in snrs], -1)
-        found = [reception_threshold(snrs, list(row), target) for row in shares]
-        return np.array([math.nan if value is None else value for value in found])
+        return np.array([reception_threshold(snrs, list(row), target) for row in shares])
+
+
+def draw_counts(generator: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Draw how often each of ``size`` things is in each resample.
+
+    Returns: Counts. Those of row 0 are 1, so that it stands for the data themselves. Shape: (1 +
+        resamples, size).
+    """
+    drawn = generator.integers(0, size, (RESAMPLES, size))
+    counts = [np.ones(size), *(np.bincount(row, minlength=size) for row in drawn)]
+    return np.stack(counts).astype(np.float64)
 
 
 def describe(values: NDArray[np.float64], form: str = ".3f") -> str:
-    """Return the first value with the 95 % interval of the others, as text."""
+    """Return the first value with the 95 % interval of the others, as text.
+
+    An infinite threshold is "below all SNRs" or "not reached". Infinite resamples count in the
+    interval.
+
+    >>> describe(np.array([1.0, 1.0, 1.0]))
+    '1.000 [1.000, 1.000]'
+    """
     if not math.isfinite(values[0]):
-        return "not reached"
-    low, high = np.nanpercentile(values[1:], [2.5, 97.5])
+        return "below all SNRs" if values[0] < 0.0 else "not reached"
+    resamples = values[1:][~np.isnan(values[1:])]
+    # Percentiles are not interpolated, because infinite values cannot be.
+    low = np.percentile(resamples, 2.5, method="lower")
+    high = np.percentile(resamples, 97.5, method="higher")
     return f"{values[0]:{form}} [{low:{form}}, {high:{form}}]"
 
 
@@ -576,14 +674,16 @@ def choose_ears(audiograms: str | Path) -> dict[str, Audiogram]:
     ears = {name: Audiogram.standard(name) for name in STANDARD_EARS}
     measured = read_audiograms(audiograms, simulated=True)
     step = max(1, len(measured) // MEASURED_EARS)
-    for row, ear in measured[::step][:MEASURED_EARS]:
-        ears[" ".join(filter(None, (row.get("listener"), row.get("ear"))))] = ear
+    for number, (row, ear) in enumerate(measured[::step][:MEASURED_EARS], start=1):
+        name = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
+        is_new = bool(name) and name not in ears
+        ears[name if is_new else f"{name} {number}".strip()] = ear
     return ears
 
 
 def run_transcribe(options: argparse.Namespace) -> None:
     """Write the sentences of a folder of speech."""
-    found = transcribe(options.speech, [Whisper(folder) for folder in options.models])
+    found = transcribe(options.speech, [load_recogniser(name) for name in options.models])
     with open(options.out, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(Sentence._fields)
@@ -592,7 +692,7 @@ def run_transcribe(options: argparse.Namespace) -> None:
 
 def run_compare(options: argparse.Namespace) -> None:
     """Compare aids, and write the table of all values."""
-    listener = WordsCorrect(Whisper(options.model))
+    listener = WordsCorrect(load_recogniser(options.model), simulator=options.simulator)
     measure = Measure("words_correct", listener, packages=["hlsim"], settings=listener.fingerprint)
     sentences = read_sentences(options.sentences)
     parts = (options.speech, options.noise, sentences)
@@ -623,13 +723,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("transcribe", help="find sentences whose words are known")
     command.add_argument("speech", help="folder of speech")
-    command.add_argument("--models", nargs="+", required=True, help="folders of Whisper models")
+    command.add_argument("--models", nargs="+", required=True, help="recognisers")
     command.add_argument("--out", required=True, help="CSV file that is written")
     command.set_defaults(run=run_transcribe)
     command = commands.add_parser("compare", help="compare hearing aids")
     command.add_argument("speech", help="folder of speech")
     command.add_argument("noise", help="folder of noise, with a subfolder for each kind")
-    command.add_argument("--model", required=True, help="folder of a Whisper model")
+    text = "recogniser: the folder of a Whisper model, or moonshine-tiny"
+    command.add_argument("--model", required=True, help=text)
+    text = "simulated ear: msbg, attenuation, or another name of a simulator"
+    command.add_argument("--simulator", default="msbg", help=text)
     command.add_argument("--audiograms", required=True, help="CSV file of measured ears")
     command.add_argument("--sentences", default=SENTENCES, help="CSV file of sentences")
     command.add_argument("--aids", nargs="+", default=["hearing-aid", "nalr"], help="aids")
