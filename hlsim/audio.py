@@ -1,10 +1,19 @@
-"""Reading, writing and listing of audio files. No other module imports soundfile."""
+"""Reading, writing and listing of audio files. No other module imports soundfile.
+
+Recordings of any length are read by ``scan_audio`` and ``read_parts``, and written by
+``write_parts``, so that only a part of them is in memory.
+"""
 
 import io
+import math
+import struct
 import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
-import scipy
+import numpy as np
 import soundfile
 import torch
 from torch import Tensor
@@ -16,6 +25,15 @@ EXTENSIONS = tuple(
     ".wav .flac .ogg .oga .opus .mp3 .aif .aiff .aifc .au .snd .caf .w64 .rf64 .sph .voc".split()
 )
 """Extensions by which audio files are found in folders. libsndfile reads all of these formats."""
+
+_SCANNED_SAMPLES = 1_000_000
+"""Number of samples per channel that are read at once to scan a recording."""
+
+_LARGEST_SIZE = 2**32 - 1
+"""Largest size in bytes that the header of a WAV file can state."""
+
+_HEADER = struct.Struct("<4sI4s4sIHHIIHHH4sII4sI")
+"""Header of a WAV file in 32-bit float: the chunks RIFF, fmt and fact, and the head of data."""
 
 
 def read_audio(path: str | Path) -> tuple[Tensor, int]:
@@ -39,31 +57,125 @@ def read_audio(path: str | Path) -> tuple[Tensor, int]:
     >>> samples.shape, rate
     (torch.Size([1, 64320]), 16000)
     """
+    with _open_audio(path) as file:
+        rate, expected = file.samplerate, file.frames
+        samples = file.read(expected, dtype="float32", always_2d=True)
+    waveform = torch.from_numpy(samples.T.copy())
+    _check_contents(path, rate, bool(waveform.isfinite().all()), bool(waveform.any()))
+    _warn_if_truncated(path, expected, len(samples))
+    return waveform, rate
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Properties of an audio file, found without keeping its samples in memory.
+
+    Attributes:
+        path: The file.
+        sample_rate: Sample rate in Hz.
+        channels: Number of channels.
+        samples: Number of samples per channel.
+        power: Mean square of all samples of all channels, where 1.0 is full scale.
+    """
+
+    path: Path
+    sample_rate: int
+    channels: int
+    samples: int
+    power: float
+
+
+def scan_audio(path: str | Path) -> Recording:
+    """Read an audio file once, a part at a time, and return its properties.
+
+    Args:
+        path: Audio file with a sample rate of 16 kHz or more.
+
+    Raises:
+        ValueError: ``read_audio`` would reject the file.
+
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> recording = scan_audio(EXAMPLE_FILE)
+    >>> recording.samples, recording.sample_rate, recording.channels
+    (64320, 16000, 1)
+    """
+    energy, samples = 0.0, 0
+    with _open_audio(path) as file:
+        rate, channels, expected = file.samplerate, file.channels, file.frames
+        # Of a truncated file, ``file.blocks`` returns samples beyond its end.
+        while len(block := file.read(_SCANNED_SAMPLES, dtype="float32", always_2d=True)):
+            samples += len(block)
+            energy += float(np.square(block, dtype=np.float64).sum())
+    _check_contents(path, rate, math.isfinite(energy), energy > 0.0)
+    _warn_if_truncated(path, expected, samples)
+    return Recording(Path(path), rate, channels, samples, energy / (samples * channels))
+
+
+def read_parts(recording: Recording, bounds: Iterable[tuple[int, int]]) -> Iterator[Tensor]:
+    """Yield parts of a recording, each of them read when it is needed.
+
+    Args:
+        recording: Recording from ``scan_audio``.
+        bounds: Half-open range of samples of each part, in ascending order. Parts may overlap, and
+            have no gap between them.
+
+    Yields:
+        Samples in float32, (channels, time), where 1.0 is full scale.
+
+    Raises:
+        ValueError: The file has become shorter since it was scanned.
+
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> parts = read_parts(scan_audio(EXAMPLE_FILE), [(0, 1000), (900, 2000)])
+    >>> [part.shape for part in parts]
+    [torch.Size([1, 1000]), torch.Size([1, 1100])]
+    """
+    with _open_audio(recording.path) as file:
+        part = np.empty((0, recording.channels), np.float32)
+        part_start = 0
+        for start, stop in bounds:
+            part = part[start - part_start :]
+            count = stop - start - len(part)
+            part = np.concatenate((part, file.read(count, dtype="float32", always_2d=True)))
+            part_start = start
+            if len(part) < stop - start:
+                raise ValueError(f"{recording.path}: the file has changed; run again")
+            yield torch.from_numpy(part.T.copy())
+
+
+@contextmanager
+def _open_audio(path: str | Path) -> Iterator[soundfile.SoundFile]:
+    """Open an audio file; what soundfile raises in the ``with`` block becomes a ValueError."""
     if not Path(path).is_file():
         raise ValueError(f"{path}: there is no such audio file; correct the path")
     try:
         with soundfile.SoundFile(path) as file:
-            rate, expected = file.samplerate, file.frames
-            samples = file.read(expected, dtype="float32", always_2d=True)
+            yield file
     except Exception as error:  # For broken files, soundfile raises exceptions of many types.
         raise ValueError(f"{path}: cannot be read as audio: {error}") from error
+
+
+def _check_contents(path: str | Path, rate: int, is_finite: bool, has_sound: bool) -> None:
+    """Raise ValueError if a recording has a low sample rate, NaN or infinity, or no sound."""
     if rate < LOWEST_RATE:
         raise ValueError(
             f"{path}: the sample rate is {rate} Hz, expected {LOWEST_RATE} Hz or more; use another "
             f"recording, because this one has no sound above {rate / 2:g} Hz"
         )
-    waveform = torch.from_numpy(samples.T.copy())
-    if not bool(waveform.isfinite().all()):
+    if not is_finite:
         raise ValueError(f"{path}: some samples are NaN or infinite; replace or remove the file")
-    if not bool(waveform.any()):
+    if not has_sound:
         raise ValueError(f"{path}: the file is empty or silent; replace or remove it")
-    if len(samples) < expected:
+
+
+def _warn_if_truncated(path: str | Path, expected: int, samples: int) -> None:
+    """Warn if fewer samples per channel could be read than the header of a file states."""
+    if samples < expected:
         warnings.warn(
             f"{path}: the file is truncated; its header states {expected} samples per channel, but "
-            f"only {len(samples)} could be read",
-            stacklevel=2,
+            f"only {samples} could be read",
+            stacklevel=3,
         )
-    return waveform, rate
 
 
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
@@ -93,9 +205,54 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     if not bool(samples.isfinite().all()):
         raise ValueError(f"{path}: some samples are NaN or infinite; nothing was written")
     rate = check_rate(sample_rate)
-    with atomic_path(path) as temporary:
-        # libsndfile would store the time of day, and equal signals would give different files.
-        scipy.io.wavfile.write(temporary, rate, samples.mT.numpy())
+    channels, time = samples.shape
+    write_parts(path, [samples], channels, time, rate)
+
+
+def write_parts(
+    path: str | Path, parts: Iterable[Tensor], channels: int, samples: int, sample_rate: int
+) -> None:
+    """Write a WAV file with samples in 32-bit float part by part, completely or not at all.
+
+    Args:
+        path: File to write.
+        parts: Consecutive parts of the signal, (channels, time), where 1.0 is full scale.
+        channels: Number of channels.
+        samples: Number of samples per channel of all parts together.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+
+    Raises:
+        ValueError: The extension is not .wav, the sample rate is not supported, the signal is too
+            long for a WAV file (4 GB), or samples are NaN or infinite.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_parts(f"{folder}/noise.wav", 0.1 * torch.randn(2, 1, 16000), 1, 32000, 16000)
+    ...     read_audio(f"{folder}/noise.wav")[0].shape
+    torch.Size([1, 32000])
+    """
+    if Path(path).suffix.lower() != ".wav":
+        raise ValueError(f"{path}: expected the extension .wav; convert the file afterwards")
+    rate = check_rate(sample_rate)
+    frame_bytes = 4 * channels
+    data_bytes = frame_bytes * samples
+    riff_bytes = _HEADER.size - 8 + data_bytes
+    if riff_bytes > _LARGEST_SIZE:
+        raise ValueError(f"{path}: the output exceeds the 4 GB of a WAV file; split the recording")
+    # libsndfile would store the time of day, and equal signals would give different files.
+    float_format = 18, 3, channels, rate, rate * frame_bytes, frame_bytes, 32, 0
+    header = _HEADER.pack(
+        *(b"RIFF", riff_bytes, b"WAVE", b"fmt "),
+        *float_format,
+        *(b"fact", 4, samples, b"data", data_bytes),
+    )
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(header)
+        for part in parts:
+            values = part.detach().to("cpu", torch.float32)
+            if not bool(values.isfinite().all()):
+                raise ValueError(f"{path}: some samples are NaN or infinite; nothing was written")
+            file.write(values.mT.contiguous().numpy().astype("<f4", copy=False).tobytes())
 
 
 def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:

@@ -1,5 +1,7 @@
 """Audio files: reading gives the samples that were written, and errors name bad files."""
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,15 @@ import soundfile
 import torch
 from torch import Tensor
 
-from hlsim.audio import encode_flac, find_audio, read_audio, write_audio
+from hlsim.audio import (
+    encode_flac,
+    find_audio,
+    read_audio,
+    read_parts,
+    scan_audio,
+    write_audio,
+    write_parts,
+)
 
 
 def noise(*shape: int) -> np.ndarray:
@@ -51,7 +61,10 @@ def test_a_truncated_file_is_read_with_a_warning(tmp_path: Path) -> None:
     soundfile.write(path, noise(48000), 16000)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.warns(UserWarning, match=r"a\.mp3: the file is truncated"):
-        assert 0 < read_audio(path)[0].shape[-1] < 48000
+        samples = read_audio(path)[0].shape[-1]
+    with pytest.warns(UserWarning, match=r"a\.mp3: the file is truncated"):
+        assert scan_audio(path).samples == samples
+    assert 0 < samples < 48000
 
 
 BAD_SIGNALS: dict[str, tuple[np.ndarray, int]] = {
@@ -72,9 +85,12 @@ def test_a_bad_file_is_named_first(tmp_path: Path, kind: str) -> None:
         path.write_text("This is no recording.\n")
     elif kind in BAD_SIGNALS:
         soundfile.write(path, *BAD_SIGNALS[kind], subtype="FLOAT")
-    with pytest.raises(ValueError, match=f"^{path}: ") as caught:
-        read_audio(path)
-    assert "\n" not in str(caught.value)
+    messages = set()
+    for read in (read_audio, scan_audio):
+        with pytest.raises(ValueError, match=f"^{path}: ") as caught:
+            read(path)
+        messages.add(str(caught.value))
+    assert len(messages) == 1 and "\n" not in messages.pop()
 
 
 @pytest.mark.parametrize(
@@ -95,19 +111,16 @@ def test_what_cannot_be_written_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failing_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_write_leaves_the_old_file(tmp_path: Path) -> None:
     path, old = tmp_path / "a.wav", torch.full((1, 10), 0.5)
     write_audio(path, old, 16000)
 
-    def write_half(file: Path, *_: object) -> None:
-        file.write_bytes(b"RIFF")
+    def parts() -> Iterator[Tensor]:
+        yield torch.rand(1, 5)
         raise OSError("disk full")
 
-    monkeypatch.setattr(scipy.io.wavfile, "write", write_half)
     with pytest.raises(ValueError, match="disk full"):
-        write_audio(path, torch.rand(1, 10), 16000)
+        write_parts(path, parts(), 1, 10, 16000)
     assert list(tmp_path.iterdir()) == [path] and torch.equal(read_audio(path)[0], old)
 
 
@@ -128,3 +141,30 @@ def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
     (tmp_path / "x.flac").write_bytes(encode_flac(signal, 16000))
     samples, rate = read_audio(tmp_path / "x.flac")
     assert rate == 16000 and float((samples[0] - signal).abs().max()) <= 2**-15
+
+
+def test_parts_of_a_recording_are_read_and_written_as_the_whole_one(tmp_path: Path) -> None:
+    samples = torch.randn(2, 5000, generator=torch.Generator().manual_seed(0))
+    write_audio(tmp_path / "whole.wav", samples, 16000)
+    recording = scan_audio(tmp_path / "whole.wav")
+    assert (recording.channels, recording.samples, recording.sample_rate) == (2, 5000, 16000)
+    assert recording.power == pytest.approx(float(samples.square().mean()), rel=1e-5)
+    bounds = [(0, 2000), (1500, 3000), (3000, 5000)]
+    parts = list(read_parts(recording, bounds))
+    for part, (start, stop) in zip(parts, bounds, strict=True):
+        assert torch.equal(part, samples[:, start:stop])
+    consecutive = [parts[0][:, :1500], *parts[1:]]
+    write_parts(tmp_path / "parts.wav", consecutive, 2, 5000, 16000)
+    expected = (tmp_path / "whole.wav").read_bytes()
+    assert (tmp_path / "parts.wav").read_bytes() == expected
+    scipy.io.wavfile.write(tmp_path / "scipy.wav", 16000, samples.mT.numpy())
+    assert (tmp_path / "scipy.wav").read_bytes() == expected
+
+
+def test_a_part_that_is_not_finite_leaves_no_file(tmp_path: Path) -> None:
+    parts = [torch.zeros(1, 10), torch.full((1, 10), math.nan)]
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        write_parts(tmp_path / "out.wav", parts, 1, 20, 16000)
+    with pytest.raises(ValueError, match="4 GB"):
+        write_parts(tmp_path / "out.wav", parts, 1, 2**30, 16000)
+    assert not list(tmp_path.iterdir())
