@@ -157,6 +157,36 @@ def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tens
     return tensor.to(dtype).expand(*batch, -1).reshape(-1, tensor.shape[-1])
 
 
+def differentiable_once(gradient: Tensor, message: str) -> Tensor:
+    """Return a gradient that raises an error if it is itself differentiated.
+
+    Args:
+        gradient: Result of a hand-written backward pass that is no exact derivative.
+        message: Text of the RuntimeError.
+
+    >>> differentiable_once(torch.ones(2), "no second derivative")
+    tensor([1., 1.])
+    """
+    result: Tensor = _DifferentiableOnce.apply(gradient, message)
+    return result
+
+
+class _DifferentiableOnce(torch.autograd.Function):
+    """Identity that raises RuntimeError in its backward pass."""
+
+    @staticmethod
+    def forward(gradient: Tensor, message: str) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, str], output: Tensor) -> None:
+        ctx.message = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        raise RuntimeError(ctx.message)
+
+
 def _constant(
     function: Callable[..., Any],
     arguments: tuple[Any, ...],

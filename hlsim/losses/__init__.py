@@ -2,7 +2,7 @@
 
 These words have one meaning in the whole package:
 
-- The *output* (``compensated``) is what an aid, a *compensator*, sends to the impaired ear.
+- The *output* is what an aid, a *compensator*, sends to the impaired ear.
 - The *perceived* signal is the output of a hearing-loss simulator: what the impaired ear makes of
   it. The *reference* is what it is compared with: clean speech, or what a normal ear perceives of
   it.

@@ -26,9 +26,6 @@ its power ``P``. It is above 0 wherever there is power, and so small in faint ba
 dominate the gradient.
 """
 
-import math
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -71,23 +68,8 @@ HIGHEST_PEAK = 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 MARGIN = 3.0
 """Excess of the level in dB that does not count as louder."""
 
-MAX_GRADIENT_RATIO = 6.0
-"""Gradients above this multiple of the item's 90th percentile are scaled down to it.
-
-The percentile is that of the sounding samples.
-"""
-
 FRAMES_PER_HOP = 3
 """Frames from one segment to the next; a segment is twice as long."""
-
-LIMITER_SECONDS = 0.005
-"""Length of the blocks whose gradients are scaled together."""
-
-SOUNDING = 1e-3
-"""Power of a block over that of the loudest one from which it counts as sounding."""
-
-LIMITER_SAMPLES = 4096
-"""Approximate number of samples from which the percentile of an item's gradients is taken."""
 
 SIGN_WEIGHT = 0.1
 """Weight of the term of the misalignment that tells a signal from its negative."""
@@ -155,111 +137,20 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
     return sums
 
 
-def peak_excess(compensated: Tensor) -> Tensor:
-    """Compute by how much samples exceed 120 dB SPL on average, as a multiple of that pressure.
+def peak_excess(output: Tensor) -> Tensor:
+    """Compute the mean over all samples of ``max(abs(x) / P - 1, 0)``.
+
+    P is ``HIGHEST_PEAK``, the pressure at 120 dB SPL, with which each sample is compared.
 
     Shape: (items, time) -> (items,).
 
     Args:
-        compensated: Output of an aid in pascals.
+        output: Output of an aid in pascals.
 
     >>> peak_excess(torch.full((1, 100), 2.0 * HIGHEST_PEAK))
     tensor([1.])
     """
-    return (compensated.abs() / HIGHEST_PEAK - 1.0).clamp_min(0.0).mean(-1)
-
-
-def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
-    """Return a waveform unchanged, and limit its gradient in the backward pass.
-
-    In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
-    times as large as that of all other samples, which then hardly affect the training step. The
-    gradient is therefore divided into blocks of 5 ms. The largest magnitude in a block may be six
-    times the usual magnitude of the item: the 90th percentile over its samples outside pauses. In
-    pauses, which are blocks of the waveform whose RMS is 30 dB or more below that of the loudest
-    block, it may be once the usual magnitude. Where it is larger, the whole block is scaled down to
-    the limit. Limiting single samples would give the gradient a non-zero mean, from which a
-    convolutional network learns an inaudible constant pressure. NaN in a gradient is passed on.
-
-    Shape: (..., time) -> (..., time).
-
-    Args:
-        compensated: Output of an aid.
-        sample_rate: Sample rate in Hz.
-
-    >>> samples = torch.randn(1, 1600, requires_grad=True)
-    >>> gradient = torch.ones(1, 1600)
-    >>> gradient[0, 800] = 1e6
-    >>> limit_gradient_spikes(samples, sample_rate=16000).backward(gradient)
-    >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
-    True
-    """
-    limited: Tensor = _GradientLimiter.apply(compensated, round(LIMITER_SECONDS * sample_rate))
-    return limited
-
-
-class _GradientLimiter(torch.autograd.Function):
-    """Identity whose gradient is limited, as ``limit_gradient_spikes`` describes."""
-
-    @staticmethod
-    def forward(waveform: Tensor, block: int) -> Tensor:
-        return waveform.view_as(waveform)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
-        waveform, ctx.block = inputs
-        ctx.save_for_backward(waveform)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (waveform,) = ctx.saved_tensors
-        time = gradient.shape[-1]
-        powers = _split(waveform, ctx.block).square().mean(-1)
-        sizes = _split(gradient.abs(), ctx.block)
-        sounding = powers >= SOUNDING * powers.amax(-1, keepdim=True)
-        # Samples behind the end of an item have no gradient, and are left out.
-        counted = sounding.unsqueeze(-1) & (sizes > 0.0)
-        candidates = torch.where(counted, sizes, math.nan).flatten(-2)
-        sample = candidates[..., :: max(1, time // LIMITER_SAMPLES)]
-        usual = sample.nanquantile(0.9, -1, keepdim=True).nan_to_num(nan=math.inf)
-        limit = usual * torch.where(sounding, MAX_GRADIENT_RATIO, 1.0)
-        factor = (limit / sizes.amax(-1)).clamp_max(1.0)
-
-        # Factors are linear between the edges of blocks, where the smaller one of both holds.
-        before = functional.pad(factor, (1, 0), value=1.0)
-        after = functional.pad(factor, (0, 1), value=1.0)
-        edges = torch.minimum(before, after)
-        ramp = (torch.arange(ctx.block, device=gradient.device) / ctx.block).to(edges)
-        factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp).flatten(-2)
-        limited: Tensor = _FirstDerivative.apply(gradient * factors[..., :time])
-        return limited, None
-
-
-class _FirstDerivative(torch.autograd.Function):
-    """Identity that raises RuntimeError if it is differentiated."""
-
-    @staticmethod
-    def forward(gradient: Tensor) -> Tensor:
-        return gradient.view_as(gradient)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        raise RuntimeError(
-            "the criteria 'coherent-bands', 'haspi' and 'hasqi' limit the gradient and have no "
-            "second derivative; use 'bands', 'paper' or a function"
-        )
-
-
-def _split(samples: Tensor, block: int) -> Tensor:
-    """Split into blocks, the last one filled with zeros.
-
-    Shape: (..., time) -> (..., blocks, block).
-    """
-    return functional.pad(samples, (0, -samples.shape[-1] % block)).unflatten(-1, (-1, block))
+    return (output.abs() / HIGHEST_PEAK - 1.0).clamp_min(0.0).mean(-1)
 
 
 def _average_segments(frames: Tensor) -> Tensor:

@@ -1,37 +1,210 @@
-"""Criteria of ``HearingLossLoss`` by name, and the weights of their parts.
+"""Criteria of ``HearingLossLoss``: one entry of a table and one function each.
 
-A criterion compares perceived speech with its reference. It has one or several *parts*, whose
-weighted sum is the loss.
+A criterion compares the output of an aid, or what an impaired ear perceives of it, with clean
+speech or with what a normal ear perceives of that. It has one or several *parts*, whose weighted
+sum is the loss. A new criterion is a function from a ``Comparison`` to its parts, and an entry in
+``CRITERIA``.
 """
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_weights
+from hlsim.dsp.resample import resample
 from hlsim.losses import coherent_bands, paper
+from hlsim.losses.frozen_simulator import Reference, check_shape
+from hlsim.losses.interaural import interaural_loss
+from hlsim.losses.score_loss import score_loss
+from hlsim.metrics.band_levels import band_level_loss
 
-CRITERIA: dict[str, Mapping[str, float]] = {
-    "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
-    "bands": {"band_levels": 1.0},
-    "paper": paper.DEFAULT_WEIGHTS,
-    "haspi": {"haspi": 1.0},
-    "hasqi": {"hasqi": 1.0},
-    "interaural": {"interaural": 1.0},
-}
-"""Parts of each criterion with their default weights."""
-
-Criterion = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
+CriterionLike = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
 """Name of a criterion, weights of several by name, or a function of perceived speech and reference.
 
 Shape of the function: (items, time) twice, in pascals -> (items,).
 """
 
 
+_SIGNALS = ("output", "limited_output", "clean", "perceived", "reference")
+"""Attributes of a ``Comparison`` that are signals."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Signals that a criterion compares. Shape of each: (items, time), in pascals.
+
+    Attributes:
+        output: Output of an aid.
+        limited_output: Output of an aid, whose gradient is limited in the backward pass if a
+            criterion of the loss limits it (``hlsim.losses.gradient_limit``).
+        clean: Clean speech.
+        perceived: Output of the simulator for ``limited_output`` and the impaired ears.
+        reference: Reference of the criterion, see ``Criterion.reference``.
+        ears: Thresholds of the impaired ear of each item in dB HL. Shape: (items, 8).
+        lengths: Number of samples of each item before padding.
+        sample_rate: Sample rate in Hz.
+    """
+
+    output: Tensor
+    limited_output: Tensor
+    clean: Tensor
+    perceived: Tensor
+    reference: Tensor
+    ears: Tensor
+    lengths: Sequence[int]
+    sample_rate: int
+
+    def without_padding(self, item: int) -> Comparison:
+        """Return the signals of one item, (1, time), cut to its length."""
+        length = self.lengths[item]
+        signals = {name: getattr(self, name)[item, None, :length] for name in _SIGNALS}
+        return replace(self, **signals, ears=self.ears[item, None], lengths=[length])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Criterion:
+    """Entry of the table of criteria.
+
+    Attributes:
+        weights: Default weight of each part by its name.
+        compute: Function that returns the parts by name, (items,) each.
+        reference: Signal with which perceived speech is compared; None for a criterion that
+            compares the output of the aid with clean speech.
+        limits_gradient: Whether spikes of the gradient with respect to the output are limited.
+        handles_padding: Whether ``compute`` takes account of ``Comparison.lengths``. Otherwise the
+            items of a padded batch are cut and compared one by one.
+        two_ears: Whether successive items are the left and the right ear of a listener.
+
+    >>> CRITERIA["interaural"].two_ears
+    True
+    """
+
+    weights: Mapping[str, float]
+    compute: Callable[[Comparison], dict[str, Tensor]]
+    reference: Reference | None
+    limits_gradient: bool = False
+    handles_padding: bool = False
+    two_ears: bool = False
+
+    def parts(self, comparison: Comparison) -> dict[str, Tensor]:
+        """Compute the parts of all items, (items,) each, without the padding after their ends."""
+        time = comparison.output.shape[-1]
+        is_padded = any(length < time for length in comparison.lengths)
+        if self.handles_padding or not is_padded:
+            return self.compute(comparison)
+        indices = range(len(comparison.lengths))
+        items = [self.compute(comparison.without_padding(item)) for item in indices]
+        return {part: torch.cat([item[part] for item in items]) for part in self.weights}
+
+
+def _coherent_bands(signals: Comparison) -> dict[str, Tensor]:
+    parts = coherent_bands.coherent_band_parts(
+        signals.perceived, signals.reference, signals.sample_rate
+    )
+    # The gradient of a sample above the limit is exact, so it is not limited.
+    return parts | {"peaks": coherent_bands.peak_excess(signals.output)}
+
+
+def _bands(signals: Comparison) -> dict[str, Tensor]:
+    difference = band_level_loss(signals.perceived, signals.reference, signals.sample_rate)
+    return {"band_levels": difference}
+
+
+def _paper(signals: Comparison) -> dict[str, Tensor]:
+    estimate = resample(signals.perceived, signals.sample_rate, NEURO_RATE)
+    return paper.paper_parts(estimate, resample(signals.reference, signals.sample_rate, NEURO_RATE))
+
+
+def _score(name: str, signals: Comparison) -> dict[str, Tensor]:
+    loss = score_loss(
+        name,
+        signals.limited_output,
+        signals.clean,
+        signals.ears,
+        signals.lengths,
+        signals.sample_rate,
+    )
+    return {name: loss}
+
+
+def _interaural(signals: Comparison) -> dict[str, Tensor]:
+    output = signals.limited_output.unflatten(0, (-1, 2))
+    clean = signals.clean.unflatten(0, (-1, 2))
+    changes = interaural_loss(output, clean, signals.sample_rate)
+    return {"interaural": changes.repeat_interleave(2)}
+
+
+CRITERIA = {
+    "coherent-bands": Criterion(
+        weights=coherent_bands.DEFAULT_WEIGHTS,
+        compute=_coherent_bands,
+        reference=Reference(is_fixed=True),
+        limits_gradient=True,
+    ),
+    "bands": Criterion(
+        weights={"band_levels": 1.0},
+        compute=_bands,
+        reference=Reference(is_fixed=True, normal_ear="simulator", bank_phase=False),
+    ),
+    "paper": Criterion(
+        weights=paper.DEFAULT_WEIGHTS,
+        compute=_paper,
+        reference=Reference("clean", normal_ear="simulator"),
+    ),
+    "haspi": Criterion(
+        weights={"haspi": 1.0},
+        compute=partial(_score, "haspi"),
+        reference=None,
+        limits_gradient=True,
+        handles_padding=True,
+    ),
+    "hasqi": Criterion(
+        weights={"hasqi": 1.0},
+        compute=partial(_score, "hasqi"),
+        reference=None,
+        limits_gradient=True,
+        handles_padding=True,
+    ),
+    "interaural": Criterion(
+        weights={"interaural": 1.0},
+        compute=_interaural,
+        reference=None,
+        handles_padding=True,
+        two_ears=True,
+    ),
+}
+"""Criteria by name."""
+
+
+def function_criterion(function: Callable[[Tensor, Tensor], Tensor]) -> Criterion:
+    """Return the criterion that calls a function of perceived speech and its reference.
+
+    Args:
+        function: Function, (items, time) twice in pascals -> (items,).
+
+    >>> list(function_criterion(lambda perceived, reference: perceived.mean(-1)).weights)
+    ['criterion']
+    """
+    return Criterion(
+        weights={"criterion": 1.0}, compute=partial(_call, function), reference=Reference()
+    )
+
+
+def _call(function: Callable[..., Any], signals: Comparison) -> dict[str, Tensor]:
+    value = function(signals.perceived, signals.reference)
+    return {"criterion": check_shape(value, "criterion", (len(signals.perceived),))}
+
+
 def read_criterion(
-    criterion: Criterion, weights: Mapping[str, float] | None = None
-) -> tuple[dict[str, float], dict[str, float]]:
+    criterion: CriterionLike, weights: Mapping[str, float] | None = None
+) -> tuple[dict[str, Criterion], dict[str, float]]:
     """Return the criteria of a loss, and the parts that they have, with their weights.
 
     Args:
@@ -40,28 +213,30 @@ def read_criterion(
             stands for the default weights of the criteria.
 
     Returns:
-        Weights above 0 under the names of criteria, with a function under the name ``criterion``;
-        and the weight of each part under its name, multiplied by the weight of its criterion.
+        Criteria by name that have a weight above 0, where a function has the name ``criterion``;
+        and the weight of each part by its name, multiplied by the weight of its criterion.
 
     Raises:
         ValueError: A criterion or a part is unknown, or a weight is negative or not finite.
 
-    >>> read_criterion({"bands": 0.5, "haspi": 2.0, "paper": 0.0})
-    ({'bands': 0.5, 'haspi': 2.0}, {'band_levels': 0.5, 'haspi': 2.0})
+    >>> criteria, weights = read_criterion({"bands": 0.5, "haspi": 2.0, "paper": 0.0})
+    >>> list(criteria), weights
+    (['bands', 'haspi'], {'band_levels': 0.5, 'haspi': 2.0})
     """
-    criteria = {"criterion": 1.0}
-    if not callable(criterion):
+    if callable(criterion):
+        scales = {"criterion": 1.0}
+        criteria = {"criterion": function_criterion(criterion)}
+    else:
         named = {criterion: 1.0} if isinstance(criterion, str) else criterion
-        known = check_weights(named, CRITERIA, "criteria")
-        criteria = {name: weight for name, weight in known.items() if weight}
+        scales = check_weights(named, CRITERIA, "criteria")
+        criteria = {name: CRITERIA[name] for name, scale in scales.items() if scale}
     defaults: dict[str, float] = {}
-    scales: dict[str, float] = {}
-    for name, scale in criteria.items():
-        parts = CRITERIA.get(name, {name: 1.0})
-        defaults |= parts
-        scales |= dict.fromkeys(parts, scale)
+    part_scales: dict[str, float] = {}
+    for name, entry in criteria.items():
+        defaults |= entry.weights
+        part_scales |= dict.fromkeys(entry.weights, scales[name])
     chosen = check_weights(defaults if weights is None else weights, defaults, "parts of the loss")
-    return criteria, {part: weight * scales[part] for part, weight in chosen.items()}
+    return criteria, {part: weight * part_scales[part] for part, weight in chosen.items()}
 
 
 def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,27 @@ from hlsim.torchtools import constant, flatten_items
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
+
+@dataclass(frozen=True)
+class Reference:
+    """Signal with which a criterion compares what an impaired ear perceives.
+
+    Attributes:
+        signal: Clean speech, or what a normal ear perceives of it.
+        is_fixed: Whether ``signal`` applies even if the user of the loss chose another one.
+        normal_ear: Normal ear of a simulator that emulates MSBG: ``"filter"``, one filter with
+            MSBG's response for normal ears and the phase of the impaired ear's filter bank, or
+            ``"simulator"``, the simulator itself at 0 dB HL.
+        bank_phase: Whether the reference gets the phase of MSBG's filter bank for the impaired ear,
+            if the simulator emulates MSBG.
+    """
+
+    signal: ReferenceName = "normal-hearing"
+    is_fixed: bool = False
+    normal_ear: Literal["filter", "simulator"] = "filter"
+    bank_phase: bool = True
+
+
 NormalEar = Callable[[Tensor], Tensor]
 """Function or module that returns what a normal ear perceives, (..., time) -> (..., time)."""
 
@@ -35,16 +57,16 @@ class FrozenSimulator:
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
         normal: Normal ear that belongs to the simulator. By default, the simulator at 0 dB HL.
-        reference: Reference of the criteria that have a choice: ``"clean"`` speech, or
-            ``"normal-hearing"``, what the normal ear perceives of it. By default, the criterion
-            ``"paper"`` takes clean speech.
+        choice: Reference of the criteria that have a choice: ``"clean"`` speech, or
+            ``"normal-hearing"``, what the normal ear perceives of it. By default, each criterion
+            has its own.
         checkpoint: Whether activations of the simulator are computed again in the backward pass
             instead of stored.
 
     Raises:
         ValueError: An argument is not as described.
 
-    >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, reference=None)
+    >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, choice=None)
     >>> frozen.simulator.training
     False
     """
@@ -55,7 +77,7 @@ class FrozenSimulator:
         sample_rate: int,
         full_scale_spl: float,
         normal: NormalEar | None,
-        reference: ReferenceName | None,
+        choice: ReferenceName | None,
         checkpoint: bool = False,
     ) -> None:
         model: Any = load_simulator(
@@ -68,7 +90,7 @@ class FrozenSimulator:
         self.normal = normal
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
-        self.choice = reference
+        self.choice = choice
         self._band_rate = 2.0 * getattr(model, "highest_frequency", math.inf)
         self._needs_exact_lengths = getattr(model, "needs_exact_lengths", False)
         self._has_bank_phase = normal is None and getattr(model, "emulates_msbg", False)
@@ -100,18 +122,18 @@ class FrozenSimulator:
             outputs.append(functional.pad(perceived, (0, time - int(end))))
         return torch.stack(outputs).reshape(*batch, time)
 
-    def reference(
+    def compute_reference(
         self,
-        criterion: str,
+        reference: Reference | None,
         clean: Tensor,
         thresholds: Tensor,
         batch: torch.Size,
         lengths: Tensor | None = None,
     ) -> Tensor:
-        """Compute the reference with which a criterion compares what the impaired ears perceive.
+        """Compute the signal with which a criterion compares what the impaired ears perceive.
 
         Args:
-            criterion: Name of the criterion.
+            reference: Kind of the signal; None stands for clean speech as it is.
             clean: Clean speech, (..., time).
             thresholds: Impaired ears in dB HL, (..., 8). Their severity selects the phase shift of
                 the reference (``hlsim.msbg.response``).
@@ -122,27 +144,32 @@ class FrozenSimulator:
             Clean speech, or what a normal ear perceives of it, (*batch, time).
         """
         shape = (*batch, clean.shape[-1])
+        if reference is None:
+            return clean.expand(shape)
         ears = thresholds[None]
         if thresholds.ndim > 1:
             ears = flatten_items(thresholds, batch, thresholds.dtype)
-        choice = self.choice or ("clean" if criterion == "paper" else "normal-hearing")
-        if criterion in ("coherent-bands", "bands"):
-            choice = "normal-hearing"
-        reference = clean = self._limit_band(clean)
-        if choice == "normal-hearing" and self.normal is not None:
-            reference = check_shape(self.normal(clean), "normal ear", clean.shape)
-        elif choice == "normal-hearing":
-            if self._has_bank_phase and criterion not in ("bands", "paper"):
-                items = flatten_items(clean, batch, clean.dtype)
-                return simulate_normal_ear(items, ears, self.sample_rate).reshape(shape)
-            cpu = torch.device("cpu")
-            no_loss = constant(np.zeros, len(FREQUENCIES), dtype=clean.dtype, device=cpu)
-            reference = self.simulate(clean, on_device(no_loss, clean.device), lengths)
-        if criterion == "bands" or not self._has_bank_phase:
-            return reference.expand(shape)
-        items = flatten_items(reference, batch, clean.dtype)
-        normal = choice == "normal-hearing"
-        return apply_bank_phase(items, ears, self.sample_rate, normal=normal).reshape(shape)
+        is_chosen = self.choice is not None and not reference.is_fixed
+        is_normal = (self.choice if is_chosen else reference.signal) == "normal-hearing"
+        target = self._limit_band(clean)
+        if is_normal and self._has_bank_phase and reference.normal_ear == "filter":
+            items = flatten_items(target, batch, clean.dtype)
+            return simulate_normal_ear(items, ears, self.sample_rate).reshape(shape)
+        if is_normal:
+            target = self._simulate_normal_ear(target, lengths)
+        if not (self._has_bank_phase and reference.bank_phase):
+            return target.expand(shape)
+        items = flatten_items(target, batch, clean.dtype)
+        return apply_bank_phase(items, ears, self.sample_rate, normal=is_normal).reshape(shape)
+
+    def _simulate_normal_ear(self, clean: Tensor, lengths: Tensor | None) -> Tensor:
+        """Compute what the normal ear perceives. Shape: (..., time) -> (..., time)."""
+        if self.normal is not None:
+            return check_shape(self.normal(clean), "normal ear", clean.shape)
+        # Thresholds whose values the CPU knows, so that it need not wait for a GPU.
+        cpu = torch.device("cpu")
+        no_loss = constant(np.zeros, len(FREQUENCIES), dtype=clean.dtype, device=cpu)
+        return self.simulate(clean, on_device(no_loss, clean.device), lengths)
 
     def _limit_band(self, clean: Tensor) -> Tensor:
         """Remove the frequencies above those that the simulator returns."""

@@ -23,14 +23,9 @@ from hlsim.checks import (
     check_waveform,
     silence_after,
 )
-from hlsim.dsp.resample import resample
-from hlsim.losses import coherent_bands
-from hlsim.losses.criteria import Criterion, read_criterion, weighted_sum
-from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceName, check_shape
-from hlsim.losses.interaural import interaural_loss
-from hlsim.losses.paper import paper_parts
-from hlsim.losses.score_loss import SCORES, score_loss
-from hlsim.metrics.band_levels import band_level_loss
+from hlsim.losses.criteria import Comparison, CriterionLike, read_criterion, weighted_sum
+from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, Reference, ReferenceName
+from hlsim.losses.gradient_limit import limit_gradient_spikes
 from hlsim.torchtools import flatten_items, not_compiled
 
 _Reduction = Literal["mean", "none"]
@@ -60,12 +55,12 @@ class _Unregistered(NamedTuple):
 class HearingLossLoss(nn.Module):
     """Difference between what an impaired ear and what a normal ear perceives.
 
-    The impaired ear perceives compensated speech, the output of an aid, and the normal ear clean
-    speech. A simulator computes both. It is frozen: it stays in eval mode and has no trainable
-    parameter, but gradients pass through it to the compensated speech. It is not registered as a
-    submodule, so that the parameters and the state dict of a module that holds this loss do not
-    include it. It moves with ``.to()`` all the same. Use ``DistributedDataParallel`` instead of
-    ``nn.DataParallel``, because all threads of a process share one simulator.
+    The impaired ear perceives the output of an aid, and the normal ear clean speech. A simulator
+    computes both. It is frozen: it stays in eval mode and has no trainable parameter, but gradients
+    pass through it to the output of the aid. It is not registered as a submodule, so that the
+    parameters and the state dict of a module that holds this loss do not include it. It moves with
+    ``.to()`` all the same. Use ``DistributedDataParallel`` instead of ``nn.DataParallel``, because
+    all threads of a process share one simulator.
 
     The level is not normalised: 65 dB SPL is an RMS of 0.035 at the default ``full_scale_spl``. NaN
     and infinity are not rejected, so that a gradient scaler can detect them. They make the value of
@@ -82,7 +77,7 @@ class HearingLossLoss(nn.Module):
     - ``"bands"``: levels in bands (``hlsim.metrics.band_levels``)
     - ``"paper"``: Equations 2 to 9 of the Neuro-MSBG paper, which are not balanced between ears and
       levels (``hlsim.losses.paper``)
-    - ``"haspi"`` and ``"hasqi"``: 1 minus the score of the compensated speech
+    - ``"haspi"`` and ``"hasqi"``: 1 minus the score of the output
       (``hlsim.losses.score_loss``). They do not penalise loudness, so combine them with another
       criterion.
     - ``"interaural"``: change of the differences between the ears of a listener
@@ -152,7 +147,7 @@ class HearingLossLoss(nn.Module):
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
         reference: ReferenceName | None = None,
-        criterion: Criterion = "coherent-bands",
+        criterion: CriterionLike = "coherent-bands",
         weights: Mapping[str, float] | None = None,
         reduction: _Reduction = "mean",
         normal: NormalEar | None = None,
@@ -183,7 +178,7 @@ class HearingLossLoss(nn.Module):
 
     def forward(
         self,
-        compensated: Tensor,
+        output: Tensor,
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
@@ -191,7 +186,7 @@ class HearingLossLoss(nn.Module):
         """Compute the loss.
 
         Args:
-            compensated: Output of the compensator.
+            output: Output of an aid.
             clean: Clean speech.
             audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions; by
                 default the ears of the constructor. With (batch, 1, time), (batch, 8) is accepted,
@@ -209,13 +204,13 @@ class HearingLossLoss(nn.Module):
                 normal ear or criterion returns another shape than it should, or, with ``"haspi"``
                 or ``"hasqi"``, an item is shorter than 0.7 s.
         """
-        parts = self.parts(compensated, clean, audiogram, lengths)
+        parts = self.parts(output, clean, audiogram, lengths)
         return weighted_sum(parts, self.weights)
 
     @not_compiled
     def parts(
         self,
-        compensated: Tensor,
+        output: Tensor,
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
@@ -231,7 +226,7 @@ class HearingLossLoss(nn.Module):
             for ``"paper"`` magnitude, phase, complex and time. Other criteria have one part of
             their own name, and a function has the part ``"criterion"``.
         """
-        call = self._prepare(compensated, clean, audiogram, lengths)
+        call = self._prepare(output, clean, audiogram, lengths)
         with torch.autocast(clean.device.type, enabled=False):
             parts = self._compare(*call)
         if self.ears == "better":
@@ -245,7 +240,7 @@ class HearingLossLoss(nn.Module):
     @not_compiled
     def heard(
         self,
-        compensated: Tensor,
+        output: Tensor,
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
@@ -261,19 +256,17 @@ class HearingLossLoss(nn.Module):
             of the ears.
 
         Returns:
-            The compensated speech as the impaired ear perceives it, and its reference: the clean
-            speech as a normal ear perceives it or, with ``reference="clean"``, as it is.
+            The output as the impaired ear perceives it, and its reference: the clean speech as a
+            normal ear perceives it or, with ``reference="clean"``, as it is.
         """
-        output, clean, ears, ends = self._prepare(compensated, clean, audiogram, lengths)
+        output, clean, ears, ends = self._prepare(output, clean, audiogram, lengths)
         with torch.autocast(clean.device.type, enabled=False):
             perceived = self._frozen.simulate(output, ears, ends)
             batch = perceived.shape[:-1]
-            reference = self._frozen.reference("criterion", clean, ears, batch, ends)
+            reference = self._frozen.compute_reference(Reference(), clean, ears, batch, ends)
             if ends is not None:
-                perceived, reference = (
-                    silence_after(perceived, ends),
-                    silence_after(reference, ends),
-                )
+                perceived = silence_after(perceived, ends)
+                reference = silence_after(reference, ends)
             gain = gain_to_pascals(self.full_scale_spl)
             return perceived * gain, reference * gain
 
@@ -283,7 +276,7 @@ class HearingLossLoss(nn.Module):
 
     def _prepare(
         self,
-        compensated: Tensor,
+        output: Tensor,
         clean: Tensor,
         audiogram: AudiogramLike | None,
         lengths: Lengths | None,
@@ -294,34 +287,37 @@ class HearingLossLoss(nn.Module):
             The output and the clean speech, silent after the end of each item; thresholds in dB HL;
             and the number of samples of each item, or None if all are as long as the batch.
         """
-        check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
+        check_waveform(output, "output", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
-        if compensated.shape != clean.shape:
+        if output.shape != clean.shape:
             raise ValueError(
-                "expected compensated and clean with the same shape, "
-                f"got {tuple(compensated.shape)} and {tuple(clean.shape)}"
+                "expected output and clean with the same shape, "
+                f"got {tuple(output.shape)} and {tuple(clean.shape)}"
             )
         stored = self._unregistered.thresholds
         ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)
-        if self.ears == "better" or "interaural" in self.criteria:
+        if self.ears == "better" or any(entry.two_ears for entry in self.criteria.values()):
             check_two_channels(clean)
-        dtype = torch.promote_types(torch.result_type(compensated, clean), torch.float32)
-        compensated, clean = compensated.to(dtype), clean.to(dtype)
+        dtype = torch.promote_types(torch.result_type(output, clean), torch.float32)
+        output, clean = output.to(dtype), clean.to(dtype)
         ends = None if lengths is None else check_lengths(lengths, clean.shape)
         if ends is None or bool((ends == clean.shape[-1]).all()):
-            return compensated, clean, ears, None
-        return silence_after(compensated, ends), silence_after(clean, ends), ears, ends
+            return output, clean, ears, None
+        return silence_after(output, ends), silence_after(clean, ends), ears, ends
 
     def _compare(
         self, output: Tensor, clean: Tensor, ears: Tensor, lengths: Tensor | None
     ) -> dict[str, Tensor]:
-        """Compute the parts of the loss for each item, each in the shape of the leading dimensions.
+        """Compute the parts of the loss for each item.
 
         The arguments are the results of ``_prepare``.
+
+        Returns:
+            One tensor per part, of the shape of the leading dimensions.
         """
         limited = output
-        if {"coherent-bands", *SCORES} & self.criteria.keys():
-            limited = coherent_bands.limit_gradient_spikes(output, self.sample_rate)
+        if any(criterion.limits_gradient for criterion in self.criteria.values()):
+            limited = limit_gradient_spikes(output, self.sample_rate)
         perceived = self._frozen.simulate(limited, ears, lengths)
         batch, time = perceived.shape[:-1], perceived.shape[-1]
         gain = gain_to_pascals(self.full_scale_spl)
@@ -330,53 +326,23 @@ class HearingLossLoss(nn.Module):
             """Return a waveform in pascals, (items, time)."""
             return waveform.expand_as(perceived).reshape(-1, time) * gain
 
-        aided, target = as_items(limited), as_items(clean)
-        item_ears = flatten_items(ears, batch, ears.dtype)
-        ends = [time] * len(aided) if lengths is None else lengths.expand(batch).flatten().tolist()
+        ends = torch.tensor(time) if lengths is None else lengths
+        signals: dict[str, Any] = {
+            "output": as_items(output),
+            "limited_output": as_items(limited),
+            "clean": as_items(clean),
+            "perceived": as_items(perceived),
+            "ears": flatten_items(ears, batch, ears.dtype),
+            "lengths": ends.expand(batch).flatten().tolist(),
+            "sample_rate": self.sample_rate,
+        }
         parts: dict[str, Tensor] = {}
-        for name in self.criteria:
-            if name in SCORES:
-                parts[name] = score_loss(name, aided, target, item_ears, ends, self.sample_rate)
-            elif name == "interaural":
-                shape = perceived.shape
-                changes = interaural_loss(aided.view(shape), target.view(shape), self.sample_rate)
-                parts[name] = changes.unsqueeze(-1).expand(batch)
-            else:
-                reference = self._frozen.reference(name, clean, ears, batch, lengths)
-                signals = [as_items(waveform) for waveform in (perceived, reference, output)]
-                parts |= self._compare_perceived(name, signals, None if lengths is None else ends)
+        for criterion in self.criteria.values():
+            reference = self._frozen.compute_reference(
+                criterion.reference, clean, ears, batch, lengths
+            )
+            parts |= criterion.parts(Comparison(**signals, reference=as_items(reference)))
         return {name: part.reshape(batch) for name, part in parts.items()}
-
-    def _compare_perceived(
-        self, name: str, signals: list[Tensor], ends: list[int] | None = None
-    ) -> dict[str, Tensor]:
-        """Compute the parts of a criterion that compares what is perceived.
-
-        Args:
-            name: Name of the criterion.
-            signals: The perceived signal, the reference and the output, (items, time) in pascals.
-            ends: Number of samples of each item, or None if all are as long as the batch.
-
-        Returns:
-            Parts, each under its name, (items,) each.
-        """
-        if ends is not None:
-            items = []
-            for item, end in enumerate(ends):
-                alone = [signal[item, None, :end] for signal in signals]
-                items.append(self._compare_perceived(name, alone))
-            return {part: torch.cat([item[part] for item in items]) for part in items[0]}
-        perceived, reference, output = signals
-        if name == "coherent-bands":
-            parts = coherent_bands.coherent_band_parts(perceived, reference, self.sample_rate)
-            return parts | {"peaks": coherent_bands.peak_excess(output)}
-        if name == "bands":
-            return {"band_levels": band_level_loss(perceived, reference, self.sample_rate)}
-        if name == "paper":
-            estimate = resample(perceived, self.sample_rate, NEURO_RATE)
-            return paper_parts(estimate, resample(reference, self.sample_rate, NEURO_RATE))
-        value = self._unregistered.criterion(perceived, reference)
-        return {name: check_shape(value, "criterion", (len(perceived),))}
 
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move modules that are not registered along with the loss, but not to half precision."""
@@ -406,7 +372,7 @@ class HASPILoss(HearingLossLoss):
     ``noise="expected"``, which makes them deterministic. An item whose clean speech is inaudible
     has a HASPI term of 0.
 
-    It is called as ``loss(compensated, clean, audiogram=None, lengths=None)``, with waveforms of
+    It is called as ``loss(output, clean, audiogram=None, lengths=None)``, with waveforms of
     shape (..., time) in pascals, and returns a scalar; ``HearingLossLoss`` describes the details.
     Items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. A step costs about 10
     times that of the default loss, with HASQI 23 times.

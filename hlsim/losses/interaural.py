@@ -10,7 +10,7 @@ HALF_WEIGHT_RATIO = 1e-4
 """Power of an octave relative to the loudest octave at which the octave has half its weight."""
 
 
-def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
+def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
     """Compute how much an aid changes the differences between the ears, as a loss for training.
 
     Gains and delays that are equal in both ears are ignored. The loss of an octave is the error of
@@ -19,7 +19,7 @@ def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tenso
     less weight.
 
     Args:
-        processed: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).
+        output: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).
         clean: Clean speech at the left and the right ear in Pa. Shape: (..., 2, time).
         sample_rate: Sample rate in Hz.
 
@@ -30,7 +30,7 @@ def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tenso
     >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)
     True
     """
-    left, right, cross, octaves = spectra_of_ears(processed, sample_rate)
+    left, right, cross, octaves = spectra_of_ears(output, sample_rate)
     clean_left, clean_right, clean_cross, _ = spectra_of_ears(clean, sample_rate)
     left_level = torch.log10(left @ octaves + POWER_FLOOR)
     right_level = torch.log10(right @ octaves + POWER_FLOOR)

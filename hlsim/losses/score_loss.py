@@ -18,10 +18,10 @@ SCORES: dict[str, Callable[..., Tensor]] = {"haspi": haspi, "hasqi": hasqi}
 
 def score_loss(
     name: str,
-    processed: Tensor,
+    output: Tensor,
     clean: Tensor,
     ears: Tensor,
-    ends: Sequence[int],
+    lengths: Sequence[int],
     sample_rate: int,
 ) -> Tensor:
     """Compute 1 minus the score of each item, for training.
@@ -29,14 +29,14 @@ def score_loss(
     The ear's internal noise has no random effect (``noise="expected"``), so the loss is smooth. An
     item has no meaningful score if its clean signal is silent, below 20 dB SPL, only as long as a
     click, or for HASPI below the threshold of hearing: the loss of this item is 0 and has no
-    gradient. An item with NaN or infinity in ``processed`` has the loss NaN.
+    gradient. An item with NaN or infinity in ``output`` has the loss NaN.
 
     Args:
         name: Name of the score, ``"haspi"`` or ``"hasqi"``.
-        processed: Output of the compensator in pascals. Shape: (items, time).
+        output: Output of an aid in pascals. Shape: (items, time).
         clean: Clean speech in pascals, for which no gradient is computed. Shape: (items, time).
         ears: Thresholds of the impaired ear of each item in dB HL. Shape: (items, 8).
-        ends: Number of samples of each item before padding.
+        lengths: Number of samples of each item before padding.
         sample_rate: Sample rate in Hz.
 
     Returns:
@@ -50,11 +50,11 @@ def score_loss(
     >>> bool(loss < 0.2)
     True
     """
-    finite = processed.detach().isfinite().all(-1)
-    processed = torch.where(finite.unsqueeze(-1), processed, 0.0)
-    scores = scores_or_errors(SCORES[name], processed, clean, ears, ends, sample_rate=sample_rate)
+    finite = output.detach().isfinite().all(-1)
+    output = torch.where(finite.unsqueeze(-1), output, 0.0)
+    scores = scores_or_errors(SCORES[name], output, clean, ears, lengths, sample_rate=sample_rate)
     losses = []
-    for score, signal in zip(scores, processed, strict=True):
+    for score, signal in zip(scores, output, strict=True):
         if isinstance(score, Tensor):
             losses.append(1.0 - score)
         elif isinstance(score, UnscorableError):

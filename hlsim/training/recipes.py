@@ -7,10 +7,13 @@ import.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 _SHARES = ("sounds", "equalised", "noisy", "babble", "unreduced")
 """Settings from 0 to 1."""
+
+_NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
+"""Criteria that train the noise reduction of a hearing aid, and nothing else."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +59,10 @@ class TrainingRecipe:
     validation_items: int = 48
     seed: int = 0
 
-    criteria: ClassVar[tuple[str, ...]]
+    @classmethod
+    def criteria(cls) -> tuple[str, ...]:
+        """Return the names of the criteria that ``weights`` may contain."""
+        raise NotImplementedError
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "validate_every", "validation_items"):
@@ -66,9 +72,10 @@ class TrainingRecipe:
         self._require("seed", abs(self.seed) < 2**32, "a whole number below 2**32 in magnitude")
         for name in _SHARES:
             self._require(name, 0.0 <= getattr(self, name, 0.0) <= 1.0, "a share from 0 to 1")
+        criteria = self.criteria()
         for name, weight in self.weights.items():
-            expected = f"weights of 0 or more of {', '.join(self.criteria)}"
-            self._require("weights", name in self.criteria and weight >= 0.0, expected)
+            expected = f"weights of 0 or more of {', '.join(criteria)}"
+            self._require("weights", name in criteria and weight >= 0.0, expected)
         self._require("weights", any(self.weights.values()), "at least one weight above 0")
 
     def _require(self, name: str, is_valid: bool, expected: str) -> None:
@@ -109,7 +116,9 @@ class SimulatorRecipe(TrainingRecipe):
     precision: Literal["float32", "bfloat16"] = "float32"
     average: float = 0.99
 
-    criteria = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
+    @classmethod
+    def criteria(cls) -> tuple[str, ...]:
+        return ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,9 +137,9 @@ class CompensatorRecipe(TrainingRecipe):
         model: Settings of ``MappingConfig`` or ``HearingAidConfig``.
         weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
             ``hasqi``, ``denoising`` and ``intelligibility``. The first five are those of
-            ``HearingLossLoss``; ``haspi`` and ``hasqi`` (1 - score) require clips of 0.7 s or more.
-            The last two train a hearing aid's noise reduction alone, and the others its
-            amplification alone: ``denoising`` is the error of the gains of noise reduction,
+            ``HearingLossLoss`` for one ear; ``haspi`` and ``hasqi`` (1 - score) require clips of
+            0.7 s or more. The last two train a hearing aid's noise reduction alone, and the others
+            its amplification alone: ``denoising`` is the error of the gains of noise reduction,
             ``intelligibility`` is 1 - HASPI at equal level.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
             them, a network learns that steady sounds are noise.
@@ -162,15 +171,12 @@ class CompensatorRecipe(TrainingRecipe):
     validate_every: int = 50
     validation_items: int = 8
 
-    criteria = (
-        "coherent-bands",
-        "bands",
-        "paper",
-        "haspi",
-        "hasqi",
-        "denoising",
-        "intelligibility",
-    )
+    @classmethod
+    def criteria(cls) -> tuple[str, ...]:
+        from hlsim.losses.criteria import CRITERIA  # imports torch
+
+        names = (name for name, criterion in CRITERIA.items() if not criterion.two_ears)
+        return (*names, *_NOISE_REDUCTION_CRITERIA)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -186,4 +192,4 @@ class CompensatorRecipe(TrainingRecipe):
         >>> CompensatorRecipe().trains_noise_reduction()
         False
         """
-        return bool(self.weights.get("denoising") or self.weights.get("intelligibility"))
+        return any(self.weights.get(name) for name in _NOISE_REDUCTION_CRITERIA)

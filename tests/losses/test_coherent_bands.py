@@ -13,11 +13,10 @@ from hlsim.losses.coherent_bands import (
     DEFAULT_WEIGHTS,
     KNEE,
     MARGIN,
-    MAX_GRADIENT_RATIO,
     coherent_band_parts,
-    limit_gradient_spikes,
 )
 from hlsim.losses.criteria import weighted_sum
+from hlsim.losses.gradient_limit import MAX_GRADIENT_RATIO, limit_gradient_spikes
 from tests.losses.signals import RATE, add_noise, excerpt, filter_by_gain, frequencies
 
 

@@ -16,14 +16,16 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, Listener, NeuroMSBG, load_pr
 from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
 from hlsim.losses.coherent_bands import coherent_band_parts
-from hlsim.losses.criteria import CRITERIA
+from hlsim.losses.criteria import CRITERIA, Comparison, Criterion
+from hlsim.losses.frozen_simulator import Reference
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics.band_levels import band_level_loss
 from hlsim.msbg.response import apply_bank_phase
+from hlsim.training.recipes import CompensatorRecipe
 from tests.losses.signals import add_noise, excerpt, gain_slope
 
 SIMULATORS = {"neuro-msbg": NeuroMSBG, "msbg": MSBG}
-WEIGHTS = {name: CRITERIA[name] for name in ("coherent-bands", "paper", "bands")}
+WEIGHTS = {name: CRITERIA[name].weights for name in ("coherent-bands", "paper", "bands")}
 NH, N2, N3, N4, S2 = (Audiogram.standard(name) for name in ("NH", "N2", "N3", "N4", "S2"))
 
 each_simulator = pytest.mark.parametrize("simulator", SIMULATORS)
@@ -312,6 +314,30 @@ def test_several_criteria_share_one_simulation(clean: Tensor) -> None:
     close(value, expected)
     unweighted = HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.0})
     assert list(unweighted.criteria) == ["coherent-bands"]
+
+
+def test_new_criterion_is_one_entry_and_one_function(
+    clean: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compare_powers(signals: Comparison) -> dict[str, Tensor]:
+        powers = [wave.square().mean(-1) for wave in (signals.perceived, signals.reference)]
+        return {"softer": (powers[1] - powers[0]).relu(), "louder": (powers[0] - powers[1]).relu()}
+
+    entry = Criterion(
+        weights={"softer": 1.0, "louder": 2.0}, compute=compare_powers, reference=Reference()
+    )
+    monkeypatch.setitem(CRITERIA, "power", entry)
+    assert "power" in CompensatorRecipe(weights={"power": 1.0}).criteria()
+    loss = HearingLossLoss([N3, S2], criterion="power", reduction="none")
+    output = (30.0 * clean).requires_grad_()
+    value = loss(output, clean, lengths=[4800, 3000])
+    assert bool(torch.autograd.grad(value.sum(), output)[0].any())
+    perceived, reference = loss.heard(output[1, :3000], clean[1, :3000], S2)
+    change = perceived.square().mean() - reference.square().mean()
+    close(value[1], torch.maximum(2.0 * change, -change))
+    with_bands = HearingLossLoss([N3, S2], criterion={"power": 0.5, "bands": 1.0})
+    bands = HearingLossLoss([N3, S2], criterion="bands")(output, clean)
+    close(with_bands(output, clean), 0.5 * loss(output, clean).mean() + bands)
 
 
 @each_criterion
