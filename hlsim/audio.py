@@ -6,6 +6,7 @@ Recordings of any length are read by ``scan_audio`` and ``read_parts``, and writ
 
 import io
 import math
+import os
 import struct
 import warnings
 from collections.abc import Iterable, Iterator
@@ -34,6 +35,9 @@ _LARGEST_SIZE = 2**32 - 1
 
 _HEADER = struct.Struct("<4sI4s4sIHHIIHHH4sII4sI")
 """Header of a WAV file in 32-bit float: the chunks RIFF, fmt and fact, and the head of data."""
+
+_OTHER_EXTENSIONS = (".m4a", ".aac", ".wma", ".amr", ".ape", ".wv", ".shn")
+"""Extensions of audio files that libsndfile does not read."""
 
 
 def read_audio(path: str | Path) -> tuple[Tensor, int]:
@@ -202,8 +206,6 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     if samples.ndim > 2:
         shape = tuple(samples.shape)
         raise ValueError(f"{path}: expected shape (channels, time) or (time,), got {shape}")
-    if not bool(samples.isfinite().all()):
-        raise ValueError(f"{path}: some samples are NaN or infinite; nothing was written")
     rate = check_rate(sample_rate)
     channels, time = samples.shape
     write_parts(path, [samples], channels, time, rate)
@@ -248,10 +250,17 @@ def write_parts(
     )
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(header)
+        written = 0
         for part in parts:
-            values = part.detach().to("cpu", torch.float32)
-            if not bool(values.isfinite().all()):
-                raise ValueError(f"{path}: some samples are NaN or infinite; nothing was written")
+            values = part.detach().to("cpu", torch.float32).resolve_neg()
+            invalid_times = values.isfinite().logical_not().any(0).nonzero()
+            if len(invalid_times):
+                seconds = (written + int(invalid_times[0])) / rate
+                raise ValueError(
+                    f"{path}: nothing was written, because the sample at {seconds:.3f} s is NaN or "
+                    "infinite; correct the signal before it is written"
+                )
+            written += values.shape[-1]
             file.write(values.mT.contiguous().numpy().astype("<f4", copy=False).tobytes())
 
 
@@ -269,7 +278,7 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     b'fLaC'
     """
     data = io.BytesIO()
-    samples = waveform.detach().cpu().float().numpy()
+    samples = waveform.detach().cpu().float().resolve_neg().numpy()
     soundfile.write(data, samples.T, sample_rate, format="FLAC", subtype="PCM_16")
     return data.getvalue()
 
@@ -277,27 +286,66 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
 def find_audio(folder: str | Path) -> list[Path]:
     """Find all audio files in a folder and its subfolders, except hidden ones, sorted by path.
 
+    Links to files and folders are followed, except for a link to a folder that contains it, whose
+    files are found without it. Audio in formats that libsndfile does not read, such as M4A, causes
+    a warning.
+
     Args:
         folder: Folder to search.
 
     Raises:
-        ValueError: There is no such folder, or no audio in it.
+        ValueError: There is no such folder, a folder in it cannot be read, there is no audio in it,
+            or a link in it leads nowhere.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> [path.name for path in find_audio(EXAMPLE_FILE.parent)][:1]
     ['espeak-scotland-m7-01.flac']
     """
-    root = Path(folder)
-    if not root.is_dir():
+    if not Path(folder).is_dir():
         raise ValueError(f"{folder}: there is no such folder; correct the path")
-    files = [
-        path
-        for path in sorted(root.rglob("*"))
-        if path.suffix.lower() in EXTENSIONS
-        and path.is_file()
-        and "/." not in f"/{path.relative_to(root).as_posix()}"
-    ]
+    files, broken_links, unreadable_files = [], [], []
+    try:
+        for entry in _visible_files(os.fspath(folder), {os.path.realpath(folder)}):
+            extension = os.path.splitext(entry.name)[1].lower()
+            if extension in ("", *EXTENSIONS) and not os.path.exists(entry.path):
+                broken_links.append(entry.path)
+            elif extension in EXTENSIONS and entry.is_file():
+                files.append(Path(entry.path))
+            elif extension in _OTHER_EXTENSIONS:
+                unreadable_files.append(entry.path)
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be searched for audio: {error}") from error
+    if broken_links:
+        raise ValueError(
+            f"{folder}: {len(broken_links)} links lead to files that do not exist, such as "
+            f"{min(broken_links)}; fetch the files, or remove the links"
+        )
+    if unreadable_files:
+        warnings.warn(
+            f"{folder}: {len(unreadable_files)} files are left out because libsndfile does not read"
+            f" their format, such as {min(unreadable_files)}; convert them to FLAC or WAV",
+            stacklevel=2,
+        )
     if not files:
         extensions = ", ".join(EXTENSIONS)
         raise ValueError(f"{folder}: no audio in it; expected files ending in {extensions}")
-    return files
+    return sorted(files)
+
+
+def _visible_files(folder: str, parents: set[str]) -> Iterator[os.DirEntry[str]]:
+    """Yield everything in a folder and its subfolders that is neither hidden nor a folder.
+
+    Args:
+        folder: Folder to search.
+        parents: Real paths of the folder and of those that lead to it, which are not entered again.
+    """
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            if not entry.is_dir():
+                yield entry
+                continue
+            real_path = os.path.realpath(entry.path)
+            if real_path not in parents:
+                yield from _visible_files(entry.path, {*parents, real_path})

@@ -17,8 +17,8 @@ from pathlib import Path
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Write a file all at once, from a ``with`` block that writes to a temporary path.
 
-    When the block ends, the temporary file replaces ``path``. If the block raises, ``path`` stays
-    as it was.
+    When the block ends, the temporary file replaces ``path``, or the file to which it links. If the
+    block raises, ``path`` stays as it was.
 
     Args:
         path: File to write. Its folder is made if there is none.
@@ -35,13 +35,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     ...     Path(f"{folder}/scores.csv").read_text()
     'haspi'
     """
-    path = Path(path)
+    target = Path(os.path.realpath(path))
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".hlsim-", dir=path.parent) as folder:
-            temporary = Path(folder) / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".hlsim-", dir=target.parent) as folder:
+            temporary = Path(folder) / Path(path).name
             yield temporary
-            os.replace(temporary, path)
+            os.replace(temporary, target)
     except OSError as error:
         raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -67,7 +67,9 @@ def write_atomically(path: str | Path, data: str | bytes) -> None:
 
 
 def path_below(root: str | Path, name: str) -> Path:
-    """Return the path of a file that a manifest names, with links resolved.
+    """Return the absolute path of a file that a manifest names, without ``..``.
+
+    Links below the folder may lead out of it, as in corpora whose files are stored elsewhere.
 
     Args:
         root: Folder that contains all files of the manifest.
@@ -79,9 +81,11 @@ def path_below(root: str | Path, name: str) -> Path:
     >>> path_below("/corpus", "clean/../1.wav").as_posix()
     '/corpus/1.wav'
     """
-    folder = os.path.realpath(root)
-    path = Path(os.path.realpath(os.path.join(folder, name)))
-    if not name or not path.is_relative_to(folder):
+    if not name:
+        raise ValueError(f"expected the path of a file below {root}, got none; fill it in")
+    folder = os.path.abspath(root)
+    path = Path(os.path.normpath(os.path.join(folder, name)))
+    if not path.is_relative_to(folder):
         raise ValueError(
             f"expected the path of a file below {root}, got {name!r}; move the file there, or pass "
             "the folder that contains all files as root"

@@ -168,3 +168,45 @@ def test_a_part_that_is_not_finite_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="4 GB"):
         write_parts(tmp_path / "out.wav", parts, 1, 2**30, 16000)
     assert not list(tmp_path.iterdir())
+
+
+def test_links_are_followed_unless_they_lead_in_a_circle_or_nowhere(tmp_path: Path) -> None:
+    corpus, elsewhere = tmp_path / "corpus", tmp_path / "elsewhere"
+    for path in (corpus / "ann" / "1.wav", elsewhere / "deep" / "2.wav"):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    (corpus / "bob").symlink_to(elsewhere)
+    (corpus / "3.wav").symlink_to(elsewhere / "deep" / "2.wav")
+    (corpus / "ann" / "again").symlink_to(corpus)
+    (elsewhere / "deep" / "up").symlink_to(elsewhere)
+    (corpus / "notes.txt").symlink_to(elsewhere / "none.txt")
+    names = [path.relative_to(corpus).as_posix() for path in find_audio(corpus)]
+    assert names == ["3.wav", "ann/1.wav", "bob/deep/2.wav"]
+    for name in ("4.wav", "eve"):
+        link = corpus / name
+        link.symlink_to(elsewhere / "none")
+        with pytest.raises(ValueError, match=f"1 links lead to files .* such as {link};"):
+            find_audio(corpus)
+        link.unlink()
+
+
+def test_audio_that_libsndfile_cannot_read_is_counted(tmp_path: Path) -> None:
+    for name in ("1.wav", "2.m4a", "3.M4A", "notes.txt"):
+        (tmp_path / name).touch()
+    with pytest.warns(UserWarning, match=r"2 files are left out .* such as .*2\.m4a"):
+        assert find_audio(tmp_path) == [tmp_path / "1.wav"]
+
+
+def test_a_tensor_with_the_negative_bit_is_written(tmp_path: Path) -> None:
+    signal = torch.view_as_complex(torch.randn(100, 2).clamp(-1, 1)).conj().imag
+    assert signal.is_neg()
+    write_audio(tmp_path / "a.wav", signal, 16000)
+    assert torch.equal(read_audio(tmp_path / "a.wav")[0][0], signal)
+    assert encode_flac(signal, 16000) == encode_flac(signal.resolve_neg(), 16000)
+
+
+def test_the_first_invalid_sample_is_placed(tmp_path: Path) -> None:
+    parts = torch.zeros(3, 2, 16000)
+    parts[1, 1, 4000] = torch.nan
+    with pytest.raises(ValueError, match=r"sample at 1\.250 s is NaN"):
+        write_parts(tmp_path / "a.wav", parts, 2, 48000, 16000)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hlsim.files import atomic_path, read_table, write_atomically
+from hlsim.files import atomic_path, path_below, read_table, write_atomically
 
 
 def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
@@ -16,6 +16,29 @@ def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
     assert (tmp_path / "new" / "a").read_text() == "old"
     write_atomically(tmp_path / "new" / "a", b"new")
     assert os.listdir(tmp_path / "new") == ["a"] and (tmp_path / "new" / "a").read_text() == "new"
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "store" / "file")
+    for text in ("new", "old"):
+        write_atomically(tmp_path / "link", text)
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / "store" / "file").read_text() == text
+    assert os.listdir(tmp_path / "store") == ["file"]
+
+
+def test_links_may_lead_out_of_a_corpus_but_paths_may_not(tmp_path: Path) -> None:
+    corpus = tmp_path / "corpus"
+    corpus.mkdir()
+    (corpus / "bob").symlink_to(tmp_path)
+    for name in ("bob/1.wav", "./bob/../bob/1.wav", str(corpus / "bob" / "1.wav")):
+        assert path_below(corpus, name) == corpus / "bob" / "1.wav"
+    # The system would look for this file beside the folder to which bob links.
+    assert path_below(corpus, "bob/../1.wav") == corpus / "1.wav"
+    for name in ("", "../1.wav", "bob/../../1.wav", "/1.wav", "../corpus2/1.wav"):
+        with pytest.raises(ValueError, match="expected the path of a file below"):
+            path_below(corpus, name)
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Random clips of recordings, which are decoded once and kept in memory."""
 
+import hashlib
 import math
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +25,12 @@ Source = str | Path | Sequence[Path | tuple[Path, Path]]
 
 In a list, a pair of files, clean speech and its noisy version, stands for the noise between them.
 """
+
+_MAX_HASHED_BYTES = 2**30
+"""Number of bytes up to which ``hash_source`` reads all files completely."""
+
+_HASHED_PIECES = 4
+_SMALLEST_PIECE = 4096  # bytes
 
 _SILENT_POWER = 1e-7
 """Mean square up to which a clip counts as silent, if the peak of its recording is 1.0."""
@@ -66,8 +74,7 @@ class Clips:
         seconds: float,
         repeat: bool = False,
     ) -> None:
-        files = find_audio(source) if isinstance(source, str | Path) else source
-        pairs = [file if isinstance(file, tuple) else (None, file) for file in files]
+        pairs = _find_pairs(source)
         self.files = [file for _, file in pairs]
         self._clean_files = [clean for clean, _ in pairs]
         if not self.files:
@@ -188,3 +195,48 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
             f"the clean version, got {rate} Hz and {tuple(noisy.shape)}; replace one of them"
         )
     return noisy
+
+
+def hash_source(source: Source) -> str:
+    """Compute a hash of the contents of recordings, which changes when one is replaced.
+
+    Paths have no influence except for the order of the files, so that a corpus may be moved. If all
+    files have 1 GB or less together, they are read completely. Otherwise, the hash covers the size
+    of each file and four pieces of it, from its start to its end, about 1 GB together.
+
+    Args:
+        source: Folder or files, see ``Source``.
+
+    Returns:
+        The SHA-256 in hexadecimal.
+
+    Raises:
+        ValueError: The folder does not exist, or contains no audio.
+
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> hash_source([EXAMPLE_FILE]) == hash_source([EXAMPLE_FILE, EXAMPLE_FILE])
+    False
+    """
+    files = [file for pair in _find_pairs(source) for file in pair]
+    sizes = [os.path.getsize(file) if file and file.is_file() else 0 for file in files]
+    piece = max(_SMALLEST_PIECE, _MAX_HASHED_BYTES // (_HASHED_PIECES * max(1, len(files))))
+    reads_all = sum(sizes) <= _MAX_HASHED_BYTES
+    digest = hashlib.sha256()
+    for file, size in zip(files, sizes, strict=True):
+        digest.update(f"{size};".encode())
+        if file is None or not size:
+            continue
+        with file.open("rb") as data:
+            if reads_all or size <= _HASHED_PIECES * piece:
+                digest.update(data.read())
+                continue
+            for number in range(_HASHED_PIECES):
+                data.seek(number * (size - piece) // (_HASHED_PIECES - 1))
+                digest.update(data.read(piece))
+    return digest.hexdigest()
+
+
+def _find_pairs(source: Source) -> list[tuple[Path | None, Path]]:
+    """Return the files of a source, each with its clean version if it stands for noise."""
+    files = find_audio(source) if isinstance(source, str | Path) else source
+    return [file if isinstance(file, tuple) else (None, file) for file in files]

@@ -82,10 +82,11 @@ def prepare(
             corpus has none.
 
     Returns:
-        Name of the layout, and a table of the splits.
+        Name of the layout, a table of the splits, and the number of files that are left out.
 
     Raises:
-        ValueError: The layout is unknown or contradictory, or the manifest cannot be written.
+        ValueError: The layout is unknown or contradictory, the share is not from 0 to below 1, or
+            the manifest cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -98,8 +99,11 @@ def prepare(
     train         1           1      0
     valid         1           1      0
     """
+    noise_files = []
     if Path(source).is_dir():
         layout, utterances = find_corpus(source, folders)
+        listed_files = {file for row in utterances for file in (row.path, row.noisy)}
+        noise_files = [file for file in _relative_files(source) if file not in listed_files]
     else:
         layout, utterances = "CSV file", read_manifest(source)
     if valid_share:
@@ -113,6 +117,8 @@ def prepare(
         pairs = sum(bool(row.noisy) for row in rows)
         if rows:
             lines.append(f"{split:<5}  {speaker_count:>8}  {len(rows):>10}  {pairs:>5}")
+    if noise_files:
+        lines.append(f"left out: {len(noise_files)} files of noise, such as {noise_files[0]}")
     return "\n".join(lines)
 
 
@@ -136,13 +142,17 @@ def find_corpus(
     >>> layout
     'folders train, valid, test'
     """
-    files = [path.relative_to(root).as_posix() for path in find_audio(root)]
     try:
-        layout, utterances = recognise(files, folders)
+        layout, utterances = recognise(_relative_files(root), folders)
         check_utterances(utterances)
     except ValueError as error:
         raise ValueError(f"{root}: {error}; {_ADVICE}") from error
     return layout, utterances
+
+
+def _relative_files(root: str | Path) -> list[str]:
+    """Return the paths of the audio files in a folder, relative to it, with forward slashes."""
+    return [path.relative_to(root).as_posix() for path in find_audio(root)]
 
 
 def recognise(
@@ -191,19 +201,21 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
 
     Args:
         utterances: Rows of a manifest.
-        share: Share of the training speakers to move. At least one is moved.
+        share: Share of the training speakers to move, above 0 and below 1. At least one is moved.
 
     Returns:
         New rows in the same order; the rows that were passed do not change.
 
     Raises:
-        ValueError: There is a validation split already, a speaker is unknown, or no training
-            speaker would remain.
+        ValueError: The share is not between 0 and 1, there is a validation split already, a speaker
+            is unknown, or no training speaker would remain.
 
     >>> rows = [Utterance("ann/1.wav", speaker="ann"), Utterance("bob/1.wav", speaker="bob")]
     >>> [row.split for row in hold_out_speakers(rows, 0.5)]
     ['train', 'valid']
     """
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"expected a share between 0 and 1 (--valid-share), got {share}")
     if any(row.split == "valid" for row in utterances):
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
     speakers = sorted({row.speaker for row in utterances if row.split == "train"})
@@ -226,19 +238,35 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
     """Read utterances from the paths of files, which must all match the pattern of a layout."""
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}
+    file_of: dict[tuple[str, str], str] = {}  # by condition and key
+    folder_of: dict[str, str] = {}  # by split
     for file in files:
         match = re.fullmatch(pattern, file, re.IGNORECASE)
         if match is None:
             raise ValueError(f"{file} does not match the layout {layout!r}")
         groups = match.groupdict(default="")
-        key = os.path.splitext(file)[0]
+        key = file
         if "condition" in groups:
-            key = key[: match.start("condition")] + key[match.end("condition") :]
+            stem = os.path.splitext(file)[0]
+            key = stem[: match.start("condition")] + stem[match.end("condition") :]
         condition = groups.get("condition", "clean").lower()
+        folder = groups.get("split", "train").lower()
+        split = _SPLIT_OF[folder]
+        if folder_of.setdefault(split, folder) != folder:
+            raise ValueError(
+                f"the folders {folder_of[split]} and {folder} are both for the split {split}; "
+                "rename one of them, for example to test"
+            )
+        if condition not in ("clean", "noisy"):
+            continue
+        if file_of.setdefault((condition, key), file) != file:
+            raise ValueError(
+                f"{file_of[condition, key]} and {file} belong to one pair, because they differ in "
+                "their extension only; rename or remove one of them"
+            )
         if condition == "clean":
-            split = _SPLIT_OF[groups.get("split", "train").lower()]
             clean[key] = Utterance(file, "", groups.get("speaker", ""), split)
-        elif condition == "noisy":
+        else:
             noisy[key] = file
     unpaired = sorted(set(clean) ^ set(noisy))
     if "(?P<condition>" in pattern and unpaired:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
+from hlsim.audiogram.value import convert_at
 from hlsim.files import path_below, read_table, write_atomically
 
 SPLITS = ("train", "valid", "test")
@@ -42,7 +44,7 @@ class Utterance:
 
 
 def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utterance]:
-    """Read and check a manifest.
+    """Read and check a manifest. The paths are returned without ``.`` and ``..``.
 
     Args:
         path: CSV file with a column ``path`` and optional columns ``noisy`` (path of the noisy
@@ -65,18 +67,17 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     utterances = []
     for line, row in read_table(path, "the manifest"):
         values = {name: row[name] for name in COLUMNS if name in row}
-        utterance = Utterance(**{"path": "", **values})
-        if not utterance.path or utterance.split not in SPLITS:
+        if not values.get("path") or values.get("split", "train") not in SPLITS:
             raise ValueError(
                 f"{path}, line {line}: expected a file in the column 'path', and train, valid or "
                 f"test in the column 'split', got {values}; correct the row"
             )
-        for name in filter(None, (utterance.path, utterance.noisy)):
-            try:
-                path_below(folder, name)
-            except ValueError as error:
-                raise ValueError(f"{path}, line {line}: {error}") from error
-        utterances.append(utterance)
+        for column in ("path", "noisy"):
+            if values.get(column):
+                place = f"{path}, line {line}"
+                file = convert_at(place, path_below, folder, values[column])
+                values[column] = Path(os.path.relpath(file, folder)).as_posix()
+        utterances.append(Utterance(**values))
     try:
         check_utterances(utterances)
     except ValueError as error:

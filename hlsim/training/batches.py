@@ -25,7 +25,7 @@ from hlsim.data.augment import (
     mix,
     replace_share,
 )
-from hlsim.data.clips import Clips, Source
+from hlsim.data.clips import Clips, Source, hash_source
 from hlsim.data.ears import draw_thresholds
 from hlsim.data.manifest import read_manifest
 from hlsim.data.tones_and_clicks import draw_sounds
@@ -135,8 +135,23 @@ class TrainingData:
         )
 
     def identity(self) -> str:
-        """Compute a hash of all paths, in order to recognise a training that should resume."""
-        return hashlib.sha256(repr(replace(self, workers=0)).encode()).hexdigest()
+        """Compute a hash of all recordings and ears, with which a training must resume.
+
+        See ``hash_source`` for what is read of large corpora.
+
+        Raises:
+            ValueError: A folder does not exist or contains no audio, or a table is not valid.
+        """
+        sources = (self.speech, self.noise, self.valid_speech, self.valid_noise)
+        hashes = [hash_source(source) if source else None for source in sources]
+        tables = (self.audiograms, self.valid_audiograms)
+        ears = [_read_ears(table) if table else None for table in tables]
+        return hashlib.sha256(repr((hashes, ears)).encode()).hexdigest()
+
+
+def _read_ears(table: Path) -> list[tuple[float, ...]]:
+    """Read the thresholds of measured ears in dB HL."""
+    return [ear.thresholds for _, ear in read_audiograms(table, simulated=True)]
 
 
 class _RandomBatches(Dataset[Batch]):
@@ -151,8 +166,7 @@ class _RandomBatches(Dataset[Batch]):
         self.noise = Clips(data.noise, repeat=True, **settings) if data.noise else None
         self.measured_ears: Tensor | None = None  # (ears, 8) dB HL
         if data.audiograms is not None:
-            measured = read_audiograms(data.audiograms, simulated=True)
-            self.measured_ears = torch.tensor([ear.thresholds for _, ear in measured])
+            self.measured_ears = torch.tensor(_read_ears(data.audiograms))
 
     def __getitem__(self, index: int) -> Batch:
         seed = self.recipe.seed * 1_000_003 * MAX_DEVICES + index

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import write_audio
-from hlsim.data.clips import Clips
+from hlsim.data.clips import Clips, hash_source
 
 
 def folder_with(tmp_path: Path, **waves: Tensor) -> Path:
@@ -106,3 +106,31 @@ def test_a_file_that_cannot_be_used_causes_one_warning_and_another_draw(tmp_path
     # Draws depend on the generator, and not on whether the bad files are already known.
     assert torch.equal(first, clips.draw(30, torch.Generator().manual_seed(2)))
     assert not torch.equal(first, clips.draw(30, torch.Generator().manual_seed(3)))
+
+
+@pytest.mark.parametrize("limit", [2**30, 100_000])
+def test_the_hash_of_recordings_changes_with_each_and_not_with_their_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int
+) -> None:
+    """The lower limit is below the size of the files, so that pieces of them are read."""
+    monkeypatch.setattr("hlsim.data.clips._MAX_HASHED_BYTES", limit)
+    files = [tmp_path / name for name in ("a.wav", "b.wav")]
+    for seed, file in enumerate(files):
+        signal = torch.randn(40_000, generator=torch.Generator().manual_seed(seed))
+        write_audio(file, signal.clamp(-1, 1), 16000)
+    hashes = {hash_source(tmp_path), hash_source(files)}
+    assert len(hashes) == 1
+    tmp_path.rename(tmp_path.with_name("moved"))
+    tmp_path.with_name("moved").rename(tmp_path)
+    hashes |= {
+        hash_source(files[::-1]),
+        hash_source(files[:1]),
+        hash_source([(files[0], files[1])]),
+    }
+    contents = files[0].read_bytes()
+    for edited in (contents[:-1], contents[:-1] + b"x", contents[:5000] + b"x" + contents[5001:]):
+        files[0].write_bytes(edited)
+        hashes.add(hash_source(tmp_path))
+    files[1].unlink()
+    hashes.add(hash_source(files))
+    assert len(hashes) == 8

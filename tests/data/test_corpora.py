@@ -89,6 +89,10 @@ REJECTED = {
     "speakers without an option": ["id1/session/1.wav", "id2/session/1.wav"],
     "TIMIT": ["TRAIN/DR1/FCJF0/SA1.WAV", "TEST/DR1/FAKS0/SA1.WAV"],
     "no audio": ["readme.txt"],
+    "dev and eval": ["train/a/1.wav", "dev/b/1.wav", "Eval/c/1.wav"],
+    "train twice": ["train/a/1.wav", "training/b/1.wav", "test/c/1.wav"],
+    "two files of a pair": ["train/clean/1.wav", "train/clean/1.flac", "train/noisy/1.wav"],
+    "two noisy files": ["train/clean/1.wav", "train/noisy/1.wav", "train/noisy/1.mp3"],
 }
 
 
@@ -123,6 +127,26 @@ def test_held_out_speakers_validate_and_no_longer_train() -> None:
     for invalid_rows in (rows, utterances[:2], unknown_speakers):
         with pytest.raises(ValueError):
             hold_out_speakers(invalid_rows, 0.2)
+
+
+@pytest.mark.parametrize("share", [-0.5, 1.0, 1.5, float("nan"), float("inf")])
+def test_shares_outside_0_to_1_are_rejected(tmp_path: Path, share: float) -> None:
+    touch_files(tmp_path, [f"train/{name}/1.wav" for name in ("ann", "bob", "eve")])
+    with pytest.raises(ValueError, match="--valid-share"):
+        prepare(tmp_path, tmp_path / "m.csv", valid_share=share)
+    assert not (tmp_path / "m.csv").exists()
+
+
+def test_prepare_lists_every_recording_or_counts_it(tmp_path: Path) -> None:
+    corpus = touch_files(tmp_path / "corpus", ["train/ann/1.wav", "train/ann/1.flac"])
+    (corpus / "train" / "bob").symlink_to(touch_files(tmp_path / "elsewhere", ["2.wav"]))
+    assert "left out" not in prepare(corpus, corpus / "m.csv")
+    names = [row.path for row in read_manifest(corpus / "m.csv")]
+    assert names == ["train/ann/1.flac", "train/ann/1.wav", "train/bob/2.wav"]
+    files = [f"train/{kind}/{name}.wav" for kind in ("clean", "noisy", "noise") for name in "12"]
+    pairs = touch_files(tmp_path / "pairs", files)
+    text = prepare(pairs, pairs / "m.csv")
+    assert text.endswith("left out: 2 files of noise, such as train/noise/1.wav")
 
 
 def test_prepare_writes_what_training_reads(tmp_path: Path) -> None:
@@ -174,6 +198,7 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         "path\n1.wav\n../2.wav\n",
         "path,noisy\n1.wav,/2.wav\n",
         "path,noisy\n1.wav,1.wav\n",
+        "path,split\n1.wav,train\na/.././1.wav,test\n",
         "path,noisy,split\n1.wav,2.wav,train\n1.wav,3.wav,test\n",
         "path,speaker,split\n1.wav,ann,train\n2.wav,ann,test\n",
         "path\nnoise/1.wav\n",

@@ -97,6 +97,26 @@ def test_other_files_are_another_training(manifest: Path) -> None:
     data = TrainingData.from_manifest(manifest)
     assert data.identity() == TrainingData.from_manifest(manifest, workers=3).identity()
     assert data.identity() != replace(data, noise=manifest.parent / "noisy").identity()
+    before = data.identity()
+    write_audio(manifest.parent / "noisy" / "3.wav", hum(9600), 16000)
+    assert data.identity() != before
+
+
+@pytest.mark.parametrize("name", ["audiograms", "valid_audiograms"])
+def test_other_ears_are_another_training(manifest: Path, name: str) -> None:
+    table = manifest.parent / "ears.csv"
+    data = replace(TrainingData.from_manifest(manifest), **{name: table})
+    identities = set()
+    for row in ("20,40", "80,90"):
+        table.write_text(f"hl_500,hl_4000\n{row}\n")
+        identities.add(data.identity())
+    assert len(identities) == 2
+
+
+def test_paths_of_a_manifest_stay_below_its_root_behind_links(manifest: Path) -> None:
+    (manifest.parent / "link").symlink_to("/")
+    manifest.write_text("path\nlink/../clean/1.wav\n")
+    assert TrainingData.from_manifest(manifest).speech == [manifest.parent / "clean" / "1.wav"]
 
 
 @pytest.mark.parametrize(("treated", "low", "high"), [(True, 50.0, 80.0), (False, 85.0, 90.0)])
