@@ -18,7 +18,8 @@ from torch import Tensor
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power
-from hlsim.torchtools import constant_like
+from hlsim.dsp.interpolation import interpolation_weights
+from hlsim.torchtools import constant
 
 RATE = 16000
 """Sample rate of the aids in Hz."""
@@ -105,9 +106,10 @@ def band_powers(powers: Tensor, bands: int) -> Tensor:
     >>> band_powers(torch.ones(1, 1, FRAME // 2 + 1), bands=4).round()
     tensor([[[ 5., 18., 60., 46.]]])
     """
-    return powers @ constant_like(powers, _band_shares, bands, FRAME)
+    return powers @ _band_shares(bands, FRAME, like=powers)
 
 
+@constant
 def _band_shares(bands: int, points: int) -> NDArray[np.float64]:
     """Return the weight of each band at each frequency of a Fourier transform of ``points``.
 
@@ -116,7 +118,7 @@ def _band_shares(bands: int, points: int) -> NDArray[np.float64]:
     Returns: (points / 2 + 1, bands).
     """
     frequencies = np.arange(points // 2 + 1) * RATE / points
-    return np.stack([np.interp(frequencies, band_centres(bands), row) for row in np.eye(bands)], 1)
+    return interpolation_weights(band_centres(bands), frequencies).T
 
 
 def _filter_taps(bands: int) -> NDArray[np.float64]:
@@ -152,12 +154,12 @@ def apply_gains(samples: Tensor, excess_gains: Tensor, position: int = 0) -> Ten
     length = min(time, HOP)
     # A matrix product instead of a Fourier transform, in which later samples would change earlier
     # ones by rounding.
-    matrix = constant_like(samples, _hop_matrix, bands).unflatten(1, (bands, HOP))
+    matrix = _hop_matrix(bands, like=samples).unflatten(1, (bands, HOP))
     matrix = matrix[: length + 2 * DELAY, :, :length]
     hops = samples.unfold(-1, length + 2 * DELAY, length)
     bands_of_hops = (hops @ matrix.flatten(1)).unflatten(-1, (bands, length))
     first_and_last = torch.stack((excess_gains[:, :-1], excess_gains[:, 1:]), 2)
-    ramp = constant_like(samples, _ramp)[:, position : position + length]
+    ramp = _ramp(like=samples)[:, position : position + length]
     added = ((first_and_last @ bands_of_hops) * ramp).sum(2).flatten(1)
     return samples[:, DELAY : DELAY + time] + added
 
@@ -195,8 +197,8 @@ def frame_power(samples: Tensor) -> Tensor:
     >>> frame_power(torch.randn(2, HISTORY + 10 * HOP)).shape
     torch.Size([2, 10, 129])
     """
-    frames = samples.unfold(-1, FRAME, HOP) * constant_like(samples, _window)
-    return power(torch.fft.rfft(frames)) * constant_like(samples, _scale)
+    frames = samples.unfold(-1, FRAME, HOP) * _window(like=samples)
+    return power(torch.fft.rfft(frames)) * _scale(like=samples)
 
 
 def level_db(powers: Tensor) -> Tensor:
@@ -208,6 +210,7 @@ def level_db(powers: Tensor) -> Tensor:
     return 10.0 * torch.log10(powers + POWER_FLOOR) + PASCAL_SPL
 
 
+@constant
 def speech_band_levels(bands: int) -> NDArray[np.float64]:
     """Return the level of average speech in each band in dB SPL, at 65 dB SPL in total.
 
@@ -237,6 +240,7 @@ def speech_density(points: int) -> NDArray[np.float64]:
     return 10.0 ** (np.interp(np.log(frequencies), np.log(thirds), density) / 10.0)
 
 
+@constant
 def _hop_matrix(bands: int) -> NDArray[np.float64]:
     """Return the matrix from the samples of a hop, and those before it, to the bands of the hop.
 
@@ -249,12 +253,14 @@ def _hop_matrix(bands: int) -> NDArray[np.float64]:
     return matrix.reshape(len(matrix), -1)
 
 
+@constant
 def _ramp() -> NDArray[np.float64]:
     """Return the weights of a hop's first and last gain at each sample, (2, HOP)."""
     last = np.arange(1, HOP + 1) / HOP
     return np.stack([1.0 - last, last])
 
 
+@constant
 def _window() -> NDArray[np.float64]:
     """Return a window that rises as a Hann window in 12 ms and falls as one in 4 ms, (FRAME,)."""
     rise = FRAME - FALL
@@ -263,6 +269,7 @@ def _window() -> NDArray[np.float64]:
     return np.concatenate([up, down])
 
 
+@constant
 def _scale() -> NDArray[np.float64]:
     """Return the factor from squared magnitudes to powers, (FRAME / 2 + 1,)."""
     scale = np.full(FRAME // 2 + 1, 2.0 / (FRAME * np.square(_window()).sum()))

@@ -15,7 +15,7 @@ from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
 from hlsim.dsp.fft import power
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 
 class MeasuredAid(nn.Module):
@@ -52,10 +52,10 @@ class MeasuredAid(nn.Module):
         weight = next(self.parameters(), torch.empty(0))
         thresholds = as_thresholds(audiogram).to(weight)
         ears = thresholds.reshape(-1, len(FREQUENCIES))
-        noise = constant_like(ears, _speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
+        noise = _speech_noise(like=ears) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
         # The first second, in which gains settle, is left out.
         output = self._amplify(noise.repeat(len(ears), 2), ears)[:, RATE:]
-        in_third = constant_like(ears, _thirds_of_octave)
+        in_third = _thirds_of_octave(like=ears)
         output_power, noise_power = (
             power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
         )
@@ -69,6 +69,7 @@ class MeasuredAid(nn.Module):
         raise NotImplementedError
 
 
+@constant
 def _speech_noise() -> NDArray[np.float64]:
     """Return one second of noise with the spectrum of average speech at 65 dB SPL.
 
@@ -82,6 +83,7 @@ def _speech_noise() -> NDArray[np.float64]:
     return noise * rms / np.sqrt(np.square(noise).mean())
 
 
+@constant
 def _thirds_of_octave() -> NDArray[np.float64]:
     """Return 1 for each whole frequency in Hz in each third of an octave, else 0, (8001, 8)."""
     ratio = np.arange(RATE // 2 + 1)[:, None] / np.array(FREQUENCIES)

@@ -11,16 +11,17 @@ from torch.nn import functional
 from compensators.config import MappingConfig
 from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
+from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
-from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
+from hlsim.dsp.interpolation import interpolate, interpolation_weights
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 NEPER_DB = 20.0 / math.log(10.0)
 """One neper in dB."""
@@ -94,7 +95,7 @@ class MappingCompensator(MeasuredAid, EarNetwork):
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         spectrum = self.stft.analyse(signals)
-        start = interpolate(nalr_gains_db(ears), self.config.hz) / NEPER_DB
+        start = interpolate(nalr_gains_db(ears), FREQUENCIES, self.config.hz) / NEPER_DB
         features = self._features(spectrum, ears, start)
         features = features.contiguous(memory_format=torch.channels_last)
         features = self.encoder(features).permute(0, 2, 3, 1)
@@ -118,8 +119,8 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         Shape: (items, channels, ...) -> (items, frames, frequencies).
         """
         bands = self.config.bands, self.config.fft
-        into_bands = constant_like(features, _into_bands, *bands)
-        out_of_bands = constant_like(features, _out_of_bands, *bands)
+        into_bands = _into_bands(*bands, like=features)
+        out_of_bands = _out_of_bands(*bands, like=features)
         levels = self.magnitude_decoder(features, size).squeeze(1) @ into_bands
         smooth = _average_over_stride(torch.tanh(levels), self.config.stride[0])
         return smooth @ out_of_bands * (self.config.reach_db / NEPER_DB)
@@ -147,6 +148,7 @@ def _average_over_stride(levels: Tensor, stride: int) -> Tensor:
     return functional.avg_pool1d(functional.avg_pool1d(padded, stride, 1), stride, 1).mT
 
 
+@constant
 def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
     """Return weights that interpolate from bands to frequencies, linearly between band centres.
 
@@ -157,9 +159,10 @@ def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
     positions = erb_number(np.arange(fft // 2 + 1) * NEURO_RATE / fft)
     lowest, highest = erb_number(np.array([LOWEST_CENTRE, NEURO_RATE / 2.0]))
     centres = np.linspace(lowest, highest, count)
-    return np.stack([np.interp(positions, centres, row) for row in np.eye(count)])
+    return interpolation_weights(centres, positions)
 
 
+@constant
 def _into_bands(count: int, fft: int) -> NDArray[np.float64]:
     """Return weights from frequencies to bands, which are means, (frequencies, count)."""
     weights = _out_of_bands(count, fft)

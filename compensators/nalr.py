@@ -6,20 +6,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hlsim.audiogram import HIGHEST_LEVEL
+from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
     has_listeners,
-    interpolate,
     resolve_thresholds,
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.torchtools import constant_like
+from hlsim.dsp.interpolation import interpolate
+from hlsim.torchtools import constant
 
 ORDER = 220
 """Order of the filter, which has one more tap."""
@@ -121,10 +121,13 @@ class NALR(nn.Module):
         Shape: (..., 8) dB HL -> (..., ORDER + 1).
         """
         frequencies = np.linspace(0.0, self.sample_rate / 2.0, ORDER + 1)
-        gains = interpolate(nalr_gains_db(thresholds.double()), tuple(frequencies.tolist()))
-        return (10.0 ** (gains / 20.0)) @ constant_like(gains, _design)
+        gains = interpolate(
+            nalr_gains_db(thresholds.double()), FREQUENCIES, tuple(frequencies.tolist())
+        )
+        return (10.0 ** (gains / 20.0)) @ _design(like=gains)
 
 
+@constant
 def _design() -> NDArray[np.float64]:
     """Return the taps for a gain of 1 at each of ``ORDER + 1`` evenly spaced frequencies.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from compensators.filter_bank import HOP, RATE
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 BLOCK_FRAMES = 128
 """Frames that are computed together by a matrix, whose powers must not overflow."""
@@ -52,7 +52,7 @@ def follow_peaks(
     averages = _average(values, average, fall)
     blocks = []
     for block in (values - averages).split(BLOCK_FRAMES, 1):
-        powers = constant_like(values, _powers, block.shape[1], fall)
+        powers = _powers(block.shape[1], fall, like=values)
         highest = _running_maximum(block / powers)
         blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
         excess = blocks[-1][:, -1]
@@ -81,8 +81,8 @@ def _average(values: Tensor, before: Tensor, past: float) -> Tensor:
     averages = []
     for block in values.split(BLOCK_FRAMES, 1):
         frames = block.shape[1]
-        new = constant_like(values, _weights, frames, past) @ block
-        old = constant_like(values, _powers, frames, past) * before.unsqueeze(1)
+        new = _weights(frames, past, like=values) @ block
+        old = _powers(frames, past, like=values) * before.unsqueeze(1)
         averages.append(new + old)
         before = averages[-1][:, -1]
     return torch.cat(averages, 1)
@@ -98,11 +98,13 @@ def _running_maximum(values: Tensor) -> Tensor:
     return torch.stack(highest, 1)
 
 
+@constant
 def _powers(frames: int, past: float) -> NDArray[np.float64]:
     """Return past ** 1 to past ** frames, (frames, 1)."""
     return past ** np.arange(1.0, frames + 1.0)[:, None]
 
 
+@constant
 def _weights(frames: int, past: float) -> NDArray[np.float64]:
     """Return the weight of each frame in each average, lower triangular, (frames, frames)."""
     distance = np.arange(frames)[:, None] - np.arange(frames)

@@ -9,7 +9,6 @@ from compensators.wearable import State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
-from hlsim.torchtools import constant_like
 
 KNEE_DB = 20.0
 """Level of a band in dB below that of average speech, below which softer sounds get no more gain.
@@ -85,7 +84,7 @@ class WDRC(Wearable):
         levels, memory = follow_peaks(
             level_db(band_powers(powers, self.bands)), state["levels"], self.attack, self.release
         )
-        above_speech = levels - constant_like(levels, speech_band_levels, self.bands)
+        above_speech = levels - speech_band_levels(self.bands, like=levels)
         loss, prescribed = fitted.chunk(2, -1)
         ratios = 1.0 + ((loss - 10.0) / 40.0).clamp(0.0, 2.0)
         slope = (1.0 / ratios - 1.0).unsqueeze(1)

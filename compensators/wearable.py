@@ -32,18 +32,19 @@ from compensators.filter_bank import (
 )
 from compensators.gains import MeasuredAid
 from compensators.limiter import soft_limit
+from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
     check_two_channels,
-    interpolate,
     resolve_thresholds,
 )
 from hlsim.calibration import check_full_scale, gain_to_pascals
-from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform
+from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
-from hlsim.torchtools import flatten_items
+from hlsim.torchtools import broadcast_shape, flatten_items
 
 Slider = float | Tensor
 """Value of a slider, 0 to 1: one number, or one value per item."""
@@ -130,8 +131,8 @@ class Wearable(MeasuredAid):
         Shape: (items, 8) in dB HL -> (items, 2 * bands).
         """
         centres = band_centres(self.bands)
-        prescribed = interpolate(nalr_gains_db(thresholds), centres)
-        return torch.cat((interpolate(thresholds, centres), prescribed), -1)
+        prescribed = interpolate(nalr_gains_db(thresholds), FREQUENCIES, centres)
+        return torch.cat((interpolate(thresholds, FREQUENCIES, centres), prescribed), -1)
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State

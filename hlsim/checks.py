@@ -32,25 +32,6 @@ Lengths = Tensor | Sequence[int]
 """Number of samples of each item of a padded batch, in the shape of the leading dimensions."""
 
 
-def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
-    """Return the shape to which tensors of some shapes broadcast.
-
-    ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third
-    of a second.
-
-    Args:
-        shapes: Shapes of the tensors.
-
-    Raises:
-        RuntimeError: The shapes do not fit.
-
-    >>> broadcast_shape((3, 1), (2,))
-    torch.Size([3, 2])
-    """
-    number = torch.empty(())
-    return torch.broadcast_tensors(*(number.expand(shape) for shape in shapes))[0].shape
-
-
 def check_names(names: Iterable[Any], known: Iterable[str], description: str) -> None:
     """Raise ValueError unless all names of settings or options are known.
 
@@ -316,21 +297,3 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
             f"{describe(lengths)}"
         )
     return ends.long()
-
-
-def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
-    """Replace the samples after the end of each item by zeros.
-
-    Shape: (..., time), (...) -> (..., time).
-
-    Args:
-        waveform: Padded signals.
-        ends: Number of samples of each item before padding.
-
-    >>> silence_after(torch.ones(2, 3), torch.tensor([1, 2]))
-    tensor([[1., 0., 0.],
-            [1., 1., 0.]])
-    """
-    samples = torch.arange(waveform.shape[-1], device=waveform.device)
-    ends = ends.to(waveform.device, non_blocking=True)
-    return torch.where(samples < ends.unsqueeze(-1), waveform, 0.0)

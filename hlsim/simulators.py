@@ -17,12 +17,12 @@ from hlsim.calibration import (
     gain_to_pascals,
     set_level,
 )
-from hlsim.checks import broadcast_shape, check_rate, check_waveform
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
-from hlsim.torchtools import flatten_items
+from hlsim.torchtools import broadcast_shape, flatten_items
 
 EXACT = "msbg"
 """Name of the exact MSBG."""

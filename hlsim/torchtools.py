@@ -1,25 +1,30 @@
-"""Tools around torch: constants that are computed once, and functions that are not compiled.
+"""Tools around torch: what is computed once, batches, and functions that are not compiled.
 
-A *constant* is a tensor that a function computes from its arguments, such as the taps of a filter.
-It is computed once for each type and device, and then comes from a cache.
+A *constant* is a tensor that a function designs from its arguments, such as the taps of a filter.
+It is computed once for each type and device, and then comes from a store. Thresholds are copied
+once from the CPU to a GPU, or back.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import wraps
+from functools import update_wrapper, wraps
 from threading import Lock
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
+Values = TypeVar("Values")
 
-CACHE_BYTES = 2**28
-"""Size of the cache of constants. MSBG's filters take 5 MiB per second of signal."""
+STORE_BYTES = 2**28
+"""Size of the store of constants. MSBG's filters take 5 MiB per second of signal."""
+
+_HOST = torch.device("cpu")
 
 
 def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
@@ -68,59 +73,70 @@ def without_modes(
         return pool.submit(function, *arguments, **options).result()
 
 
-def constant(
-    function: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """Return the values of ``function(*arguments)`` as a tensor that is computed only once.
+class constant(Generic[P, Values]):
+    """Decorator of a function that designs a constant, and computes it once.
 
-    The tensor comes from a cache, so it must not be changed in place.
+    With ``like``, a call returns the values as a tensor in the precision and on the device of
+    another tensor. It comes from a store, so it must not be changed in place, and the other
+    arguments must be hashable. Without ``like``, a call returns the values as the function computes
+    them.
 
     Args:
-        function: Function at the top level of a module, which returns an array or numbers.
-        arguments: Hashable arguments of the function.
-        dtype: Type of real values, and of the real and imaginary parts of complex ones.
-        device: Device of the tensor.
+        design: Function at the top level of a module, which returns an array or numbers.
 
-    >>> constant(np.hanning, 3, dtype=torch.float32, device=torch.device("cpu"))
+    >>> @constant
+    ... def window(points):
+    ...     return np.hanning(points)
+    >>> window(3, like=torch.zeros(1))
     tensor([0., 1., 0.])
+    >>> window(3)
+    array([0., 1., 0.])
     """
-    tensor: Tensor = compute_once(_constant, function, arguments, dtype, device)
-    return tensor
+
+    def __init__(self, design: Callable[P, Values]) -> None:
+        update_wrapper(self, design)
+        self._design = design
+
+    @overload
+    def __call__(self, *arguments: P.args, **options: P.kwargs) -> Values: ...
+
+    @overload
+    def __call__(self, *arguments: Any, like: Tensor) -> Tensor: ...
+
+    def __call__(  # type: ignore[misc]  # a design has no argument ``like``
+        self, *arguments: Any, like: Tensor | None = None, **options: Any
+    ) -> Any:
+        if like is None:
+            return self._design(*arguments, **options)
+        dtype = like.dtype.to_real() if like.is_complex() else like.dtype
+        return _design_tensor(self._design, arguments, dtype, like.device)
 
 
-def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any) -> Tensor:
-    """Return the values of ``function(*arguments)`` in the precision and on the device of a tensor.
+def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Decorate a function whose results are computed once and then come from a store.
 
-    They are computed only once, see ``constant``, and must not be changed in place.
+    The store drops the results that were not used for the longest time.
 
     Args:
-        tensor: Real or complex tensor whose precision and device the result has.
-        function: Function at the top level of a module, which returns an array or numbers.
-        arguments: Hashable arguments of the function.
+        function: Function at the top level of a module, with hashable arguments, which returns a
+            tensor or another object with ``nbytes``.
 
-    >>> constant_like(torch.zeros(1).double(), np.hanning, 3)
-    tensor([0., 1., 0.], dtype=torch.float64)
-    """
-    dtype = tensor.dtype.to_real() if tensor.is_complex() else tensor.dtype
-    return constant(function, *arguments, dtype=dtype, device=tensor.device)
-
-
-def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return ``function(*arguments)``, which is computed once and then comes from a cache.
-
-    The cache drops the least recently used results.
-
-    Args:
-        function: Function at the top level of a module, which returns a tensor or another object
-            with ``nbytes``.
-        arguments: Hashable arguments of the function.
-
-    >>> compute_once(np.hanning, 5) is compute_once(np.hanning, 5)
+    >>> @compute_once
+    ... def window(points):
+    ...     return np.hanning(points)
+    >>> window(5) is window(5)
     True
     """
-    if torch.compiler.is_compiling():  # a program that is traced cannot use tensors from outside
-        return function(*arguments)
-    return _CACHE.get(function, arguments)
+
+    @wraps(function)
+    def compute(*arguments: P.args, **options: P.kwargs) -> Result:
+        # a program that is traced cannot use tensors from outside
+        if torch.compiler.is_compiling():
+            return function(*arguments, **options)
+        result: Result = _STORE.get_or_compute(function, *arguments, **options)
+        return result
+
+    return compute
 
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -187,16 +203,138 @@ class _DifferentiableOnce(torch.autograd.Function):
         raise RuntimeError(ctx.message)
 
 
-def _constant(
-    function: Callable[..., Any],
+def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
+    """Return the shape to which tensors of some shapes broadcast.
+
+    ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third
+    of a second.
+
+    Args:
+        shapes: Shapes of the tensors.
+
+    Raises:
+        RuntimeError: The shapes do not fit.
+
+    >>> broadcast_shape((3, 1), (2,))
+    torch.Size([3, 2])
+    """
+    number = torch.empty(())
+    return torch.broadcast_tensors(*(number.expand(shape) for shape in shapes))[0].shape
+
+
+def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
+    """Replace the samples after the end of each item by zeros.
+
+    Shape: (..., time), (...) -> (..., time).
+
+    Args:
+        waveform: Padded signals.
+        ends: Number of samples of each item before padding.
+
+    >>> silence_after(torch.ones(2, 3), torch.tensor([1, 2]))
+    tensor([[1., 0., 0.],
+            [1., 1., 0.]])
+    """
+    samples = torch.arange(waveform.shape[-1], device=waveform.device)
+    ends = ends.to(waveform.device, non_blocking=True)
+    return torch.where(samples < ends.unsqueeze(-1), waveform, 0.0)
+
+
+@compute_once
+def _design_tensor(
+    design: Callable[..., Any],
     arguments: tuple[Any, ...],
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
-    return as_tensor(function(*arguments), dtype, device)
+    return as_tensor(design(*arguments), dtype, device)
 
 
-class _Cache:
+# -- copies of thresholds on the CPU and on a GPU --------------------------------------------------
+
+_COPIES = WeakTensorKeyDictionary()
+"""Copies by original and device, each with the number of changes of the original at that time.
+
+Copying a tensor to a GPU, or back, makes the CPU wait until the GPU has finished all queued
+operations. Therefore each copy is made once, and remembered in both directions as long as the
+original exists and nobody writes into it.
+"""
+
+
+def on_device(values: Tensor, device: torch.device) -> Tensor:
+    """Return a tensor on a device, without synchronising if it is a constant on the CPU.
+
+    The original is remembered, so that ``on_host`` need not synchronise either.
+
+    Args:
+        values: Tensor of any shape.
+        device: Device of the result.
+
+    >>> on_device(torch.zeros(8), torch.device("cpu")).device
+    device(type='cpu')
+    """
+    if values.device == device:
+        return values
+    if values.device != _HOST or values.requires_grad:
+        return values.to(device)
+    copy = _find_copy(values, device)
+    if copy is None:
+        copy = values.to(device, non_blocking=True)
+        _add_copy(values, copy)
+        _add_copy(copy, values)
+    return copy
+
+
+def on_host(values: Tensor) -> Tensor:
+    """Return a tensor on the CPU, which synchronises with a GPU unless the values are known.
+
+    Args:
+        values: Tensor of any shape on any device.
+
+    >>> on_host(torch.zeros(8)).device
+    device(type='cpu')
+    """
+    copy = known_on_host(values)
+    if copy is None:
+        copy = values.detach().cpu()
+        _add_copy(values, copy)
+    return copy
+
+
+def known_on_host(values: Tensor) -> Tensor | None:
+    """Return a tensor on the CPU if its values are known there, else None.
+
+    Args:
+        values: Tensor of any shape on any device.
+
+    >>> known_on_host(torch.zeros(2))
+    tensor([0., 0.])
+    """
+    return values.detach() if values.device == _HOST else _find_copy(values, _HOST)
+
+
+def _find_copy(tensor: Tensor, device: torch.device) -> Tensor | None:
+    """Return the copy on a device, or None if there is none or the original has changed."""
+    if not _can_be_remembered(tensor):
+        return None
+    version, copy = _COPIES.get(tensor, {}).get(device, (None, None))
+    return copy if version == tensor._version else None
+
+
+def _add_copy(tensor: Tensor, copy: Tensor) -> None:
+    if _can_be_remembered(tensor):
+        _COPIES.setdefault(tensor, {})[copy.device] = tensor._version, copy
+
+
+def _can_be_remembered(tensor: Tensor) -> bool:
+    # a compiled program must not hold values, and inference tensors do not count their changes
+    return not (torch.compiler.is_compiling() or tensor.is_inference())
+
+
+# -- the store -------------------------------------------------------------------------------------
+
+
+class _Store:
     """Results by function and arguments, up to a number of bytes and at least the latest one."""
 
     def __init__(self, limit: int) -> None:
@@ -204,14 +342,14 @@ class _Cache:
         self._results: OrderedDict[Any, Any] = OrderedDict()
         self._lock = Lock()
 
-    def get(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        key = function, arguments
+    def get_or_compute(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        key = function, arguments, tuple(options.items())
         with self._lock:
             if key in self._results:
                 self._results.move_to_end(key)
                 return self._results[key]
         # The lock is open meanwhile, because a function may compute other constants.
-        result = without_modes(function, *arguments)
+        result = without_modes(function, *arguments, **options)
         with self._lock:
             self._results[key] = result
             while len(self._results) > 1 and self.nbytes > self.limit:
@@ -224,4 +362,4 @@ class _Cache:
         return sum(result.nbytes for result in self._results.values())
 
 
-_CACHE = _Cache(CACHE_BYTES)
+_STORE = _Store(STORE_BYTES)

@@ -136,7 +136,7 @@ def current_line() -> str:
 
 
 def count_wait(reason: str) -> None:
-    if any(frame.name == "compute_once" for frame in traceback.extract_stack()):
+    if any(frame.name == "get_or_compute" for frame in traceback.extract_stack()):
         return  # under a dispatch mode hlsim computes its constants anew, without one it keeps them
     waits[f"{reason} @ {current_line()}"] += 1
 

@@ -22,8 +22,10 @@ from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 @pytest.fixture(autouse=True)
 def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute constants in this thread, which has the device, and not in the shared cache."""
-    monkeypatch.setattr(torchtools, "without_modes", lambda function, *args: function(*args))
-    monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(torchtools.CACHE_BYTES))
+    monkeypatch.setattr(
+        torchtools, "without_modes", lambda function, *args, **kwargs: function(*args, **kwargs)
+    )
+    monkeypatch.setattr(torchtools, "_STORE", torchtools._Store(torchtools.STORE_BYTES))
     # so small that four items need several groups of channels
     monkeypatch.setattr(ear_model, "GPU_CHUNK", 2**20)
 

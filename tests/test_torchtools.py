@@ -9,47 +9,50 @@ from torch.func import grad
 from hlsim import MSBG, torchtools
 from hlsim.msbg.filterbank import BANKS
 from hlsim.msbg.multirate import multirate_bank
-from hlsim.torchtools import compute_once, constant, constant_like
+from hlsim.torchtools import constant
 
 CPU = torch.device("cpu")
 
 
-def test_compute_once_for_each_type_and_device() -> None:
+def test_constant_is_designed_once_for_each_type_and_device() -> None:
     calls = []
 
+    @constant
     def make(count: int) -> list[int]:
         calls.append(count)
         return [1] * count
 
-    first = constant(make, 3, dtype=torch.float32, device=CPU)
-    assert constant(make, 3, dtype=torch.float32, device=CPU) is first
+    single, double = torch.zeros(1), torch.zeros(1).double()
+    first = make(3, like=single)
+    assert make(3, like=single) is first
     assert first.tolist() == [1.0] * 3
-    assert constant(make, 3, dtype=torch.float64, device=CPU).dtype == torch.float64
-    assert constant(make, 4, dtype=torch.float32, device=CPU).shape == (4,)
-    assert constant(make, 3, dtype=torch.float32, device=torch.device("meta")).is_meta
+    assert make(3, like=double).dtype == torch.float64
+    assert make(4, like=single).shape == (4,)
+    assert make(3, like=torch.zeros(1, device="meta")).is_meta
     assert calls == [3, 3, 4, 3]
+    assert make(2) == [1, 1]
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> torchtools._Cache:
-    cache = torchtools._Cache(4 * 2**20)
-    monkeypatch.setattr(torchtools, "_CACHE", cache)
-    return cache
+def small(monkeypatch: pytest.MonkeyPatch) -> torchtools._Store:
+    store = torchtools._Store(4 * 2**20)
+    monkeypatch.setattr(torchtools, "_STORE", store)
+    return store
 
 
 def test_complex_constants_and_those_like_a_tensor() -> None:
+    @constant
     def make(count: int) -> np.ndarray:
         return 1j * np.arange(count)[::-1]
 
     for dtype, expected in ((torch.float32, torch.complex64), (torch.float64, torch.complex128)):
-        tensor = constant(make, 3, dtype=dtype, device=CPU)
+        tensor = make(3, like=torch.ones(1, dtype=dtype))
         assert tensor.dtype == expected and tensor.is_contiguous()
         assert tensor.imag.tolist() == [2.0, 1.0, 0.0]
-        for like in (torch.ones(1, dtype=dtype), torch.ones(1, dtype=expected)):
-            assert constant_like(like, make, 3) is tensor
+        assert make(3, like=torch.ones(1, dtype=expected)) is tensor
 
 
-def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Cache) -> None:
+def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Store) -> None:
     model = MSBG("N3")
     signals = [0.01 * torch.ones(1, 3000 + 2000 * n) for n in range(8)]
     first = [model(signal) for signal in signals]
@@ -59,16 +62,16 @@ def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Cach
     assert small.nbytes <= small.limit
 
 
-def test_one_that_is_too_large_is_held_all_the_same(small: torchtools._Cache) -> None:
-    key = (multirate_bank, BANKS["severe"], 24 * 4000, 1, 22050.0, torch.float32, CPU)
-    bank = compute_once(*key)
-    assert compute_once(*key) is bank and small.nbytes > small.limit
-    constant(np.arange, 4410, dtype=torch.float32, device=CPU)
+def test_one_that_is_too_large_is_held_all_the_same(small: torchtools._Store) -> None:
+    arguments = (BANKS["severe"], 24 * 4000, 1, 22050.0, torch.float32, CPU)
+    bank = multirate_bank(*arguments)
+    assert multirate_bank(*arguments) is bank and small.nbytes > small.limit
+    constant(np.arange)(4410, like=torch.zeros(1))
     assert small.nbytes <= small.limit
 
 
 def test_constants_of_inference_mode_or_a_transform_serve_gradients_later(
-    small: torchtools._Cache,
+    small: torchtools._Store,
 ) -> None:
     model = MSBG("N3")
     wave, gain = 0.03 * torch.randn(1, 1200), torch.tensor(1.0)

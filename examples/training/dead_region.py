@@ -9,7 +9,8 @@ perceives nothing.
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram.thresholds import interpolate
+from hlsim.audiogram import FREQUENCIES
+from hlsim.dsp.interpolation import interpolate
 
 TAPS = 512
 """Length of the filter in samples, 32 ms."""
@@ -27,7 +28,7 @@ class DeadRegion(nn.Module):
     def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
         """Simulate the loss. Shape: (..., time), (..., 8) in dB HL -> (..., time), time-aligned."""
         hz = tuple(number * self.sample_rate / TAPS for number in range(TAPS // 2 + 1))
-        loss_db = interpolate(audiogram, hz)
+        loss_db = interpolate(audiogram, FREQUENCIES, hz)
         is_dead = (loss_db > 70.0) & (torch.tensor(hz, device=loss_db.device) >= 2000.0)
         is_alive = is_dead.cumsum(-1) == 0
         gains = 10.0 ** (-loss_db.clamp_min(0.0) / 20.0) * is_alive

@@ -7,10 +7,7 @@ Newall 1990, Ear and Hearing 11(1).
 import torch
 from torch import Tensor
 
-from hlsim.torchtools import constant_like
-
-BIAS_DB = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
-"""Constant of NAL-R's formula at each of its frequencies."""
+from hlsim.torchtools import constant
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
@@ -35,10 +32,16 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
         0.05 * three_frequency_sum,
         9.0 + 0.116 * (three_frequency_sum - 180.0),
     )
-    bias = constant_like(losses, tuple, tuple(BIAS_DB.values()))
+    bias = _bias(like=losses)
     gains = (common + 0.31 * losses + bias).clamp_min(0.0)
     low, high = gains[..., :4], gains[..., 4:]
     at_3_khz = 0.5 * (low[..., -1:] + high[..., :1])
     all_gains = torch.cat((low, at_3_khz, high, high[..., -1:]), -1)
     has_no_loss = (losses <= 0.0).all(-1, keepdim=True)
     return torch.where(has_no_loss, 0.0, all_gains)
+
+
+@constant
+def _bias() -> list[float]:
+    """Return the constant in dB of the formula at 250, 500, 1000, 2000, 4000 and 6000 Hz."""
+    return [-17.0, -8.0, 1.0, -1.0, -2.0, -2.0]

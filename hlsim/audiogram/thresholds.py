@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram.devices import known_on_host, on_device, on_host
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.scale import FREQUENCIES, HIGHEST_SIMULATED, LOWEST_LEVEL
 from hlsim.audiogram.value import Audiogram, EarLike, check_range, find_audiogram
-from hlsim.checks import broadcast_shape
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import broadcast_shape, known_on_host, on_device, on_host
 
 AudiogramLike = EarLike | Listener | Sequence[EarLike] | Sequence[Listener]
 """One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
@@ -220,45 +217,6 @@ def check_two_channels(waveform: Tensor) -> None:
             f"got {tuple(waveform.shape)}; pass torch.stack([left, right], -2), with the same "
             "signal twice if it is mono"
         )
-
-
-def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
-    """Interpolate thresholds at the eight ``FREQUENCIES`` to other frequencies, linearly in Hz.
-
-    Below the lowest of the eight frequencies, the result is the threshold at that frequency; above
-    the highest, the threshold at the highest.
-
-    Shape: (..., 8) -> (..., frequencies).
-
-    Args:
-        levels: Thresholds in dB HL.
-        frequencies: Frequencies of the result in Hz.
-
-    >>> interpolate(torch.arange(8.0), (375.0, 9000.0))
-    tensor([0.5000, 7.0000])
-    """
-    # A GPU may round matrix products to ten bits, so this is a sum of products.
-    weights = constant_like(levels, interpolation_weights, frequencies)
-    return (levels.unsqueeze(-1) * weights).sum(-2)
-
-
-def interpolation_weights(
-    frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
-) -> NDArray[np.float64]:
-    """Compute the matrix that interpolates levels linearly in Hz, and continues them as constants.
-
-    Args:
-        frequencies: Frequencies of the result in Hz.
-        grid: Frequencies of the levels in Hz.
-
-    Returns:
-        Weights, (grid, frequencies). The product of levels on the grid and this matrix are the
-        levels at the frequencies.
-
-    >>> interpolation_weights((375.0,)).T
-    array([[0.5, 0.5, 0. , 0. , 0. , 0. , 0. , 0. ]])
-    """
-    return np.stack([np.interp(frequencies, grid, row) for row in np.eye(len(grid))])
 
 
 def _check_tensor(levels: Any, highest: float) -> Tensor:

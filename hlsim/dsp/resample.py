@@ -90,7 +90,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
             f"divisor, {common}, is too small; choose rates such as 16000, 22050, 24000, "
             "32000, 44100 and 48000"
         )
-    kernel = compute_once(sinc_kernel, source, target, waveform.dtype, waveform.device)
+    kernel = sinc_kernel(source, target, waveform.dtype, waveform.device)
 
     *leading, time = waveform.shape
     signals = waveform.reshape(math.prod(leading), 1, time)
@@ -102,6 +102,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     return resampled[..., : -(-time * target // source)]
 
 
+@compute_once
 def sinc_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Compute the filters with which a convolution resamples signals.
 

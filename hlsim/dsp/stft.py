@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import rfft
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,10 @@ class STFT:
 
     def _hann_window(self, like: Tensor) -> Tensor:
         """Hann window in the precision and on the device of a tensor. Shape: (window,)."""
-        return constant_like(like, _hann, self.window)
+        return _hann(self.window, like=like)
 
 
+@constant
 def _hann(points: int) -> NDArray[np.float64]:
     """Compute a periodic Hann window of shape (points,)."""
     return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(points) / points)

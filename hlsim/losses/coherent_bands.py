@@ -112,7 +112,7 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
     aligned = cross.real.contiguous() @ shares
     product = (level + _POWER_FLOOR) * reference_level + PRODUCT_FLOOR
 
-    quiet = constant(_quiet_power, dtype=perceived.dtype, device=perceived.device)
+    quiet = _quiet_power(like=perceived)
     strongest = reference_level.detach().amax((-2, -1), keepdim=True)
     threshold = torch.maximum(quiet, 10.0 ** (-_DEPTH_DB / 10.0) * strongest)
     weights = _audibility(reference_level, threshold)
@@ -175,6 +175,7 @@ def _decibels(powers: Tensor) -> Tensor:
     return 10.0 * torch.log10(powers + _POWER_FLOOR)
 
 
+@constant
 def _quiet_power() -> NDArray[np.float64]:
     """Return the power of each band at the threshold of hearing, (24,)."""
     return 10.0 ** ((threshold_in_quiet() - PASCAL_SPL) / 10.0)

@@ -6,18 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.devices import on_device
-from hlsim.checks import broadcast_shape
 from hlsim.dsp.resample import resample
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
 from hlsim.simulators import load_simulator
-from hlsim.torchtools import constant, flatten_items
+from hlsim.torchtools import broadcast_shape, compute_once, flatten_items, on_device
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
@@ -167,9 +164,7 @@ class FrozenSimulator:
         if self.normal is not None:
             return check_shape(self.normal(clean), "normal ear", clean.shape)
         # Thresholds whose values the CPU knows, so that it need not wait for a GPU.
-        cpu = torch.device("cpu")
-        no_loss = constant(np.zeros, len(FREQUENCIES), dtype=clean.dtype, device=cpu)
-        return self.simulate(clean, on_device(no_loss, clean.device), lengths)
+        return self.simulate(clean, on_device(_normal_ear(), clean.device), lengths)
 
     def _limit_band(self, clean: Tensor) -> Tensor:
         """Remove the frequencies above those that the simulator returns."""
@@ -177,6 +172,12 @@ class FrozenSimulator:
             return clean
         low = resample(clean, self.sample_rate, round(self._band_rate))
         return resample(low, round(self._band_rate), self.sample_rate)[..., : clean.shape[-1]]
+
+
+@compute_once
+def _normal_ear() -> Tensor:
+    """Return the thresholds of a normal ear on the CPU."""
+    return torch.zeros(len(FREQUENCIES), device="cpu")
 
 
 def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:

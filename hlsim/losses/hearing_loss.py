@@ -21,12 +21,11 @@ from hlsim.checks import (
     check_lengths,
     check_rate,
     check_waveform,
-    silence_after,
 )
 from hlsim.losses.criteria import Comparison, CriterionLike, read_criterion, weighted_sum
 from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, Reference, ReferenceName
 from hlsim.losses.gradient_limit import limit_gradient_spikes
-from hlsim.torchtools import flatten_items, not_compiled
+from hlsim.torchtools import flatten_items, not_compiled, silence_after
 
 _Reduction = Literal["mean", "none"]
 

@@ -123,7 +123,7 @@ def audibility_threshold(levels: Tensor) -> Tensor:
     >>> audibility_threshold(torch.full((1, 10, 24), 60.0))[0, 0, :3]
     tensor([23.0014, 20.0000, 20.0000])
     """
-    quiet = constant(threshold_in_quiet, dtype=levels.dtype, device=levels.device)
+    quiet = threshold_in_quiet(like=levels)
     return torch.maximum(quiet, levels.amax((-2, -1), keepdim=True) - _DEPTH_DB).detach()
 
 
@@ -162,7 +162,7 @@ def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor, float]:
     """
     hop = round(FRAME_SECONDS / 2.0 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
-    shares = constant(_band_shares, stft.fft, sample_rate, dtype=like.dtype, device=like.device)
+    shares = _band_shares(stft.fft, sample_rate, like=like)
     # Positive and negative frequencies count. The squares of a Hann window of n samples sum to
     # 3 n / 8.
     return stft, shares, 2.0 / (stft.fft * 0.375 * stft.window)
@@ -188,6 +188,7 @@ def band_centres() -> NDArray[np.float64]:
     return np.sqrt(edges[1:] * edges[:-1])
 
 
+@constant
 def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     """Return the share of each frequency of a transform in each band, (fft // 2 + 1, 24)."""
     spacing = sample_rate / fft
@@ -198,6 +199,7 @@ def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     return np.clip((upper - lower) / spacing, 0.0, None)
 
 
+@constant
 def threshold_in_quiet() -> NDArray[np.float64]:
     """Return the softest level that a normal ear hears in each band in dB SPL, (24,).
 

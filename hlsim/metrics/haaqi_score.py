@@ -38,7 +38,7 @@ from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.quality import QualityParts, QualityReference
-from hlsim.torchtools import constant_like, not_compiled
+from hlsim.torchtools import constant, not_compiled
 
 ENVELOPE_SEGMENT = 192
 """Samples of a segment of the smoothed envelopes, 8 ms at 24 kHz."""
@@ -124,11 +124,12 @@ def _split_by_rate(waves: Tensor) -> Tensor:
     """
     time = waves.shape[-1]
     points = fft_length(max(time + MODULATION_ORDER // 2, MODULATION_ORDER + 1), 2)
-    responses = constant_like(waves, _modulation_responses, points)
+    responses = _modulation_responses(points, like=waves)
     spectrum = torch.fft.rfft(waves, points)[:, None] * responses[:, None]
     return torch.fft.irfft(spectrum, points)
 
 
+@constant
 def _modulation_responses(points: int) -> NDArray[np.float64]:
     """Return the frequency responses of the bands of modulation: (4, points // 2 + 1)."""
     filters = []

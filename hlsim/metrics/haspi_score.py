@@ -41,7 +41,7 @@ from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.reference import PreparedBatch, Reference
-from hlsim.torchtools import constant_like, not_compiled
+from hlsim.torchtools import constant, not_compiled
 
 
 @not_compiled  # tracing takes minutes
@@ -309,13 +309,14 @@ def _intelligibility(features: Tensor) -> Tensor:
     Shape: (..., 10) -> (...,).
     """
     hidden, output, normalisation = (
-        constant_like(features, _network, part) for part in ("hidden", "output", "normalisation")
+        _network(part, like=features) for part in ("hidden", "output", "normalisation")
     )
     hidden_sums = (features[..., None, None, :] * hidden[..., 1:]).sum(-1) + hidden[..., 0]
     output_sums = (torch.sigmoid(hidden_sums) * output[:, 1:]).sum(-1) + output[:, 0]
     return torch.sigmoid(output_sums).mean(-1) / normalisation.squeeze(0)
 
 
+@constant
 def _network(part: str) -> NDArray[np.float64]:
     """Return weights of the networks that map features to HASPI, biases first.
 

@@ -18,7 +18,7 @@ from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 OCTAVES = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
 """Centre frequencies of the octaves in Hz."""
@@ -141,9 +141,10 @@ def spectra_of_ears(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor,
     left_power = power(left).mean(-2)
     right_power = power(right).mean(-2)
     cross = (left * right.conj()).mean(-2)
-    return left_power, right_power, cross, constant_like(cross, _octaves, stft.fft, sample_rate)
+    return left_power, right_power, cross, _octaves(stft.fft, sample_rate, like=cross)
 
 
+@constant
 def _octaves(points: int, sample_rate: int) -> NDArray[np.float64]:
     """Assign the frequencies of a Fourier transform to octaves.
 

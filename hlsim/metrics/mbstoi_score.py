@@ -30,7 +30,7 @@ from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.dsp.fft import power, rfft
 from hlsim.metrics.pair import check_finite, match_pair
 from hlsim.metrics.reference import map_on_cores
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 RATE = 10000
 """Sample rate in Hz at which the score is defined."""
@@ -149,7 +149,7 @@ def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
     Raises:
         ValueError: Too few frames remain for a segment.
     """
-    window = constant_like(signals, _window)
+    window = _window(like=signals)
     missing = FRAME + 1 - signals.shape[-1]
     padded = functional.pad(signals, (0, max(0, missing)))
     # As in pyclarity, a frame that ends with the signal is left out.
@@ -186,6 +186,7 @@ def _frames_to_end(counts: list[int], device: torch.device) -> Tensor:
     return torch.cat([torch.arange(count, 0, -1, device=device) for count in counts])
 
 
+@constant
 def _window() -> NDArray[np.float64]:
     """Return a Hann window without the zeros at its ends."""
     window: NDArray[np.float64] = np.hanning(FRAME + 2)[1:-1]
@@ -205,7 +206,7 @@ def _band_features(frames: Tensor) -> Tensor:
     left, right = rfft(functional.pad(frames, (0, POINTS - FRAME))).unbind(1)
     cross = left * right.conj()
     features = torch.stack([power(left), power(right), cross.real, cross.imag], 1)
-    bands = features @ constant_like(frames, _band_matrix)
+    bands = features @ _band_matrix(like=frames)
     return bands.flatten(0, 1).permute(1, 2, 0)
 
 
@@ -232,6 +233,7 @@ def _mean_correlation(features: Tensor, counts: list[int]) -> Tensor:
     return torch.stack([item.mean() for item in items])
 
 
+@constant
 def _band_matrix() -> NDArray[np.float64]:
     """Return 1 where a frequency lies in a band, and 0 elsewhere: (frequencies, bands)."""
     bins = np.arange(POINTS // 2 + 1)[:, None]
@@ -260,7 +262,7 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
         (part + part.transpose(-1, -2))[..., first, second]
         for part in (products[..., :4, :4], products[..., :4, 4:], products[..., 4:, 4:])
     )
-    grid = constant_like(windows, _cancellation_weights)
+    grid = _cancellation_weights(like=windows)
     with torch.no_grad():
         ratio, index = _find_largest_ratio(clean, output, grid)
         is_silent = ~(clean.any(-1) & output.any(-1))
@@ -308,6 +310,7 @@ def _find_largest_ratio(clean: Tensor, output: Tensor, grid: Tensor) -> tuple[Te
     return torch.stack(ratios, -1), torch.stack(indices, -1)
 
 
+@constant
 def _cancellation_weights() -> NDArray[np.float64]:
     """Compute the weights of products of band features after equalisation and cancellation.
 

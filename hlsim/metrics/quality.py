@@ -354,12 +354,13 @@ def _threshold_noise(
     if noise == "expected":
         # The same noise every time: each channel takes its part of one signal. Only audible parts
         # of the clean signal count, and the noise is far below them.
-        table = constant(_frozen_table, dtype=torch.float32, device=like.device)
+        table = _frozen_table(like=like.float())
         copies = -(-((CHANNELS - 1) * FROZEN_STRIDE + longest) // FROZEN_SAMPLES)
         return None, table.repeat(copies).unfold(0, longest, FROZEN_STRIDE)[:CHANNELS]
     return None, None
 
 
+@constant
 def _frozen_table() -> NDArray[np.float64]:
     return np.random.RandomState(0).standard_normal(FROZEN_SAMPLES)
 

@@ -15,12 +15,10 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import HIGHEST_LEVEL
-from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import (
     Lengths,
-    broadcast_shape,
     check_choice,
     check_lengths,
     check_number,
@@ -32,6 +30,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
 from hlsim.metrics.pair import SHORTEST_SECONDS, Noise, check_finite, check_pair
+from hlsim.torchtools import broadcast_shape, on_host
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")

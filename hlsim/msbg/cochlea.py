@@ -28,7 +28,7 @@ from hlsim.msbg.filterbank import FilterBank, gammatone_response
 from hlsim.msbg.filtfilt_end import end_correction
 from hlsim.msbg.multirate import RateBand, multirate_bank
 from hlsim.msbg.recruitment import apply_gains, expand, recruitment_gains
-from hlsim.torchtools import compute_once, constant_like
+from hlsim.torchtools import constant
 
 _TAIL = 3200
 """Samples of silence behind a signal, 73 ms.
@@ -139,9 +139,7 @@ def simulate_cochlea(
     torch.Size([1, 2401])
     """
     spectrum = rfft(signals, points // rate_divisor)
-    multirate = compute_once(
-        multirate_bank, bank, points, rate_divisor, highest, signals.dtype, signals.device
-    )
+    multirate = multirate_bank(bank, points, rate_divisor, highest, signals.dtype, signals.device)
     channels_of_bands = []
     sums = []
     for band in multirate.bands:
@@ -248,15 +246,16 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
     """
     length = waveform.shape[-1]
     points = fft_length(length + _TAIL, 2 * STEP)
-    response = constant_like(waveform, gammatone_response, bank, points)
+    response = gammatone_response(bank, points, like=waveform)
     spectrum = rfft(waveform, points).unsqueeze(-2) * response
-    before_end = constant_like(waveform, _before_advanced_end, bank, points, length)
+    before_end = _before_advanced_end(bank, points, length, like=waveform)
     channels = torch.fft.irfft(spectrum, points) * before_end
-    envelopes = envelope(channels, constant_like(waveform, envelope_lowpass, bank, points))
+    envelopes = envelope(channels, envelope_lowpass(bank, points, like=waveform))
     envelopes = envelopes + end_correction(channels, bank, length)
     return expand(channels, envelopes, ratios)[..., :length]
 
 
+@constant
 def _before_advanced_end(bank: FilterBank, points: int, length: int) -> NDArray[np.bool]:
     """Compute a mask of the samples before the end of each channel, (channels, points).
 

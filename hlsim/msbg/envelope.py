@@ -23,7 +23,7 @@ from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 STEP = 24
 """Samples at 44.1 kHz from one value of an envelope, and of the gain from it, to the next."""
@@ -167,10 +167,11 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
     >>> envelope(torch.full((1, 96), -2.0), torch.ones(1, 3)).round(decimals=3)
     tensor([[2., 2., 2., 2.]])
     """
-    weights = constant_like(channels, mean_weights)
+    weights = mean_weights(like=channels)
     return smooth(partial_means(channels.abs(), weights), lowpass)
 
 
+@constant
 def envelope_lowpass(
     bank: FilterBank,
     points: int,
@@ -233,6 +234,7 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
     return [scipy.signal.ellip(2, 0.25, 35.0, cutoff, fs=MSBG_RATE) for cutoff in cutoffs]
 
 
+@constant
 def mean_weights(samples: int = STEP) -> NDArray[np.float64]:
     """Compute the weights for ``partial_means``: how much each sample contributes to averages.
 

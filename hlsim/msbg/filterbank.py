@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
+from hlsim.torchtools import constant
 
 _CORNER_STEP_HZ = MSBG_RATE / 8192.0
 """Unit of the high-passes' corner frequencies."""
@@ -100,6 +101,7 @@ BANKS = {"none": _NARROW, "mild": _NARROW, "moderate": _MIDDLE, "severe": _WIDE}
 """Filter bank of each severity of hearing loss."""
 
 
+@constant
 def gammatone_response(
     bank: FilterBank, points: int, channels: slice = slice(None), bins: int | None = None
 ) -> NDArray[np.complex128]:

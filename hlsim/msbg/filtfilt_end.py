@@ -22,7 +22,7 @@ from torch.nn import functional
 from hlsim.msbg.envelope import STEP, envelope_filters
 from hlsim.msbg.filterbank import FilterBank
 from hlsim.msbg.recruitment import AHEAD
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 LOOK_BACK = 4096
 """Number of last samples that matter, after which the slowest low-pass has decayed by 70 dB."""
@@ -55,8 +55,8 @@ def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
     >>> end_correction(torch.zeros(19, 240), BANKS["severe"], length=100).shape
     torch.Size([19, 10])
     """
-    weights = constant_like(channels, _amplitude_weights, bank)
-    oscillations = constant_like(channels, _sampled_oscillations, bank, (length - 1) % STEP)
+    weights = _amplitude_weights(bank, like=channels)
+    oscillations = _sampled_oscillations(bank, (length - 1) % STEP, like=channels)
     first = max(0, length - LOOK_BACK)
     last_samples = channels[..., first:length].abs().unsqueeze(-1)
     amplitudes = weights[..., -last_samples.shape[-2] :] @ last_samples
@@ -67,6 +67,7 @@ def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
     return functional.pad(correction, (end - correction.shape[-1], steps - end))
 
 
+@constant
 def _amplitude_weights(bank: FilterBank) -> Array:
     """Compute the weights of the last samples in the two amplitudes of each channel.
 
@@ -76,6 +77,7 @@ def _amplitude_weights(bank: FilterBank) -> Array:
     return _oscillations(bank)[0]
 
 
+@constant
 def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
     """Compute the two free oscillations of each channel's low-pass once per step.
 

@@ -19,18 +19,17 @@ from hlsim.audiogram import (
     Audiogram,
     severity_index,
 )
-from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     ears_on_other_grids,
     has_listeners,
-    interpolation_weights,
     resolve_thresholds,
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import broadcast_shape, check_rate, check_waveform
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import rfft
+from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.msbg.cochlea import (
     cochlea_fft_length,
     common_period,
@@ -44,7 +43,7 @@ from hlsim.msbg.overlapping_blocks import in_blocks
 from hlsim.msbg.recruitment import expansion_ratios
 from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix
-from hlsim.torchtools import constant_like, flatten_items, not_compiled
+from hlsim.torchtools import broadcast_shape, flatten_items, not_compiled, on_host
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz, without smearing, by which ``aligned`` advances the output.
@@ -281,12 +280,10 @@ class MSBG(nn.Module):
         length = math.ceil((model_samples + delay) / rate_divisor)
         cochlear = to_cochlea(precise, rate, length, rate_divisor)
         if smears:
-            matrix = constant_like(cochlear, smearing_matrix, group.severity, rate_divisor, highest)
+            matrix = smearing_matrix(group.severity, rate_divisor, highest, like=cochlear)
             cochlear = smear(cochlear, matrix, rate_divisor)
         cochlear = cochlear.to(signals.dtype)
-        weights = constant_like(
-            signals, interpolation_weights, bank.centre_frequencies, group.frequencies
-        )
+        weights = interpolation_weights(group.frequencies, bank.centre_frequencies, like=signals)
         ratios = expansion_ratios(ears, weights)
         gain = 10.0 ** (-bank.recombination_db / 20.0)
         length = cochlear.shape[-1]
@@ -296,7 +293,7 @@ class MSBG(nn.Module):
 
         points = cochlea_fft_length(length * rate_divisor, rate, rate_divisor)
         if group.no_loss:
-            response = constant_like(cochlear, total_response, bank, points, rate_divisor)
+            response = total_response(bank, points, rate_divisor, like=cochlear)
             spectrum = rfft(cochlear, points // rate_divisor) * response
         else:
             spectrum = simulate_cochlea(

@@ -34,7 +34,7 @@ from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, envelope_lowpass, mean_wei
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
 from hlsim.msbg.recruitment import interpolation_kernel
 from hlsim.msbg.smearing import SKIRT_HZ
-from hlsim.torchtools import as_tensor
+from hlsim.torchtools import as_tensor, compute_once, constant
 
 _BANDWIDTHS_ABOVE_CENTRE = 5.0
 """Bandwidths above its centre frequency up to which a channel is kept."""
@@ -167,6 +167,7 @@ def _assign_rates(
     return groups
 
 
+@compute_once
 def multirate_bank(
     bank: FilterBank,
     points: int,
@@ -254,6 +255,7 @@ def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
     return float(gain ** (1.0 / exponent) / total)
 
 
+@constant
 def total_response(bank: FilterBank, points: int, rate_divisor: int) -> NDArray[np.complex128]:
     """Compute the frequency response of the sum of all channels, for ears without any loss.
 

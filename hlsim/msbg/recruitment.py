@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.envelope import STEP
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which an impaired ear perceives sounds as loud as a normal one."""
@@ -221,11 +221,12 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     >>> expand(tone, torch.full((1, 8), 0.35481), torch.tensor([2.0]))[:3].round(decimals=3)
     tensor([0.1000, 0.1000, 0.1000])
     """
-    kernel = constant_like(channels, interpolation_kernel)
+    kernel = interpolation_kernel(like=channels)
     gains = recruitment_gains(envelopes, ratios)
     return apply_gains(channels, gains, kernel, (envelopes, ratios))
 
 
+@constant
 def interpolation_kernel(
     samples: int = STEP, repeats: int = 1, steps_per_window: int = 8
 ) -> NDArray[np.float64]:

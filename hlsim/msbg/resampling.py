@@ -19,7 +19,7 @@ from torch import Tensor
 from hlsim.dsp.fft import fade_out_weights, fft_length, rfft
 from hlsim.dsp.fir import BLOCK_POINTS, filter_in_blocks
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 _FIR_TAIL = 2 * EAR_DELAY + 132
 """Samples at 44.1 kHz by which the filters of the way out lengthen a signal."""
@@ -40,14 +40,14 @@ def to_cochlea(signals: Tensor, rate: int, length: int, rate_divisor: int) -> Te
     torch.Size([2, 44100])
     """
     if rate == MSBG_RATE and rate_divisor == 1:
-        return filter_in_blocks(signals, constant_like(signals, _inward_block_response), length)
+        return filter_in_blocks(signals, _inward_block_response(like=signals), length)
     up, down = _rate_ratio(rate, rate_divisor)
     tail = math.ceil(_FIR_TAIL * down / up / rate_divisor)
     samples = max(signals.shape[-1], math.ceil(length * down / up)) + tail
     outer_points, inner_points = _fft_lengths(samples, up, down)
     bins = min(outer_points, inner_points) // 2 + 1
     points = inner_points * rate_divisor
-    response = constant_like(signals, _inward_response, points, bins, up / down, rate)
+    response = _inward_response(points, bins, up / down, rate, like=signals)
     spectrum = rfft(signals, outer_points)[..., :bins] * response
     return torch.fft.irfft(spectrum, inner_points)[..., :length]
 
@@ -87,7 +87,7 @@ def from_spectrum(
     outer_points = points * rate // MSBG_RATE
     bins = min(inner_points, outer_points) // 2 + 1
     total_gain = gain * outer_points / inner_points
-    response = constant_like(spectrum, _outward_response, points, delay, bins, total_gain, rate)
+    response = _outward_response(points, delay, bins, total_gain, rate, like=spectrum)
     return torch.fft.irfft(spectrum[..., :bins] * response, outer_points)[..., :samples]
 
 
@@ -126,11 +126,13 @@ def from_cochlea(
     return from_spectrum(spectrum, points, rate_divisor, rate, samples, gain=gain, delay=delay)
 
 
+@constant
 def _inward_block_response() -> NDArray[np.complex128]:
     """Compute the response of outer and middle ear for ``filter_in_blocks``."""
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 
+@constant
 def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
     """Compute the response of outer and middle ear and of resampling, with a gain, (bins,).
 
@@ -143,6 +145,7 @@ def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[
     return gain * np.fft.rfft(ear_filter(), points)[:bins] * _band_end(points, bins, rate)
 
 
+@constant
 def _outward_response(
     points: int, delay: int, bins: int, gain: float, rate: int
 ) -> NDArray[np.complex128]:

@@ -19,7 +19,7 @@ from hlsim.dsp.fir import filter_without_delay
 from hlsim.msbg.ear import MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 _HALF_LENGTH_SECONDS = 0.064
 """Time in seconds that impulse responses cover before and after time 0."""
@@ -84,7 +84,7 @@ def apply_bank_phase(
     torch.Size([1, 1600])
     """
     severity = severity_index(thresholds)
-    taps = constant_like(waveform, _taps, rate, "difference" if normal else "phase")[severity]
+    taps = _taps(rate, "difference" if normal else "phase", like=waveform)[severity]
     filtered = filter_without_delay(waveform, taps)
     if not normal:
         return filtered
@@ -112,10 +112,11 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
     >>> simulate_normal_ear(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
     torch.Size([1, 1600])
     """
-    taps = constant_like(waveform, _taps, rate, "normal ear")[severity_index(thresholds)]
+    taps = _taps(rate, "normal ear", like=waveform)[severity_index(thresholds)]
     return filter_without_delay(waveform, taps)
 
 
+@constant
 def _taps(rate: int, kind: str) -> NDArray[np.float64]:
     """Compute an impulse response for each severity, from the response of its filter bank.
 

@@ -19,7 +19,7 @@ from torch.nn import functional
 from hlsim.dsp.erb import ERB_AT_0_HZ, erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 FRAME = 256
 """Length of a frame in samples at 44.1 kHz."""
@@ -123,6 +123,7 @@ def smearing_from_filters(
     return np.asarray(solution[:count], dtype=np.float64)
 
 
+@constant
 def smearing_matrix(
     severity: str, rate_divisor: int = 1, highest: float = MSBG_RATE / 2.0
 ) -> NDArray[np.float64]:
@@ -172,7 +173,7 @@ def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
     """
     hop = HOP // rate_divisor
     count = math.ceil(waveform.shape[-1] / hop)
-    window = constant_like(waveform, _window, rate_divisor)
+    window = _window(rate_divisor, like=waveform)
     frames = _cut_frames(waveform, count, hop, window)
     spectrum, _ = smear_spectrum(rfft(frames)[..., : len(matrix)], matrix)
     half = len(window) // 2
@@ -297,6 +298,7 @@ class _SmearSpectrum(torch.autograd.Function):
         return spectrum_gradient, matrix_gradient, None
 
 
+@constant
 def _window(rate_divisor: int) -> Tensor:
     """Compute the window of analysis and synthesis, followed by as many zeros.
 

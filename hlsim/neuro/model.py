@@ -7,10 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
-from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import SIMULATOR, read_checkpoint
 from hlsim.dsp.fft import power
+from hlsim.dsp.interpolation import interpolate
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.bands import BandCorrection
 from hlsim.neuro.blocks import DualPathBlock
@@ -195,7 +195,9 @@ class NeuroMSBG(EarNetwork):
             log_mask = maps[:, -1]
             if self.prior is not None:
                 # Errors of the prior's envelope are in proportion to the recruitment of the ear.
-                ratios = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz))
+                ratios = CATCH_UP_SPL / (
+                    CATCH_UP_SPL - interpolate(ears, FREQUENCIES, self.config.hz)
+                )
                 log_mask = maps[:, 0] * (ratios - 1.0).unsqueeze(1) + log_mask
             log_mask = log_mask.clamp(MIN_LOG_MASK, MAX_LOG_MASK)
             if self.phase_decoder is None:

@@ -10,11 +10,11 @@ from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import NEURO_RATE, check_full_scale, gain_to_pascals
-from hlsim.checks import broadcast_shape, check_rate, check_waveform
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NetworkConfig
-from hlsim.torchtools import flatten_items
+from hlsim.torchtools import broadcast_shape, flatten_items
 
 # On a CPU, larger feature maps take time because the C library returns their memory to the system
 # after each operation.

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import SEVERITIES
-from hlsim.audiogram.thresholds import interpolation_weights
+from hlsim.audiogram import FREQUENCIES, SEVERITIES
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.dsp.fir import filter_without_delay
+from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
@@ -36,7 +36,7 @@ from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
 from hlsim.msbg.smearing import BROADENING, roex_filters, smear_spectrum, smearing_from_filters
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
 """Number of samples at 16 kHz that fixed responses have before time 0, and from it on."""
@@ -224,7 +224,7 @@ class Prior(nn.Module):
             thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
-        weights = constant_like(thresholds, _threshold_weights)[severity]
+        weights = _threshold_weights(like=thresholds)[severity]
         exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
         return (log_envelope - _LOG_CATCH_UP).clamp_max(0.0) * exponents
 
@@ -347,13 +347,14 @@ def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
     return matrix[: stft.frequencies, : stft.frequencies]
 
 
+@constant
 def _threshold_weights() -> NDArray[np.float64]:
     """Compute the weights of thresholds in each channel, 0 for channels that a bank lacks.
 
     Returns: Weights of shape (severities, 8, channels).
     """
     banks = [BANKS[severity] for severity in SEVERITIES]
-    weights = [interpolation_weights(bank.centre_frequencies) for bank in banks]
+    weights = [interpolation_weights(FREQUENCIES, bank.centre_frequencies) for bank in banks]
     return np.stack([_pad_channels(bank_weights.T).T for bank_weights in weights])
 
 

@@ -9,8 +9,9 @@ import torch
 from compensators import NALR, load_compensator
 from hlsim import MSBG, load_pretrained
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.audiogram.thresholds import as_thresholds, interpolate, interpolation_weights
+from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.data.ears import draw_thresholds
+from hlsim.dsp.interpolation import interpolate, interpolation_weights
 from hlsim.metrics import haspi
 
 
@@ -75,7 +76,7 @@ def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
     rows = levels.reshape(6, 8).double().numpy()
     expected = np.array([np.interp(hz, FREQUENCIES, ear) for ear in rows])
     for ears in (levels, levels.double()):
-        interpolated = interpolate(ears, hz)
+        interpolated = interpolate(ears, FREQUENCIES, hz)
         assert interpolated.shape == (2, 3, 9) and interpolated.dtype == ears.dtype
         np.testing.assert_allclose(interpolated.reshape(6, 9).numpy(), expected, rtol=1e-5)
-    np.testing.assert_allclose(rows @ interpolation_weights(hz), expected, rtol=1e-12)
+    np.testing.assert_allclose(rows @ interpolation_weights(FREQUENCIES, hz), expected, rtol=1e-12)

@@ -5,8 +5,9 @@ import torch
 
 from compensators import WDRC
 from compensators.filter_bank import band_centres, band_powers, speech_band_levels
+from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
-from hlsim.audiogram.thresholds import interpolate
+from hlsim.dsp.interpolation import interpolate
 from tests.compensators.aids import tone
 
 BANDS = 20
@@ -25,7 +26,7 @@ def test_the_static_curve_is_nalrs_gain_with_a_ratio_above_the_knee_up_to_the_li
     assert (above_speech < -25.0).any()
     assert (above_speech > 40.0).any()
     ratios = (1.0 + (ears[:, :1] - 10.0) / 40.0).clamp(1.0, 3.0)
-    prescribed = interpolate(nalr_gains_db(ears), band_centres(BANDS))
+    prescribed = interpolate(nalr_gains_db(ears), FREQUENCIES, band_centres(BANDS))
     expected = prescribed + (1.0 / ratios - 1.0) * above_speech.clamp(min=-20.0)
     expected = torch.minimum(expected.clamp(min=0.0), (110.0 - levels).clamp(min=0.0))
     assert (gains[:, -1] - expected).abs().max() < 0.01

@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import gain_to_pascals
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.erb import erb
+from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filterbank import BANKS
@@ -40,7 +40,8 @@ def test_expansion_ratios_equal_pyclaritys(name: str) -> None:
     bank = BANKS[name]
     ears = draw_thresholds(20, torch.Generator().manual_seed(0)).double()
     ours = expansion_ratios(
-        ears.reshape(4, 5, 8), torch.from_numpy(interpolation_weights(bank.centre_frequencies))
+        ears.reshape(4, 5, 8),
+        torch.from_numpy(interpolation_weights(FREQUENCIES, bank.centre_frequencies)),
     )
     assert ours.shape == (4, 5, bank.channels)
     for levels, ratios in zip(ears, ours.reshape(20, -1), strict=True):
@@ -64,7 +65,9 @@ class RoundedProducts(TorchFunctionMode):
 
 def test_expansion_ratios_are_exact_where_matrix_products_are_rounded() -> None:
     ears = torch.linspace(93.3, 99.9, 80).reshape(10, 8)
-    weights = torch.from_numpy(interpolation_weights(BANKS["severe"].centre_frequencies)).float()
+    weights = torch.from_numpy(
+        interpolation_weights(FREQUENCIES, BANKS["severe"].centre_frequencies)
+    ).float()
     with RoundedProducts():
         ours = expansion_ratios(ears, weights)
     expected = expansion_ratios(ears.double(), weights.double())
@@ -80,7 +83,7 @@ def test_recruitment_equals_pyclaritys(name: str) -> None:
     envelopes = np.maximum(cochlea.compute_envelope(channels, bandwidths, MSBG_RATE), 1e-7)
     levels = torch.linspace(20.0, 70.0, 8, dtype=torch.float64)
     ratios = expansion_ratios(
-        levels, torch.from_numpy(interpolation_weights(bank.centre_frequencies))
+        levels, torch.from_numpy(interpolation_weights(FREQUENCIES, bank.centre_frequencies))
     )
     catch_up = np.full(bank.channels, 105.0)
     expected = cochlea.recruitment(

@@ -28,7 +28,7 @@ from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.clean_speech import UnscorableError
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, shift
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 STRIDE = 9
 """Samples at 24 kHz between frames."""
@@ -82,7 +82,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
     delayed = shift(
         levels, delays + WINDOW_LEAD, extent.ends, stops, STRIDE * (count + WINDOW_STRIDES - 1)
     )
-    window = constant_like(levels, _smoothing)
+    window = _smoothing(like=levels)
     parts = delayed.unflatten(-1, (-1, STRIDE)) @ window
     return sum(
         (parts[..., i : i + count, i] for i in range(1, WINDOW_STRIDES)),
@@ -90,6 +90,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
     )
 
 
+@constant
 def _smoothing() -> NDArray[np.float64]:
     """Return a Hann window without its zeros, nine taps per column: (STRIDE, WINDOW_STRIDES)."""
     window = np.hanning(WINDOW_SAMPLES + 2)[1:-1]
@@ -132,7 +133,7 @@ def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
     >>> cepstrum(torch.ones(32, 4)).shape
     torch.Size([5, 4])
     """
-    return constant_like(levels, _cosines)[:, channels] @ levels
+    return _cosines(like=levels)[:, channels] @ levels
 
 
 def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
@@ -167,6 +168,7 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
     return indices[:, : audible.longest], audible
 
 
+@constant
 def _cosines() -> NDArray[np.float64]:
     """Return five cosines over the channels, of 0.5 to 2.5 periods and of norm 1: (5, 32)."""
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
@@ -206,7 +208,7 @@ def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Co
     frames, points = extent.longest, _points(extent.longest)
     waves = extent.centred(clean), extent.centred(output)
     a, b = (torch.fft.rfft(wave, points) for wave in waves)
-    responses = constant_like(clean, _responses, points)
+    responses = _responses(points, like=clean)
     filters_at_once = 1 if clean.device.type == "cpu" else len(responses)
     sums = []
     for part in responses.split(filters_at_once):
@@ -238,6 +240,7 @@ def _filters() -> list[NDArray[np.float64]]:
     return filters
 
 
+@constant
 def _responses(points: int) -> NDArray[np.float64]:
     """Return the frequency responses of the modulation filters: (10, points // 2 + 1)."""
     return zero_phase_responses(_filters(), points)
@@ -365,7 +368,7 @@ def _energies_filtered_twice(covariance: _Covariance, extent: Extent) -> list[Te
         if points != _points(extent.longest):
             a, b = (torch.fft.rfft(wave[item, :, :frames], points) for wave in covariance.waves)
         x, y = torch.view_as_real(a), torch.view_as_real(b)
-        weights = constant_like(x, _twice_filtered, points)
+        weights = _twice_filtered(points, like=x)
         products = x.square(), y.square(), x * y
         energies = [weights @ product.sum(-1).mT for product in products]
         items.append((*energies, frames * weights.sum(-1, keepdim=True)))
@@ -398,6 +401,7 @@ def _noise_energy(frames: int) -> NDArray[np.float64]:
     return np.array(energies)
 
 
+@constant
 def _twice_filtered(points: int) -> NDArray[np.float64]:
     """Return the weights of squared spectra in the energy after filtering twice.
 

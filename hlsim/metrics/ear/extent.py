@@ -7,7 +7,6 @@ padded at their end. Computations of scores must not depend on the padding.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -15,22 +14,20 @@ from torch import Tensor
 from hlsim.metrics.ear.recursions import BLOCK
 
 
-@lru_cache(maxsize=64)
 def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
-    """Return integers as a cached tensor on a device, without making the host wait for the device.
+    """Return integers as a tensor on a device, without synchronising with a GPU.
 
     Args:
         values: The integers.
         device: Device of the tensor.
 
     Returns:
-        The integers, int64, which must not be changed in place. Shape: (number of values,).
+        The integers, int64. Shape: (number of values,).
 
     >>> integers((3, 5), torch.device("cpu"))
     tensor([3, 5])
     """
-    with torch.inference_mode(False):  # the cached tensor may serve a training later
-        return torch.tensor(values).to(device, non_blocking=device.type != "cpu")
+    return torch.tensor(values).to(device, non_blocking=device.type != "cpu")
 
 
 @dataclass(frozen=True)

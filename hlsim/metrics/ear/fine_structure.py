@@ -29,7 +29,7 @@ from hlsim.metrics.ear.envelope_modulation import ENERGY_FLOOR, normalised_covar
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.model import CHANNELS, centre_frequencies
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 SEGMENT = 384
 """Samples of a segment of the fine structure, 16 ms at 24 kHz."""
@@ -94,7 +94,7 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
     """
     counts = segments_of(extent, segment)
     half = segment // 2
-    window = constant_like(levels, _half_windows, segment)
+    window = _half_windows(segment, like=levels)
     halves = levels[..., : counts.longest * half].unflatten(-1, (counts.longest, half))
     rising, falling = (halves @ window).unbind(-1)
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
@@ -103,6 +103,7 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
     return counts.cut(torch.where(is_last, rising, means))
 
 
+@constant
 def _half_windows(segment: int) -> NDArray[np.float64]:
     """Return the rising and the falling half of a Hann window, each of sum 1: (segment / 2, 2)."""
     window = np.hanning(segment).reshape(2, segment // 2).T
@@ -140,7 +141,7 @@ def envelope_correlation(
     audible = tuple(is_audible.sum(-1).tolist())
     extent = Extent(tuple(max(1, count) for count in audible))
     order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
-    basis = constant_like(clean, _cosines)
+    basis = _cosines(like=clean)
     waves = []
     for levels in (clean, output):
         wave = extent.centred(basis @ levels.take_along_dim(order, -1))
@@ -168,6 +169,7 @@ def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
     return counts.inside(levels.device) & (loudness > 10.0 ** (SILENCE_DB / 20.0))
 
 
+@constant
 def _cosines() -> NDArray[np.float64]:
     """Return five cosines over the channels, of 0.5 to 2.5 periods: (5, 32)."""
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
@@ -208,8 +210,8 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
     """
     counts = segments_of(extent)
     kinds = _segment_kinds(counts, motion.device)
-    window = constant_like(motion, _windows)[kinds][:, None]
-    inside = constant_like(motion, _inside)[kinds][:, None]
+    window = _windows(like=motion)[kinds][:, None]
+    inside = _inside(like=motion)[kinds][:, None]
     missing = (counts.longest + 1) * HALF_SEGMENT - motion.shape[-1]
     padded = functional.pad(motion, (0, max(0, missing)))
     segments = padded.unfold(-1, SEGMENT, HALF_SEGMENT)[..., : counts.longest, :] * window
@@ -219,6 +221,7 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
     return torch.fft.rfft(segments, FFT_POINTS), counts.cut(2.0 * energy)
 
 
+@constant
 def _windows() -> NDArray[np.float64]:
     """Return the window of each kind of segment: (3, SEGMENT).
 
@@ -230,6 +233,7 @@ def _windows() -> NDArray[np.float64]:
     return np.stack((falling, window, rising))
 
 
+@constant
 def _inside() -> NDArray[np.float64]:
     """Return 1 for the samples of a segment and 0 for its padding, by kind: (3, SEGMENT)."""
     inside = np.ones((3, SEGMENT))
@@ -257,7 +261,7 @@ def coherence(
     """
     (x, xx), (y, yy) = clean, output
     kinds = _segment_kinds(counts, xx.device)
-    weights = constant_like(xx, _lag_weights)[kinds][:, None]
+    weights = _lag_weights(like=xx)[kinds][:, None]
     covariance = torch.fft.irfft(x * y.conj(), FFT_POINTS)
     near = torch.cat((covariance[..., : MAX_LAG + 1], covariance[..., -MAX_LAG:]), -1) * weights
     is_moving = (xx > 2.0 * ENERGY_FLOOR) & (yy > 2.0 * ENERGY_FLOOR)
@@ -265,6 +269,7 @@ def coherence(
     return torch.where(is_moving, near.abs().amax(-1) / norm, 0.0).clamp(0.0, 1.0)
 
 
+@constant
 def _lag_weights() -> NDArray[np.float64]:
     """Return the inverse autocorrelations of the windows at lags 0 to 24 and -24 to -1: (3, 49)."""
     lags = [*range(MAX_LAG + 1), *range(MAX_LAG, 0, -1)]
@@ -296,13 +301,14 @@ def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor
     """
     rms = mean_square.detach().sqrt()
     is_audible = _audible_segments(rms, counts)
-    weights = constant_like(rms, _synchrony_weights)[:, None]
+    weights = _synchrony_weights(like=rms)[:, None]
     weights = weights * ((rms > SILENCE_DB) & is_audible[:, None])
     total = (weights * coherences).sum((-2, -1))
     mean = total / weights.sum((-2, -1)).clamp_min(ENERGY_FLOOR)
     return torch.where(is_audible.sum(-1) < 2, 0.0, mean)
 
 
+@constant
 def _synchrony_weights() -> NDArray[np.float64]:
     ratio = (centre_frequencies() / SYNCHRONY_HZ) ** (2 * SYNCHRONY_ORDER)
     return 1.0 / np.sqrt(1.0 + ratio)

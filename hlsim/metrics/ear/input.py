@@ -19,7 +19,7 @@ from torch.nn import functional
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.torchtools import constant_like
+from hlsim.torchtools import constant
 
 ZERO_CROSSINGS, KAISER_BETA = 10, 5.0
 """Zero crossings per side and window of the resampling filter, those of ``resample_poly``."""
@@ -76,7 +76,7 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
     common = math.gcd(RATE, sample_rate)
     up, down = RATE // common, sample_rate // common
     periods = max(1, OUTPUTS_PER_ROW // up)
-    kernel = constant_like(signals, _kernel, up, down, periods)
+    kernel = _kernel(up, down, periods, like=signals)
     inputs, outputs = kernel.shape
     rows = -(-resampled_extent.longest // outputs)
     lead = _reach(up, down)
@@ -99,6 +99,7 @@ def _reach(up: int, down: int) -> int:
     return -(-ZERO_CROSSINGS * max(up, down) // up)
 
 
+@constant
 def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
     """Return the matrix from a row of input samples to a row of output samples.
 
@@ -122,11 +123,12 @@ def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
     Shape: (items, time) -> (items,).
     """
     points = fft_length(extent.longest + RING_SAMPLES, 2)
-    response = constant_like(signals, _chebyshev, rate, points)
+    response = _chebyshev(rate, points, like=signals)
     spectrum = torch.fft.rfft(signals, points) * response
     return extent.mean(torch.fft.irfft(spectrum, points).square())
 
 
+@constant
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
     sections = scipy.signal.cheby2(7, 30, 21000.0 / rate, output="sos")
     response: NDArray[np.complex128] = scipy.signal.sosfreqz(

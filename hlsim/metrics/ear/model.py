@@ -38,6 +38,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.fft import fft_length
+from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import (
     BLOCK,
@@ -48,7 +49,7 @@ from hlsim.metrics.ear.recursions import (
     gain_lowpass,
     gammatone,
 )
-from hlsim.torchtools import compute_once, constant, constant_like
+from hlsim.torchtools import compute_once, constant
 
 CHANNELS = 32
 """Number of channels of the ear."""
@@ -84,6 +85,7 @@ On a CPU they fit into its caches. On a GPU they take 128 MB per tensor in float
 """
 
 
+@constant
 def centre_frequencies() -> NDArray[np.float64]:
     """Return the centre frequencies of the 32 channels in Hz, evenly spaced on the ERB scale.
 
@@ -98,6 +100,7 @@ def centre_frequencies() -> NDArray[np.float64]:
     return centres
 
 
+@constant
 def _normal_decay() -> NDArray[np.float64]:
     """Return the decay per sample of gammatones of normal bandwidth.
 
@@ -153,8 +156,9 @@ def hair_cells(thresholds: Tensor) -> HairCells:
     26.0
     """
     indices = integers(AUDIOMETRIC_INDICES, thresholds.device)
-    weights = constant(_interpolation, dtype=torch.float64, device=thresholds.device)
-    loss = (thresholds.detach().double().index_select(-1, indices) @ weights).clamp_min(0.0)
+    levels = thresholds.detach().double().index_select(-1, indices)
+    weights = interpolation_weights(AUDIOMETRIC_HZ, tuple(centre_frequencies()), like=levels)
+    loss = (levels @ weights).clamp_min(0.0)
     normal_ratio = torch.linspace(1.25, 3.5, CHANNELS, dtype=torch.float64, device=loss.device)
     # With this loss of the outer hair cells, no compression remains.
     max_outer = 70.0 * (1.0 - 1.0 / normal_ratio)
@@ -166,14 +170,7 @@ def hair_cells(thresholds: Tensor) -> HairCells:
     return HairCells(outer, bandwidth, knee, ratio, inner)
 
 
-def _interpolation() -> NDArray[np.float64]:
-    """Return the weights of the audiometric frequencies in the channels: (6, 32).
-
-    They interpolate linearly in Hz, and extend the first and the last threshold.
-    """
-    return np.stack([np.interp(centre_frequencies(), AUDIOMETRIC_HZ, row) for row in np.eye(6)])
-
-
+@compute_once
 def _control_bandwidth(device: torch.device) -> Tensor:
     """Return the bandwidth of the control filters, relative to normal hearing. Shape: (32,)."""
     return hair_cells(torch.full((8,), CONTROL_LOSS, device=device)).bandwidth
@@ -205,7 +202,7 @@ def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
 
     Shape: (..., channels) -> (..., channels).
     """
-    return bandwidth * constant_like(bandwidth, _normal_decay)[channels]
+    return bandwidth * _normal_decay(like=bandwidth)[channels]
 
 
 def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recursion:
@@ -217,15 +214,16 @@ def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recur
         channels: The channels.
         dtype: Precision of the filters.
     """
-    centres = constant(centre_frequencies, dtype=torch.float64, device=bandwidth.device)[channels]
+    centres = centre_frequencies(like=bandwidth)[channels]
     # The response of normal and wider filters has vanished after this number of samples.
     memory = math.ceil(50.0 / float(_normal_decay()[channels.start]))
     angles = centres * (2.0 * math.pi / RATE)
     return gammatone(_decay(bandwidth, channels), angles, memory, dtype)
 
 
+@compute_once
 def _control_filters(start: int, stop: int, device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the control filters of the channels from ``start`` to before ``stop``."""
+    """Return the control filters of the channels ``start`` to ``stop - 1``."""
     channels = slice(start, stop)
     return _gammatones(_control_bandwidth(device)[channels], channels, dtype)
 
@@ -252,9 +250,7 @@ def _control_power(signal: Tensor, channels: slice) -> Tensor:
 
     Shape: (items, padded) -> (items, channels, padded).
     """
-    filters = compute_once(
-        _control_filters, channels.start, channels.stop, signal.device, signal.dtype
-    )
+    filters = _control_filters(channels.start, channels.stop, signal.device, signal.dtype)
     return _apply_gammatones(filters, signal)[1]
 
 
@@ -274,7 +270,7 @@ def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Exte
     level = 10.0 * torch.log10(mean.clamp_min(10.0 ** (WIDENING_SPL / 10.0)))
     share = ((level - WIDENING_SPL) / WIDENING_SPL).clamp_max(1.0)
     return cells.bandwidth + share * (
-        compute_once(_control_bandwidth, control.device)[channels] - cells.bandwidth
+        _control_bandwidth(control.device)[channels] - cells.bandwidth
     )
 
 
@@ -420,10 +416,11 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     torch.Size([1, 2, 1297])
     """
     points = _lag_points(extent)
-    step = constant_like(reference, _step_response, points)
+    step = _step_response(points, like=reference)
     return torch.fft.rfft(extent.cut(reference), points) * step
 
 
+@constant
 def _step_response(points: int) -> NDArray[np.complex128]:
     step: NDArray[np.complex128] = np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
     return step

@@ -33,10 +33,11 @@ Array = NDArray[np.float64]
 def apply_filter(
     design: Callable[[torch.device, torch.dtype], Recursion], signal: Tensor
 ) -> Tensor:
-    """Filter a signal by a filter that is designed once for each device and precision.
+    """Filter a signal.
 
     Args:
-        design: Function that returns the filter, such as ``middle_ear``.
+        design: Function that returns the filter for a device and a precision, such as
+            ``middle_ear``.
         signal: Signal whose length is a multiple of 64. Shape: (..., time).
 
     Returns:
@@ -45,8 +46,7 @@ def apply_filter(
     >>> apply_filter(gain_lowpass, torch.ones(1, 192)).shape
     torch.Size([1, 192])
     """
-    filters: Recursion = compute_once(design, signal.device, signal.dtype)
-    return filters(signal).flatten(-2)
+    return design(signal.device, signal.dtype)(signal).flatten(-2)
 
 
 class Recursion(NamedTuple):
@@ -151,6 +151,7 @@ def _recursion(
     return Recursion._make([*(as_tensor(matrix, dtype, device) for matrix in matrices), memory])
 
 
+@compute_once
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
 
@@ -168,6 +169,7 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     return _recursion(a, b, c, float(d[0, 0]), 2048, device, dtype)
 
 
+@compute_once
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter that smooths the gain of the outer hair cells over 0.2 ms.
 
@@ -188,6 +190,7 @@ RAPID_SECONDS, SHORT_TERM_SECONDS = 0.002, 0.060
 """Time constants of rapid and of short-term adaptation."""
 
 
+@compute_once
 def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter by which inner hair cells emphasise onsets, for levels in dB at 24 kHz.
 
@@ -215,6 +218,7 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
 GAMMATONE_ORDER = 4
 
 
+@constant
 def _binomials() -> Array:
     """Return the binomial coefficients of orders 0 to 3: row e, column d holds "d choose e".
 
@@ -278,7 +282,7 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     inward = torch.cat((inward_real, inward_imaginary), -1)
     weight = after[..., None, :] * p * (float(BLOCK) ** order)[:, None]
     outward = _as_real(weight * phase.cos()[..., None, :], weight * phase.sin()[..., None, :])
-    binomials = constant(_binomials, dtype=decay.dtype, device=decay.device)
+    binomials = _binomials(like=decay)
     decayed = torch.exp(-BLOCK * decay)[..., None] * binomials
     step_angle = BLOCK * angle[..., None]
     step = _as_real(decayed * torch.cos(step_angle), decayed * torch.sin(step_angle))
