@@ -1,9 +1,10 @@
 """HASPI, HASQI and HAAQI as metrics of torchmetrics, for validation loops.
 
 A metric collects the mean score over batches. The classes need the extra ``train``.
-"""
 
-from __future__ import annotations
+The annotations are no strings (``from __future__ import annotations``), which ``torch.jit.script``
+does not understand in a class.
+"""
 
 import warnings
 import zlib
@@ -16,12 +17,12 @@ from torch import Tensor
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, has_listeners
 from hlsim.calibration import PASCAL_SPL, check_full_scale, level_spl
-from hlsim.checks import Lengths, check_lengths, check_number, check_rate, check_waveform
+from hlsim.checks import Lengths, check_lengths, check_number, check_rate
 from hlsim.extras import require
 from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
-from hlsim.metrics.pair import check_pair, scores_or_errors
+from hlsim.metrics.pair import match_pair, scores_or_errors
 
 _Metric: Any = require("torchmetrics", "train").Metric
 
@@ -51,26 +52,37 @@ class _MeanScore(_Metric):
         self,
         sample_rate: int = 16000,
         *,
+        audiogram: AudiogramLike | None = None,
         full_scale_spl: float = PASCAL_SPL,
         limit: int | None = None,
         **options: Any,
     ) -> None:
+        if options.get("dist_sync_on_step"):
+            raise ValueError(
+                "dist_sync_on_step=True is not supported, because the value of a step is that of "
+                "one process; leave it out, and call compute() for the mean over all processes"
+            )
         super().__init__(**options)
         if limit is not None:
             check_number("limit", limit, 1, whole=True)
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.limit = limit
+        self.audiogram = audiogram
         for name in ("total", "total_level"):
             self.add_state(name, torch.tensor(0.0), dist_reduce_fx="sum")
         for name in ("count", "seen", "failed"):
             self.add_state(name, torch.tensor(0), dist_reduce_fx="sum")
         # A MetricCollection merges metrics with equal states, such as those of a batch without any
         # score. This state keeps metrics with different settings apart.
-        settings = repr((type(self), self.sample_rate, self.full_scale_spl, limit))
+        levels = None
+        if audiogram is not None:
+            levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL).tolist()
+        settings = repr((type(self), self.sample_rate, levels, self.full_scale_spl, limit))
         signature = torch.tensor(zlib.crc32(settings.encode()))
         self.add_state("signature", signature, dist_reduce_fx="max")
 
+    @torch.jit.unused
     def forward(self, *args: Any, **kwargs: Any) -> Tensor:
         """Update the metric by a batch, and return the mean score of this batch in this process.
 
@@ -82,51 +94,77 @@ class _MeanScore(_Metric):
         self._forward_cache: Tensor = (self.total - total) / (self.count - count)
         return self._forward_cache
 
+    def merge_state(self, incoming_state: "dict[str, Any] | _MeanScore") -> None:
+        """Add the scores of another metric with the same settings.
+
+        Args:
+            incoming_state: The other metric, or its ``metric_state``.
+
+        Raises:
+            ValueError: The settings differ: sample rate, full scale, limit, audiogram or class.
+        """
+        state = incoming_state
+        if isinstance(state, _MeanScore):
+            state = state.metric_state
+        if int(state.get("signature", -1)) != int(self.signature):
+            raise ValueError(
+                f"expected the state of {type(self).__name__} with the settings of this metric; "
+                "create both with the same sample_rate, audiogram, full_scale_spl and limit"
+            )
+        super().merge_state(state)
+
     @torch.no_grad()
     def update(
         self,
         output: Tensor,
         clean: Tensor,
-        audiogram: AudiogramLike,
+        audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
     ) -> None:
         """Score a batch, and add the scores to the mean.
 
         An item that cannot be scored (clean speech that is silent or soft, NaN, less than 0.7 s) is
-        left out with a warning and counted in ``failed``. A silent output is
-        scored. With two channels, left and right, the score and the level of the better ear count.
+        left out with a warning and counted in ``failed``. A silent output is scored. With two
+        channels, left and right, the score and the level of the better ear count, and an item is
+        left out if one of its ears cannot be scored.
 
         Args:
-            output: Outputs of the compensator. Shape: (time,), (batch, time) or, for two ears,
-                (batch, 2, time).
-            clean: Clean speech of the same shape.
+            output: Outputs of the compensator. Shape: (time,), (batch, time), (batch, 1, time) or,
+                for two ears, (batch, 2, time).
+            clean: Clean speech of the same shape. The longer of both is cut with a warning if they
+                differ by up to 0.1 s.
             audiogram: One ear, or one per item. For two channels a ``Listener``, a pair of left
-                and right ear, or one of these per item.
+                and right ear, or one of these per item. None takes that of the constructor.
             lengths: Number of samples of each item of a padded batch.
                 Shape: (batch,).
 
         Raises:
-            ValueError: The shapes do not fit, the signals are not what ``haspi`` accepts, or
-                ``audiogram`` or ``lengths`` are not as described.
+            ValueError: The shapes do not fit, the signals are not what ``haspi`` accepts, there is
+                no audiogram, or ``audiogram`` or ``lengths`` are not as described.
         """
-        check_waveform(output, "output")
-        check_waveform(clean, "clean")
-        check_pair(output, clean)
-        two_ears = output.ndim == 3 and output.shape[1] == 2
-        if output.ndim > 2 and not two_ears:
+        pair = match_pair(output, clean, self.sample_rate)
+        longest = max(output.shape[-1], clean.shape[-1])
+        output, clean, _ = pair
+        if output.ndim > 3 or (output.ndim == 3 and output.shape[1] > 2):
             raise ValueError(
-                "expected output and clean of shape (time,), (batch, time) or (batch, 2, time), "
-                f"got {tuple(output.shape)}"
+                "expected output and clean of shape (time,), (batch, time), (batch, 1, time) or "
+                f"(batch, 2, time), got {tuple(output.shape)}"
             )
-        sides, time = 2 if two_ears else 1, output.shape[-1]
+        sides = output.shape[1] if output.ndim == 3 else 1
+        time = output.shape[-1]
         outputs, references = (
             signal.double().reshape(-1, sides, time) for signal in (output, clean)
         )
         items = len(outputs)
+        audiogram = self.audiogram if audiogram is None else audiogram
+        if audiogram is None:
+            raise ValueError(
+                "expected an audiogram, got None; pass one to update, or to the constructor"
+            )
         ears = _thresholds(audiogram, items, sides)
         ends = torch.full((items,), time)
         if lengths is not None:
-            ends = check_lengths(lengths, torch.Size((items, time)))
+            ends = check_lengths(lengths, torch.Size((items, longest))).clamp_max(time)
 
         first = int(self.seen)
         self.seen += items
@@ -134,30 +172,27 @@ class _MeanScore(_Metric):
             items = min(items, self.limit - first)
             if items <= 0:
                 return
-        rows, sides_of_rows = ears[:items].isfinite().all(-1).nonzero(as_tuple=True)
         scores = scores_or_errors(
             type(self).score,
-            outputs[rows, sides_of_rows],
-            references[rows, sides_of_rows],
-            ears[rows, sides_of_rows],
-            ends[rows].tolist(),
+            outputs[:items].flatten(0, 1),
+            references[:items].flatten(0, 1),
+            ears[:items].flatten(0, 1),
+            ends[:items].repeat_interleave(sides).tolist(),
             sample_rate=self.sample_rate,
             full_scale_spl=self.full_scale_spl,
         )
         for item in range(items):
-            of_item = (rows == item).nonzero().flatten().tolist()
-            scored = [
-                (float(scores[row]), row) for row in of_item if isinstance(scores[row], Tensor)
-            ]
-            if not scored:
+            of_ears = scores[item * sides : (item + 1) * sides]
+            values = [float(score) for score in of_ears if isinstance(score, Tensor)]
+            if len(values) < sides:
                 self.failed += 1
-                reason = scores[of_item[0]]
+                reason = next(score for score in of_ears if isinstance(score, ValueError))
                 message = f"{type(self).__name__} leaves out item {first + item}: {reason}"
                 warnings.warn(message, stacklevel=2)
                 continue
-            score, row = max(scored)
-            samples = outputs[item, sides_of_rows[row], : ends[item]]
-            self.total += score
+            best = max(values)
+            samples = outputs[item, values.index(best), : ends[item]]
+            self.total += best
             self.total_level += float(level_spl(samples, self.full_scale_spl))
             self.count += 1
 
@@ -194,10 +229,12 @@ class HASPI(_MeanScore):
 
     Args:
         sample_rate: Sample rate in Hz, 16000 to 48000.
+        audiogram: Ear of the batches for which ``update`` is passed none, such as those of
+            torchmetrics' ``MultitaskWrapper``.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         limit: Number of items that are scored from one reset to the next in each process; the
             others are passed over. None scores all.
-        options: Keyword arguments of ``torchmetrics.Metric``.
+        options: Keyword arguments of ``torchmetrics.Metric``, except ``dist_sync_on_step``.
 
     Raises:
         ValueError: A value is out of range.
@@ -250,6 +287,8 @@ def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
 
     Shape: (items, sides, 8) dB HL.
     """
+    if isinstance(audiogram, Tensor):
+        audiogram = audiogram.cpu()  # a level out of range is an error there, and NaN on a GPU
     levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL)
     one_for_all = (2, len(FREQUENCIES)) if sides == 2 else (len(FREQUENCIES),)
     fits = levels.shape in (one_for_all, (items, *one_for_all))
@@ -258,5 +297,5 @@ def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
             f"expected an audiogram of shape {one_for_all} or {(items, *one_for_all)}, "
             f"got {tuple(levels.shape)}"
         )
-    levels = levels.detach().cpu().expand(items, *one_for_all)
+    levels = levels.detach().expand(items, *one_for_all)
     return levels.reshape(items, sides, len(FREQUENCIES))

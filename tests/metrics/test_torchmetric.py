@@ -68,11 +68,6 @@ def test_the_better_ear_of_two_channels_counts(clean: Tensor) -> None:
         metric = HASPI(16000)
         metric.update(output, both, ears)
         assert float(metric.compute()) == pytest.approx(max(scores), abs=1e-6)
-    metric.reset()
-    output[:, 0] = torch.nan  # an ear without a score does not count
-    metric.update(output, both, [N3, S2])
-    assert float(metric.compute()) == pytest.approx(scores[1], abs=1e-6)
-    assert int(metric.failed) == 0
     for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
         with pytest.raises(ValueError, match=r"thresholds|audiogram"):
             metric.update(output, both, wrong)
@@ -138,6 +133,63 @@ def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> Non
         assert (int(metric.failed), int(metric.count)) == (1, 1)
         expected = expected_score(clean[1], clean[1], N3)
         assert float(metric.compute()) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", [HASPI, HASQI, HAAQI])
+def test_an_item_with_one_broken_ear_is_left_out(clean: Tensor, kind: type[Any]) -> None:
+    """Otherwise the score of the other ear would hide an output that diverges."""
+    both = clean[0].expand(2, 2, -1)
+    broken, silent = both.clone(), both.clone()
+    broken[0, 0, 100] = torch.nan
+    silent[0, 1] = 0.0
+    for output, reference in ((broken, both), (both, silent)):
+        metric = kind()
+        with pytest.warns(UserWarning, match="leaves out item 0"):
+            metric.update(output, reference, [N3, N3])
+        assert (int(metric.failed), int(metric.count)) == (1, 1)
+
+
+def test_signals_that_the_functions_accept(clean: Tensor) -> None:
+    """One channel for each item, and lengths that differ by less than 0.1 s."""
+    expected = HASPI()(noisy(clean), clean, N3, lengths=[12800, 12700])
+    with_channel = HASPI()(noisy(clean)[:, None], clean[:, None], N3, lengths=[12800, 12700])
+    torch.testing.assert_close(with_channel, expected)
+    longer = torch.nn.functional.pad(clean, (0, 100))
+    with pytest.warns(UserWarning, match="both are cut to the shorter length"):
+        cut = HASPI()(noisy(clean), longer, N3, lengths=[12900, 12700])
+    torch.testing.assert_close(cut, expected)
+
+
+def test_an_audiogram_for_all_batches(clean: Tensor) -> None:
+    from torchmetrics.wrappers import MultitaskWrapper
+
+    expected = HASPI()(noisy(clean), clean, N3)
+    tasks = MultitaskWrapper({"speech": HASPI(audiogram=N3)})
+    tasks.update({"speech": noisy(clean)}, {"speech": clean})
+    torch.testing.assert_close(tasks.compute()["speech"], expected)
+    torch.testing.assert_close(HASPI(audiogram="S2")(noisy(clean), clean, N3), expected)
+    with pytest.raises(ValueError, match="expected an audiogram"):
+        HASPI().update(clean, clean)
+
+
+def test_states_of_other_settings_are_not_merged(clean: Tensor) -> None:
+    metric = HASPI(audiogram=N3)
+    metric.update(clean[:1], clean[:1])
+    metric.merge_state(HASPI(audiogram="N3").metric_state)
+    assert int(metric.count) == 1
+    settings = {"sample_rate": 44100}, {"audiogram": S2}, {"limit": 1}
+    metrics = [HASPI(**{"audiogram": N3, **setting}) for setting in settings]
+    for other in (*metrics, HASQI(audiogram=N3), {"total": torch.tensor(1.0)}):
+        with pytest.raises(ValueError, match="with the settings of this metric"):
+            metric.merge_state(other)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_options_of_torchmetrics() -> None:
+    with pytest.raises(ValueError, match="dist_sync_on_step=True is not supported"):
+        HASPI(dist_sync_on_step=True)
+    for kind in (HASPI, HASQI, HAAQI):
+        torch.jit.script(kind())
 
 
 def test_silence_in_place_of_speech_counts(clean: Tensor) -> None:
