@@ -1,7 +1,7 @@
 """Build the listening page: export its models, and add onnxruntime-web and speech.
 
 As a hook of mkdocs, this file adds the page to the site. Without npm, the site is built without the page.
-This command writes the page with them into a folder:
+This command writes the page with them into a folder, and as build/listen.zip for others:
 
     python docs/listening_page.py build/listen
     python -m http.server --directory build/listen
@@ -43,6 +43,13 @@ SPEECH = (
 
 WINDOW_SAMPLES = 20_000
 """Samples of a window of the simulator, as in docs/listen/windows.js."""
+
+SERVE = (
+    "Browsers do not run this page from a folder. Open a terminal in this folder, run "
+    "<code>python3 -m http.server</code> (on Windows: <code>py -m http.server</code>), and open "
+    '<a href="http://localhost:8000">http://localhost:8000</a>.'
+)
+"""Text of the page that is opened by a double click."""
 
 HOPS = 2
 """Hops of the aid per call, 8 ms: one block of an AudioWorklet at 16 kHz."""
@@ -149,14 +156,26 @@ def _export_models(folder: Path) -> None:
             onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
+def write_page(folder: Path) -> Path:
+    """Write the page into a folder, without links to the rest of the site, and as a zip beside it.
+
+    Returns: Path of the zip.
+    """
+    shutil.copytree(PAGE, folder, dirs_exist_ok=True)
+    html = folder / "index.html"
+    text = re.sub(r'<a href="\.\./[^>]*>[^<]*</a>\.?', "", html.read_text(encoding="utf-8"))
+    text = re.sub(
+        r'(<p class="care" id="unbuilt">).*?</p>', rf"\1{SERVE}</p>", text, flags=re.DOTALL
+    )
+    html.write_text(text, encoding="utf-8")
+    shutil.copytree(build_assets(), folder / "assets", dirs_exist_ok=True)
+    return Path(shutil.make_archive(str(folder), "zip", folder.parent, folder.name))
+
+
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(f"usage: python {sys.argv[0]} FOLDER")
     missing = missing_requirement()
     if missing is not None:
         sys.exit(f"{missing} is not installed; install it to build the listening page")
-    shutil.copytree(PAGE, sys.argv[1], dirs_exist_ok=True)
-    html = Path(sys.argv[1], "index.html")
-    alone = re.sub(r'<a href="\.\./[^>]*>[^<]*</a>\.?', "", html.read_text(encoding="utf-8"))
-    html.write_text(alone, encoding="utf-8")  # without links to the rest of the site
-    shutil.copytree(build_assets(), Path(sys.argv[1], "assets"), dirs_exist_ok=True)
+    print(f"written: {write_page(Path(sys.argv[1]))}")

@@ -33,8 +33,8 @@ PAGE = "const { state } = await import('./page.js');"
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of the page with its models, from a server of static files."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the page with its models."""
     if shutil.which("npm") is None:
         pytest.skip("needs npm")
     pytest.importorskip("onnxscript")
@@ -42,6 +42,12 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(ROOT / "docs" / "listening_page.py"), str(folder)]
     subprocess.run(command, check=True, env=environment, stderr=subprocess.DEVNULL)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(folder: Path) -> Iterator[str]:
+    """Address of the page, from a server of static files."""
 
     class Handler(http.server.SimpleHTTPRequestHandler):
         extensions_map = http.server.SimpleHTTPRequestHandler.extensions_map | {
@@ -282,6 +288,14 @@ def test_a_file_that_is_no_sound_is_named(opened: Any, tmp_path: Path) -> None:
         "document.getElementById('source-name').textContent.includes('cannot read')"
     )
     assert opened.locator("#version-normal .play").is_enabled()
+
+
+def test_the_unpacked_zip_says_how_to_serve_it(folder: Path, tmp_path: Path, chromium: Any) -> None:
+    shutil.unpack_archive(folder.with_suffix(".zip"), tmp_path)
+    page = chromium.new_page()
+    page.goto((tmp_path / folder.name / "index.html").as_uri())
+    page.wait_for_selector("text=python3 -m http.server", state="visible")
+    page.close()
 
 
 def test_a_recording_can_be_heard(opened: Any) -> None:

@@ -218,6 +218,7 @@ function moveHead() {
 
 async function setSound(promise, name, file = "") {
   const choice = ++choices;
+  const before = state.sourceName;
   try {
     const samples = present(await promise);
     if (choice !== choices) return; // Another sound was chosen meanwhile.
@@ -228,11 +229,13 @@ async function setSound(promise, name, file = "") {
     $("speech").value = file; // No sentence is selected beside a file or a recording, so that each can be chosen again.
     const seconds = samples.length / SAMPLE_RATE;
     const cut = seconds === LONGEST_SECONDS ? `, the first ${LONGEST_SECONDS} seconds` : "";
-    $("source-name").textContent = `${name}${cut}`;
+    state.sourceName = `${name}${cut}`;
+    write("source-name", state.sourceName);
     for (const card of Object.values(cards)) card.setAttribute("aria-busy", "true");
     await compute();
   } catch (error) {
-    write("source-name", error.message);
+    if (choice !== choices) return; // The message would stand beside another sound.
+    write("source-name", before ? `${error.message} You still hear: ${before}` : error.message);
     say("");
     if (state.sound === null) for (const card of Object.values(cards)) card.setAttribute("aria-busy", "false");
   }
@@ -370,6 +373,7 @@ $("speech").addEventListener("change", () => {
 });
 $("file").addEventListener("change", () => {
   const [file] = $("file").files;
+  if (file) write("source-name", `Reading ${file.name} …`);
   if (file) setSound(file.arrayBuffer().then(decode), file.name);
 });
 $("record").addEventListener("click", recordSound);
