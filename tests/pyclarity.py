@@ -94,20 +94,26 @@ def haspi(clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: in
     return float(score[0])
 
 
-def hasqi(clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
+def hasqi(
+    clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int, equalisation: int = 1
+) -> Array:
     """Combined, nonlinear and linear score."""
     module = pytest.importorskip("clarity.evaluator.hasqi.hasqi")
     with numpy_seed(seed):
-        scores = module.hasqi_v2(clean, rate, output, rate, audiogram.to_clarity(), level1=94.0)
+        scores = module.hasqi_v2(
+            clean, rate, output, rate, audiogram.to_clarity(), equalisation, level1=94.0
+        )
     return np.array(scores[:3], dtype=np.float64)
 
 
-def haaqi(clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
+def haaqi(
+    clean: Array, output: Array, audiogram: Audiogram, rate: int, seed: int, equalisation: int = 1
+) -> Array:
     """Combined, nonlinear and linear score."""
     module = pytest.importorskip("clarity.evaluator.haaqi")
     with numpy_seed(seed):
         scores = module.haaqi_v1(
-            clean, rate, output, rate, audiogram.to_clarity(), equalisation=1, level1=94.0
+            clean, rate, output, rate, audiogram.to_clarity(), equalisation, level1=94.0
         )
     return np.array(scores[:3], dtype=np.float64)
 

@@ -36,7 +36,7 @@ from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.pair import Noise, match_pair
+from hlsim.metrics.pair import Equalisation, Noise, match_pair
 from hlsim.metrics.quality import QualityParts, QualityReference
 from hlsim.torchtools import constant, not_compiled
 
@@ -68,6 +68,7 @@ def haaqi(
     noise: Noise = "expected",
     seed: int = 0,
     whole_khz: bool = False,
+    equalisation: Equalisation = 1,
 ) -> Tensor:
     """Compute HAAQI version 1 of each item: how good the output of an aid sounds, from 0 to 1.
 
@@ -77,7 +78,7 @@ def haaqi(
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
-        clean: Clean music, not amplified. Shape: (..., time).
+        clean: Clean music, not amplified unless ``equalisation`` is 2. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
@@ -87,6 +88,8 @@ def haaqi(
             out.
         seed: Seed of the drawn noise of each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
+        equalisation: Mode of pyclarity: 1 amplifies clean music by NAL-R here, 2 takes music that
+            NAL-R or another prescription has amplified.
 
     Returns:
         Scores. Shape: (...,).
@@ -112,6 +115,7 @@ def haaqi(
         full_scale_spl=full_scale_spl,
         lengths=lengths,
         whole_khz=whole_khz,
+        equalisation=equalisation,
         keep=False,
     )
     return reference.score(output, noise=noise, seed=seed)
@@ -146,13 +150,14 @@ class HaaqiReference(QualityReference):
     """Clean music that is prepared once for the HAAQI of many outputs in one impaired ear.
 
     Args:
-        clean: Clean music, not amplified. The scores have its dtype and its device. Its gradient
-            is not computed. Shape: (..., time).
+        clean: Clean music, not amplified unless ``equalisation`` is 2. The scores have its dtype
+            and its device. Its gradient is not computed. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
+        equalisation: Mode of pyclarity, 1 or 2, see ``haaqi``.
         keep: Store the clean music's features, about 18 MB per second in float32; otherwise they
             are computed for each score.
 

@@ -15,7 +15,7 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import fine_structure
-from hlsim.metrics.pair import Noise, match_pair
+from hlsim.metrics.pair import Equalisation, Noise, match_pair
 from hlsim.metrics.quality import QualityParts, QualityReference
 from hlsim.torchtools import not_compiled
 
@@ -32,6 +32,7 @@ def hasqi(
     noise: Noise = "expected",
     seed: int = 0,
     whole_khz: bool = False,
+    equalisation: Equalisation = 1,
 ) -> Tensor:
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
@@ -40,7 +41,7 @@ def hasqi(
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
-        clean: Clean speech, not amplified. Shape: (..., time).
+        clean: Clean speech, not amplified unless ``equalisation`` is 2. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
@@ -50,6 +51,8 @@ def hasqi(
             that pyclarity draws with ``seed``; ``"none"`` leaves it out.
         seed: Seed of the drawn noise of each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
+        equalisation: Mode of pyclarity: 1 amplifies clean speech by NAL-R here, 2 takes speech that
+            NAL-R or another prescription has amplified.
 
     Returns:
         Scores. Shape: (...,).
@@ -71,6 +74,7 @@ def hasqi(
         full_scale_spl=full_scale_spl,
         lengths=lengths,
         whole_khz=whole_khz,
+        equalisation=equalisation,
         keep=False,
     )
     return reference.score(output, noise=noise, seed=seed)
@@ -80,13 +84,14 @@ class HasqiReference(QualityReference):
     """Clean speech that is prepared once for the HASQI of many outputs in one impaired ear.
 
     Args:
-        clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
-            is not computed. Shape: (..., time).
+        clean: Clean speech, not amplified unless ``equalisation`` is 2. The scores have its dtype
+            and its device. Its gradient is not computed. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
+        equalisation: Mode of pyclarity, 1 or 2, see ``hasqi``.
         keep: Store the clean speech's features, about 18 MB per second in float32; otherwise they
             are computed for each score.
 

@@ -17,6 +17,9 @@ SHORTEST_SECONDS = 0.7
 LARGEST_LENGTH_DIFFERENCE = 0.1
 """Largest difference in seconds between the lengths of two signals, of which the longer is cut."""
 
+Equalisation = Literal[1, 2]
+"""1: the reference of HASQI and HAAQI is amplified by NAL-R here. 2: it is amplified already."""
+
 Noise = Literal["expected", "seeded", "none"]
 """Internal noise of the ear: its mean effect, the noise that pyclarity draws, or none."""
 

@@ -17,6 +17,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import Lengths, check_number
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics.ear import fine_structure
@@ -25,7 +28,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS, HairCells
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.pair import Noise
+from hlsim.metrics.pair import Equalisation, Noise
 from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import constant
 
@@ -89,13 +92,15 @@ class QualityReference(Reference):
     Subclasses combine similarities of envelopes, fine structure and spectra into the score.
 
     Args:
-        clean: Clean signals, not amplified. The scores have their dtype and their device. Their
-            gradient is not computed. Shape: (..., time).
+        clean: Clean signals, not amplified unless ``equalisation`` is 2. The scores have their
+            dtype and their device. Their gradient is not computed. Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
+        equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes signals
+            that NAL-R or another prescription has amplified.
         keep: Store the clean signals' features, about 18 MB per second in float32; otherwise they
             are computed for each score.
 
@@ -117,6 +122,30 @@ class QualityReference(Reference):
 
     split_by_rate: ClassVar[Any] = None
     """Function that divides fluctuations of envelopes into bands of modulation."""
+
+    def __init__(
+        self,
+        clean: Tensor,
+        audiogram: AudiogramLike,
+        *,
+        sample_rate: int = 16000,
+        full_scale_spl: float = PASCAL_SPL,
+        lengths: Lengths | None = None,
+        whole_khz: bool = False,
+        equalisation: Equalisation = 1,
+        keep: bool = True,
+    ) -> None:
+        check_number("equalisation", equalisation, 1, 2, whole=True)
+        self._is_amplified = equalisation == 2
+        super().__init__(
+            clean,
+            audiogram,
+            sample_rate=sample_rate,
+            full_scale_spl=full_scale_spl,
+            lengths=lengths,
+            whole_khz=whole_khz,
+            keep=keep,
+        )
 
     def score(self, output: Tensor, *, noise: Noise = "expected", seed: int = 0) -> Tensor:
         """Return the score of each output of an aid.
@@ -169,9 +198,11 @@ class QualityReference(Reference):
         return 10.0 ** (-self._full_scale_spl / 20.0)
 
     def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
+        cells = ear_model.hair_cells(self._ears[clean.items])
+        if self._is_amplified:
+            return clean.signals, cells
         ears = self._ears_on_host[clean.items].double()
-        amplified = _amplify(clean.signals, ears, clean.audible)
-        return amplified, ear_model.hair_cells(self._ears[clean.items])
+        return _amplify(clean.signals, ears, clean.audible), cells
 
     def _features(
         self,

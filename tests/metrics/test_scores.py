@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 import hlsim
-from hlsim import Audiogram
+from hlsim import NALR, WDRC, Audiogram
 from hlsim.audio import read_audio
 from hlsim.data import bundled
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
@@ -126,6 +126,28 @@ def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, key: str) 
         assert values == pytest.approx(expected, abs=error)
     score = float(SCORES[name](output, clean, ear, **settings))
     assert score == pytest.approx(expected[0], abs=7e-3 if name == "haspi" else 2e-3)
+
+
+@pytest.mark.parametrize("key", ["haaqi, NAL-R", "haaqi, compressed", "hasqi, NAL-R"])
+def test_reference_that_is_amplified_already(pyclarity: PyclarityOutputs, key: str) -> None:
+    """Cadenza's later challenges score so, with NAL-R of 221 taps or with a compressor."""
+    name, rate = key.partition(",")[0], 44100
+    ear = N3 if name == "hasqi" else N4
+    clean = example_music(rate)
+    aid = {"NAL-R": NALR(sample_rate=rate), "compressed": WDRC(sample_rate=rate)}
+    amplified = {kind: module(clean, ear) for kind, module in aid.items()}[key.partition(", ")[2]]
+    output = degrade(amplified)
+    arguments = amplified.numpy(), output.numpy(), ear, rate, 7, 2
+    expected = pyclarity(f"{key}, equalisation 2", getattr(reference, name), *arguments)
+    settings = {"sample_rate": rate, "noise": "seeded", "seed": 7, "whole_khz": True}
+    score = float(SCORES[name](output, amplified, ear, equalisation=2, **settings))
+    assert score == pytest.approx(expected[0], abs=1e-6)
+    kind = HasqiReference if name == "hasqi" else HaaqiReference
+    prepared = kind(amplified, ear, sample_rate=rate, whole_khz=True, equalisation=2)
+    assert float(prepared.score(output, noise="seeded", seed=7)) == score
+    assert float(SCORES[name](output, amplified, ear, **settings)) < score - 0.01
+    with pytest.raises(ValueError, match="expected equalisation"):
+        SCORES[name](output, amplified, ear, equalisation=0, **settings)
 
 
 @pytest.mark.parametrize(
