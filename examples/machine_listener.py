@@ -67,8 +67,8 @@ from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.data.clips import Clips
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aids import AtLevelOf, EqualiserLike, Unaided
-from hlsim.evaluation.fingerprint import fingerprint, value_hash
-from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
+from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
 from hlsim.files import read_table, sha256
 from hlsim.plugins import load_plugin
@@ -502,8 +502,9 @@ class AtEqualLevel(Condition):
         """Process an item with the aid, at the level of the other aid's output."""
         assert isinstance(self.process, AtLevelOf)
         aid, other = self.process.aid, self.process.other
-        level = item.once("level", lambda: level_spl(other(item.signal, item.ear)))
-        return set_level(aid(item.signal, item.ear), level)
+        time = item.signal.shape[-1]  # Samples after the end of the input are not scored.
+        level = item.once("level", lambda: level_spl(other(item.signal, item.ear)[..., :time]))
+        return set_level(aid(item.signal, item.ear)[..., :time], level)
 
 
 def make_conditions(aids: Sequence[str], *, own_levels: bool) -> list[Condition]:

@@ -210,7 +210,7 @@ class Audiogram:
         points: dict[float, float] = {}
         columns: dict[float, str] = {}
         for column, text in row.items():
-            frequency = _column_frequency(column)
+            frequency = column_frequency(column)
             if frequency is None:
                 continue
             if frequency in columns:
@@ -376,8 +376,12 @@ def check_range(
         )
 
 
-def _column_frequency(column: str) -> float | None:
-    """Return the frequency in Hz of a column of thresholds, or ``None`` for another column."""
+def column_frequency(column: str) -> float | None:
+    """Return the frequency in Hz of a column of thresholds, or ``None`` for another column.
+
+    >>> column_frequency("1k"), column_frequency("hl_500"), column_frequency("listener")
+    (1000.0, 500.0, None)
+    """
     match = _COLUMN.fullmatch(column)
     if match is None and re.match(r"hl[_ ]?\d", column, re.IGNORECASE):
         raise ValueError(f"column {column!r}: expected hl_ and a frequency in Hz, such as hl_500")

@@ -18,8 +18,8 @@ from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS, ear_name
 from hlsim.evaluation.measures import LEVELS, MEASURES, NORMAL, PERCEPTION, perceive
-from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.running.parallel import Progress, one_thread
 from hlsim.evaluation.study import Condition, Item
 from hlsim.report.demo import (
     NAL_R,

@@ -4,7 +4,7 @@ from hlsim.evaluation.comparison import Comparison, compare
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.recordings import haspi_report
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
 
 __all__ = [

@@ -69,8 +69,13 @@ class AtLevelOf(nn.Module):
         self.aid, self.other = aid, other
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Return the output of ``aid`` at the RMS level of the output of ``other``."""
-        return set_level(self.aid(waveform, audiogram), level_spl(self.other(waveform, audiogram)))
+        """Return the output of ``aid`` at the RMS level of the output of ``other``.
+
+        Samples after the end of the waveform do not count, because a study does not score them.
+        """
+        time = waveform.shape[-1]
+        level = level_spl(self.other(waveform, audiogram)[..., :time])
+        return set_level(self.aid(waveform, audiogram)[..., :time], level)
 
 
 class EqualiserLike(nn.Module):

@@ -27,10 +27,18 @@ from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
+from hlsim.evaluation.conditions import NAL_R, UNAIDED
 from hlsim.evaluation.measures import find_measures
-from hlsim.evaluation.parallel import describe_error, one_thread, run_parallel
-from hlsim.evaluation.recordings import Recording, score_recordings
+from hlsim.evaluation.recorded_items import Recording
+from hlsim.evaluation.recordings import score_recordings
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.running.parallel import (
+    CRASH,
+    Crash,
+    describe_error,
+    one_thread,
+    run_parallel,
+)
 from hlsim.evaluation.study import Condition, cut_output
 from hlsim.metrics.pair import common_length
 
@@ -39,9 +47,6 @@ FULL_SCALE_SPL = 100.0
 
 RULE_MS = 5.0
 """Look-ahead in ms that the challenges allow."""
-
-UNAIDED, NAL_R = "unaided", "NAL-R"
-"""Conditions with which every pair of aids is compared."""
 
 _MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
 """Ends of the names of files with the signals of the front microphones."""
@@ -140,7 +145,10 @@ def evaluate_scenes(
     write = partial(_write_signals, Path(out), conditions, rate, settings)
     parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
     recordings = []
-    for _, ears in run_parallel(write, pairs, **parallel):
+    for pair, ears in run_parallel(write, pairs, **parallel):
+        if isinstance(ears, Crash):
+            errors = {condition.name: ValueError(CRASH) for condition in conditions}
+            ears = _make_recordings(Path(out), pair, errors, settings)
         recordings += ears
     evaluation = score_recordings(
         recordings,
@@ -308,8 +316,7 @@ def _write_signals(
         ValueError: A file of the scene is broken, or has another rate or length.
     """
     mix, reference = _read_scene(pair, rate)
-    reference_file = out / "reference" / f"{pair.scene}.wav"
-    write_audio(reference_file, reference, rate)
+    write_audio(_reference_file(out, pair), reference, rate)
     outputs: dict[str, Path | ValueError] = {}
     for condition in conditions:
         assert condition.process is not None
@@ -321,8 +328,31 @@ def _write_signals(
             outputs[condition.name] = path
         except Exception as error:  # A failure must not end the study.
             outputs[condition.name] = ValueError(describe_error(error))
+            path.unlink(missing_ok=True)  # It is the output of an earlier run.
+    return _make_recordings(out, pair, outputs, settings)
+
+
+def _reference_file(out: Path, pair: _Pair) -> Path:
+    return out / "reference" / f"{pair.scene}.wav"
+
+
+def _make_recordings(
+    out: Path,
+    pair: _Pair,
+    outputs: Mapping[str, Path | ValueError],
+    settings: Mapping[str, Any],
+) -> list[Recording]:
+    """Return one recording per ear of the listener.
+
+    Args:
+        out: Folder of the results.
+        pair: The scene and the listener.
+        outputs: File of the outputs for both ears under each condition, or why there is none.
+        settings: Further arguments of the recordings.
+    """
+    reference = _reference_file(out, pair)
     return [
-        Recording(pair.scene, reference_file, outputs, ear, pair.name, side, **settings)
+        Recording(pair.scene, reference, outputs, ear, pair.name, side, **settings)
         for side, ear in pair.listener.ears().items()
     ]
 

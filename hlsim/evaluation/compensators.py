@@ -23,15 +23,13 @@ from hlsim.evaluation.aid_properties import (
 )
 from hlsim.evaluation.aids import AtLevelOf, Enhanced, EqualiserLike, Unaided, load_enhancers
 from hlsim.evaluation.comparison import compare
+from hlsim.evaluation.conditions import COMPRESSION, NAL_R, UNAIDED
 from hlsim.evaluation.items import INPUT_LEVELS, draw_aid_items, ear_name, read_ears
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
-
-UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
-"""Names of the conditions with which every compensator is compared."""
 
 UTTERANCES = 6
 """Number of clips of speech, of 3 s each, with which gains are measured."""

@@ -6,17 +6,19 @@ column of the study's table.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.checks import check_names, loud_outputs
-from hlsim.evaluation.fingerprint import fingerprint
+from hlsim.evaluation.running.fingerprint import fingerprint
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
 from hlsim.metrics import fidelity
@@ -31,7 +33,9 @@ from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
-from hlsim.version import __version__
+
+_CORRELATION_FLOOR = 0.2
+"""Correlation coefficient below which the lag of an output is unknown."""
 
 NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
@@ -52,13 +56,19 @@ def _score_signal(name: str, score: Callable[..., float], item: Item, output: Te
     return {name: score(output, item.clean, item.sample_rate)}
 
 
-# NumPy draws the noise of the scores for an ear.
+_SCORES = {
+    "haspi": (partial(_score_for_ear, "haspi", haspi), ["numpy"]),  # NumPy draws the ear's noise.
+    "hasqi": (partial(_score_for_ear, "hasqi", hasqi), ["numpy"]),
+    "haaqi": (partial(_score_for_ear, "haaqi", haaqi), ["numpy"]),
+    "stoi": (partial(_score_signal, "stoi", fidelity.stoi), ["pystoi", "scipy"]),
+    "pesq": (partial(_score_signal, "pesq", fidelity.pesq_wb), ["pesq"]),
+}
+
 MEASURES = {
-    "haspi": Measure("haspi", partial(_score_for_ear, "haspi", haspi), ["numpy"]),
-    "hasqi": Measure("hasqi", partial(_score_for_ear, "hasqi", hasqi), ["numpy"]),
-    "haaqi": Measure("haaqi", partial(_score_for_ear, "haaqi", haaqi), ["numpy"]),
-    "stoi": Measure("stoi", partial(_score_signal, "stoi", fidelity.stoi), ["pystoi", "scipy"]),
-    "pesq": Measure("pesq", partial(_score_signal, "pesq", fidelity.pesq_wb), ["pesq"]),
+    name: Measure(
+        name, compute, packages, uses_facts=False, scores=[name], may_crash=name == "pesq"
+    )
+    for name, (compute, packages) in _SCORES.items()
 }
 """The scores of ``--measures``, each under its name. Higher is better for all of them."""
 
@@ -142,8 +152,45 @@ def _measure_levels(item: Item, output: Tensor) -> Values:
     }
 
 
-LEVELS = Measure("levels", _measure_levels)
+def _measure_lag(item: Item, output: Tensor) -> Values:
+    lag = find_lag(output, item.clean)
+    return {} if lag is None else {"lag_ms": 1000.0 * lag / item.sample_rate}
+
+
+ALIGNMENT = Measure("alignment", _measure_lag, uses_facts=False, scores=())
+"""Lag of an output behind the clean speech in ms, if the two are similar enough to find it."""
+
+LEVELS = Measure("levels", _measure_levels, uses_facts=False, scores=())
 """RMS levels of output and clean speech in dB SPL, and the level of RMS 1.0."""
+
+
+def find_lag(output: Tensor, clean: Tensor) -> int | None:
+    """Return by how many samples an output is later than the clean speech.
+
+    The lag is that of the largest cross-correlation.
+
+    Args:
+        output: The output. Shape: (time,).
+        clean: Clean speech. Shape: (time,).
+
+    Returns:
+        The lag, negative if the output is early, or None if the correlation coefficient at this lag
+        is below 0.2.
+
+    >>> speech = torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    >>> find_lag(torch.nn.functional.pad(speech, (32, 0)), speech)
+    32
+    """
+    signals = [signal.double() - signal.double().mean() for signal in (output, clean)]
+    points = next_fast_len(len(output) + len(clean), real=True)
+    spectra = [torch.fft.rfft(signal, points) for signal in signals]
+    correlation = torch.fft.irfft(spectra[0] * spectra[1].conj(), points).abs()
+    peak = int(correlation.argmax())
+    energies = [float(signal.square().sum()) for signal in signals]
+    lowest = _CORRELATION_FLOOR * math.sqrt(math.prod(energies))
+    if not float(correlation[peak]) > lowest:
+        return None
+    return peak if peak < len(output) else peak - points
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
@@ -178,19 +225,13 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
     }
 
 
-PERCEPTION = Measure("perception", _measure_perception, settings=__version__)
+PERCEPTION = Measure("perception", _measure_perception, uses_facts=False, scores=())
 """Errors of an output as perceived through the exact MSBG, in dB, and its peak in dB SPL.
 
 ``loudness_error`` is the perceived level minus that of the input, with its noise, for a normal ear.
 ``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by the median
 difference of levels in 24 bands, and by ``HearingLossLoss(criterion="bands")``.
 """
-
-OTHER_COLUMNS = (
-    *("level", "clean_level", "full_scale_spl", "peak", "loudness_error"),
-    *("band_error", "loss_msbg", "loss_neuro", "gap", "source"),
-)
-"""Columns that the measures of hlsim return beside scores."""
 
 
 def network_loss(simulator: nn.Module) -> Measure:
@@ -211,7 +252,8 @@ def network_loss(simulator: nn.Module) -> Measure:
         perceived = simulator(output, item.ear)
         return {"loss_neuro": float(band_level_loss(perceived, reference, item.sample_rate))}
 
-    return Measure("network loss", compute, settings=fingerprint(simulator))
+    settings = fingerprint(simulator)
+    return Measure("network loss", compute, settings=settings, uses_facts=False, scores=())
 
 
 def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.measures import OTHER_COLUMNS
-from hlsim.evaluation.store import ScoreStore
-from hlsim.evaluation.study import Condition, Measure, Source, run_study
+from hlsim.evaluation.running.store import ScoreStore
+from hlsim.evaluation.study import Condition, Measure, Source, run_measures
 from hlsim.metrics.words import WordsChange, words_change
 from hlsim.version import __version__
 
@@ -82,15 +81,19 @@ class Evaluation:
         Raises:
             ValueError: No output could be scored.
         """
-        table = run_study(items, conditions, measures, store=ScoreStore(store), **running)
+        table, measures = run_measures(items, conditions, measures, ScoreStore(store), **running)
         evaluation = cls(items, conditions, measures, table, settings=settings)
-        if table.reindex(columns=evaluation.scores).isna().all(axis=None):
-            first = evaluation.failures.iloc[0]
-            raise ValueError(
-                f"none of {len(items)} items could be scored; the first, {first['name']} under "
-                f"{first['condition']}: {first['failure']}"
-            )
+        evaluation.check_scores()
         return evaluation
+
+    def check_scores(self) -> None:
+        """Raise ValueError, with the reason for the first item, if the table has no score."""
+        if self.table.reindex(columns=self.scores).isna().all(axis=None):
+            first = self.failures.iloc[0]
+            raise ValueError(
+                f"none of {self.table['item'].nunique()} items could be scored; the first, "
+                f"{first['name']} under {first['condition']}: {first['failure']}"
+            )
 
     @property
     def names(self) -> list[str]:
@@ -104,11 +107,9 @@ class Evaluation:
 
     @property
     def scores(self) -> list[str]:
-        """Columns of the table with scores: those of hlsim's measures, then those of your own."""
-        named = [measure.name for measure in self.measures if measure.name in self.table]
-        facts = [fact for source in self.items[:1] for fact in source.facts]
-        no_scores = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
-        return named + [column for column in self.table.columns if column not in no_scores]
+        """Columns of the table with scores, in the order of the measures."""
+        columns = [column for measure in self.measures for column in measure.scores or ()]
+        return [column for column in columns if column in self.table]
 
     @property
     def headline(self) -> Comparison | None:
@@ -150,7 +151,7 @@ class Evaluation:
         return words_change(scores[before].to_numpy(), scores[after].to_numpy())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of ``report.json``, with None in place of NaN.
+        """Return the contents of ``report.json``, with None in place of NaN and infinity.
 
         The keys are the attributes ``settings`` and ``notes``, ``versions`` of packages,
         ``conditions``, ``comparisons``, ``groups`` with comparisons of parts of the items, the keys
@@ -163,7 +164,7 @@ class Evaluation:
             for name, group in self.groups.items()
         }
         rows = self.table.astype(object).where(self.table.notna(), None)
-        return {
+        contents = {
             "settings": self.settings,
             "versions": self.versions,
             "notes": self.notes,
@@ -173,6 +174,16 @@ class Evaluation:
             **self.details,
             "rows": rows.to_dict("records"),
         }
+        return _replace_nonfinite(contents)
+
+
+def _replace_nonfinite(value: Any) -> Any:
+    """Return a value for JSON, with None in place of numbers that JSON cannot represent."""
+    if isinstance(value, Mapping):
+        return {key: _replace_nonfinite(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_replace_nonfinite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def predict_words(scores: Iterable[float]) -> float:

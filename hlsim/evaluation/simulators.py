@@ -20,10 +20,10 @@ from torch import Tensor, nn
 from hlsim.calibration import NEURO_RATE
 from hlsim.checks import loud_outputs
 from hlsim.evaluation.comparison import compare
-from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
 from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.running.fingerprint import fingerprint
 from hlsim.evaluation.study import Condition, Item, Measure, Values
 from hlsim.extras import is_installed
 from hlsim.metrics import fidelity
@@ -159,7 +159,8 @@ def _fidelity_to(teacher_name: str) -> Measure:
                 values |= {f"{name}_teacher": of_teacher, f"{name}_simulator": of_simulator}
         return values
 
-    return Measure("fidelity", compute, packages=packages, settings=fingerprint(teacher))
+    settings = fingerprint(teacher)
+    return Measure("fidelity", compute, packages, settings, uses_facts=False)
 
 
 def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:

@@ -18,6 +18,9 @@ MIN_ITEMS_FOR_INTERVAL = 6
 _RELATIVE_TOLERANCE = 1e-7
 """Share of the largest score up to which differences count as zero, because scores are float32."""
 
+_ROUNDING = {np.float32: 2.0**-24, np.float64: 2.0**-53}
+"""Largest relative difference between a decimal number and its nearest float of each type."""
+
 
 @dataclass(frozen=True)
 class PairedComparison:
@@ -100,9 +103,10 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     if n > 1 and zeros < n:
         # SciPy counts zeros when it chooses between the exact and the approximate p value.
         changes = difference[difference != 0.0]
-        # Rounding to a decimal place cannot separate equal differences of decimal scores.
-        places = -math.floor(math.log10(tolerance))
-        w, p_w = (float(value) for value in stats.wilcoxon(np.round(changes, places)))
+        precision = np.float32 if (both.astype(np.float32) == both).all() else np.float64
+        # Two differences of scores contain the rounding of four scores.
+        tied = _join_ties(changes, 4.0 * _ROUNDING[precision] * float(np.abs(both).max()))
+        w, p_w = (float(value) for value in stats.wilcoxon(tied))
     before_mean, after_mean, delta = (float(x.mean()) for x in (first, second, difference))
     interval = bootstrap_interval(difference) if n >= MIN_ITEMS_FOR_INTERVAL else (None, None)
     return PairedComparison(
@@ -120,6 +124,17 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
         d,
         *interval,
     )
+
+
+def _join_ties(differences: np.ndarray, tolerance: float) -> np.ndarray:
+    """Give differences whose magnitudes are equal up to a tolerance the same magnitude."""
+    magnitudes = np.abs(differences)
+    order = np.argsort(magnitudes)
+    is_larger = np.diff(magnitudes[order], prepend=-np.inf) > tolerance
+    first_of_group = order[is_larger][np.cumsum(is_larger) - 1]
+    joined = np.empty_like(magnitudes)
+    joined[order] = magnitudes[first_of_group]
+    return np.copysign(joined, differences)
 
 
 def bootstrap_interval(values: Iterable[float]) -> tuple[float, float]:

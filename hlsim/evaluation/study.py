@@ -21,9 +21,16 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checks import check_waveform, loud_outputs
-from hlsim.evaluation.fingerprint import fingerprint, value_hash
-from hlsim.evaluation.parallel import Progress, describe_error, one_thread, run_parallel
-from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.running.fingerprint import code_version, fingerprint, value_hash
+from hlsim.evaluation.running.parallel import (
+    CRASH,
+    Crash,
+    Progress,
+    describe_error,
+    one_thread,
+    run_parallel,
+)
+from hlsim.evaluation.running.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
 
@@ -32,6 +39,12 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, float | str]
 """Values that a measure returns for one output, by the column of the table."""
+
+_Results = dict[tuple[int, str, str], Values | str]
+"""Values, or the reason why there are none, by number of item, condition and measure."""
+
+_RESERVED_COLUMNS = ("item", "name", "condition", "failure", "source", "gap", "combined")
+"""Columns of the table that hlsim writes, so that a measure may not return them."""
 
 
 class Source(Protocol):
@@ -51,7 +64,10 @@ class Source(Protocol):
     def facts(self) -> Mapping[str, Any]: ...
 
     def digest(self, condition: str) -> str:
-        """Return a hash of everything in the item that decides its scores under a condition."""
+        """Return a hash of all data of the item on which its scores under a condition depend.
+
+        The name and the facts do not count: few measures use them.
+        """
 
     def load(self) -> Item: ...
 
@@ -152,6 +168,12 @@ class Measure:
         packages: Packages whose versions decide the values.
         settings: Fingerprint of all else that decides the values, such as a network or a version
             of the function; None if it is unknown.
+        uses_facts: Whether the values may depend on the name and the facts of an item, such as
+            the words that were spoken.
+        scores: Columns of the values that are scores, by which conditions are compared; None if
+            all columns are.
+        may_crash: Whether compiled code of the measure may end the process, which therefore is
+            never that of the caller.
 
     >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).name
     'peak'
@@ -161,6 +183,9 @@ class Measure:
     compute: Callable[[Item, Tensor], Values]
     packages: Sequence[str] = ()
     settings: str | None = ""
+    uses_facts: bool = True
+    scores: Sequence[str] | None = None
+    may_crash: bool = False
 
     @cached_property
     def fingerprint(self) -> str | None:
@@ -199,7 +224,8 @@ def run_study(
         conditions: Conditions that process each item.
         measures: Measures that score each output.
         store: Scores of earlier runs, to which new scores are added. A score is computed again only
-            if samples, ear, condition or measure have changed, or if a fingerprint is unknown.
+            if samples, ear, condition, measure or the code of hlsim have changed, if the measure
+            uses facts and these have changed, or if a fingerprint is unknown.
         jobs: Number of processes; all cores by default.
         dask: Address of a Dask scheduler, whose workers replace the processes.
         progress: Function that is called with the numbers of finished scores and of all scores.
@@ -210,8 +236,7 @@ def run_study(
         measure has its values.
 
     Raises:
-        ValueError: No scheduler answers, a process has ended, or two measures return the same
-            column.
+        ValueError: No scheduler answers, or a measure returns a column that exists already.
         OSError: The store cannot be written.
         MissingExtraError: A package is not installed.
 
@@ -222,16 +247,36 @@ def run_study(
     >>> run_study(items, conditions, measures, jobs=1)["peak"].tolist()
     [1.0]
     """
+    return run_measures(items, conditions, measures, store, progress, jobs=jobs, dask=dask)[0]
+
+
+def run_measures(
+    items: Sequence[Source],
+    conditions: Sequence[Condition],
+    measures: Sequence[Measure],
+    store: ScoreStore | None = None,
+    progress: Progress | None = None,
+    **running: Any,
+) -> tuple[DataFrame, list[Measure]]:
+    """Run a study, and return its table and its measures with the columns of their scores.
+
+    Args:
+        items, conditions, measures, store, progress: See ``run_study``.
+        running: Arguments ``jobs`` and ``dask`` of ``run_study``.
+    """
     pandas = require("pandas", "eval")
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
-    results: dict[tuple[int, str, str], Values | str] = {}
+    facts = {fact for source in items for fact in source.facts}
+    columns = _Columns([*_RESERVED_COLUMNS, *facts])
+    results: _Results = {}
     tasks = []
     for number, source in enumerate(items):
         task = _Task(number, source, [])
         for condition in conditions:
             for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
                 if key in store.scores:
+                    columns.add(measure, store.scores[key])
                     results[number, condition.name, measure.name] = store.scores[key]
                 else:
                     task.missing.append((condition, measure, key))
@@ -239,15 +284,63 @@ def run_study(
             tasks.append(task)
     total = len(items) * len(conditions) * len(measures)
     report_progress(len(results), total)
-    for task, measured in run_parallel(_measure_item, tasks, jobs=jobs, dask=dask):
-        for (condition, measure, key), values in zip(task.missing, measured, strict=True):
-            results[task.number, condition.name, measure.name] = values
-            if key and not isinstance(values, str):
-                store.append(key, values)
-        report_progress(len(results), total)
+    running["in_processes"] = any(measure.may_crash for measure in measures)
+    while tasks:
+        tasks_of_crashes = []
+        for task, measured in run_parallel(_measure_item, tasks, **running):
+            if isinstance(measured, Crash) and len(task.missing) > 1:
+                # Only one of the scores is to blame: each is computed again in a task of its own.
+                tasks_of_crashes += [task._replace(missing=[score]) for score in task.missing]
+                continue
+            if isinstance(measured, Crash):
+                measured = [CRASH]
+            for (condition, measure, key), values in zip(task.missing, measured, strict=True):
+                results[task.number, condition.name, measure.name] = values
+                if isinstance(values, str):
+                    continue
+                columns.add(measure, values)
+                if key:
+                    store.append(key, values)
+            report_progress(len(results), total)
+        tasks = tasks_of_crashes
     table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
     table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
-    return table
+    return table, columns.name_scores(measures)
+
+
+class _Columns:
+    """Columns of a table, each with the measure that returns it.
+
+    Args:
+        occupied: Columns that no measure may return.
+    """
+
+    def __init__(self, occupied: Sequence[str]) -> None:
+        self._measures: dict[str, str] = dict.fromkeys(occupied, "")
+
+    def add(self, measure: Measure, values: Values) -> None:
+        """Add the columns of the values of a measure.
+
+        Raises:
+            ValueError: A column exists already.
+        """
+        for column in values:
+            if self._measures.setdefault(column, measure.name) != measure.name:
+                raise ValueError(
+                    f"{measure.name} returns {column}, a column that exists already; rename it in "
+                    "the measure"
+                )
+
+    def name_scores(self, measures: Sequence[Measure]) -> list[Measure]:
+        """Return the measures, each with the columns of its scores."""
+        return [
+            measure
+            if measure.scores is not None
+            else replace(
+                measure, scores=[c for c, name in self._measures.items() if name == measure.name]
+            )
+            for measure in measures
+        ]
 
 
 def _keys(source: Source, condition: Condition, measures: Sequence[Measure]) -> list[str]:
@@ -259,7 +352,14 @@ def _keys(source: Source, condition: Condition, measures: Sequence[Measure]) -> 
     keys = []
     for measure in measures:
         parts = [digest, condition.fingerprint, measure.fingerprint]
-        keys.append("" if None in parts else value_hash([*parts, measure.name]))
+        if None in parts:
+            keys.append("")
+            continue
+        facts = [source.name, source.facts] if measure.uses_facts else []
+        try:
+            keys.append(value_hash([*parts, measure.name, facts, code_version()]))
+        except TypeError:  # A fact cannot be described.
+            keys.append("")
     return keys
 
 
@@ -328,18 +428,9 @@ def _make_rows(
     items: Sequence[Source],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
-    results: Mapping[tuple[int, str, str], Values | str],
+    results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the rows of the table of a study.
-
-    Args:
-        items, conditions, measures: See ``run_study``.
-        results: The values of each score, or the reason why there are none, by the number of the
-            item and the names of condition and measure.
-
-    Raises:
-        ValueError: Two measures return the same column.
-    """
+    """Return the rows of the table of a study, see ``run_study``."""
     rows = []
     for (number, source), condition in product(enumerate(items), conditions):
         row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}
@@ -348,12 +439,7 @@ def _make_rows(
             values = results[number, condition.name, measure.name]
             if isinstance(values, str):
                 reasons.append(values)
-                continue
-            for column in row.keys() & values.keys():
-                raise ValueError(
-                    f"{measure.name} returns {column}, a column that exists already; rename it in "
-                    "the measure"
-                )
-            row |= values
+            else:
+                row |= values
         rows.append({**row, "failure": "; ".join(dict.fromkeys(reasons)) or None})
     return rows

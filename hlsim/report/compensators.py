@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
-from hlsim.evaluation.compensators import COMPRESSION, HARD, NAL_R, UNAIDED, UTTERANCES
+from hlsim.evaluation.compensators import HARD, UTTERANCES
+from hlsim.evaluation.conditions import COMPRESSION, NAL_R, UNAIDED
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
 from hlsim.report.players import listening_sections

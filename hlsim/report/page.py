@@ -12,13 +12,14 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hlsim.extras import require
-from hlsim.files import write_atomically
+from hlsim.files import atomic_path
 
 SPECTROGRAM_LEVELS = (0.0, 90.0)
 """Lowest and highest level of all spectrograms in dB SPL, for a bin of 50 Hz."""
@@ -222,17 +223,25 @@ class Page:
         return _render("page.html", page=self)
 
     def markdown(self) -> str:
-        """Return text and tables in Markdown, without sounds and pictures. HTML tags stay text."""
-        return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", _render("page.md", page=self))
+        """Return text and tables in Markdown, without sounds and pictures. Marks stay text."""
+        return _render("page.md", page=self)
 
 
-def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
+def write_page(
+    page: Page,
+    data: Mapping[str, Any],
+    out: str | Path,
+    further_files: Mapping[str, str] | None = None,
+) -> Path:
     """Write a page as ``report.html`` and ``report.md``, and its data as ``report.json``.
+
+    Either all files are written or, for example because the disk is full, all stay as they were.
 
     Args:
         page: The page.
         data: Results for programs, such as those of ``Evaluation.to_dict``.
         out: Folder of the files. Files of these names are replaced; others stay.
+        further_files: Contents of further files of the folder by name.
 
     Returns: The path of ``report.html``.
 
@@ -251,10 +260,12 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
         "report.json": f"{text}\n",
         "report.md": page.markdown(),
         "report.html": page.html(),
+        **(further_files or {}),
     }
     folder = Path(out).absolute()
-    for name, content in contents.items():
-        write_atomically(folder / name, content)
+    with ExitStack() as stack:  # Files are replaced at its end, when all are on the disk.
+        for name, content in contents.items():
+            stack.enter_context(atomic_path(folder / name)).write_text(content, encoding="utf-8")
     return folder / "report.html"
 
 
@@ -277,12 +288,21 @@ def _environment() -> Any:
         "colours": SPECTROGRAM_COLOURS,
     }
     environment.filters["uri"] = _data_uri
+    environment.filters["plain"] = _escape_markdown
     return environment
 
 
 def _render(template: str, **values: Any) -> str:
     text: str = _environment().get_template(template).render(**values)
     return f"{text}\n"
+
+
+def _escape_markdown(text: str) -> str:
+    """Return a text in which no character has a meaning in Markdown, such as that of an image."""
+    text = re.sub(
+        r"([\\`*\[\]|~]|(?<!\w)_|_(?!\w)|^>|^[#+-](?=[\s#]))", r"\\\1", " ".join(text.split())
+    )
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text)
 
 
 def _data_uri(data: bytes) -> str:

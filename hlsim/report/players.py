@@ -13,8 +13,8 @@ from torch import Tensor
 from hlsim.audio import encode_flac
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl
 from hlsim.evaluation.measures import NORMAL, perceive
-from hlsim.evaluation.parallel import describe_error
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.running.parallel import describe_error
 from hlsim.extras import require
 from hlsim.report.page import (
     SPECTROGRAM_COLOURS,

@@ -72,7 +72,10 @@ def _draw_picture(
     """
     figures = require("matplotlib.figure", "eval")
     data = io.BytesIO()
-    with require("matplotlib", "eval").rc_context(_STYLE):
+    matplotlib = require("matplotlib", "eval")
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()  # Settings of the user, such as TeX, must not fail or change pages.
+        matplotlib.rcParams.update(_STYLE)
         figure = figures.Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
         draw(figure.subplots())
         figure.savefig(data, format="svg", transparent=True, metadata={"Date": None})

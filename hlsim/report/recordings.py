@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
+from hlsim.evaluation.clarity import RULE_MS
 from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.conditions import NAL_R, UNAIDED
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.files import write_atomically

@@ -240,6 +240,11 @@ def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_pat
     scored = study.table[study.table.item != failure.item]
     assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in scored.haspi]
     assert (study.details["look_ahead_ms"]["choosy"] is None) == (peaks[0] > peaks[1])
+    signals = tmp_path / "out" / "signals" / "choosy"
+    assert len([*signals.iterdir()]) == 1
+    HIGHEST_PEAK[0] = 0.0
+    evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, stride=2))
+    assert not [*signals.iterdir()], "an output of an earlier run stays although the aid fails"
 
 
 def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:

@@ -14,7 +14,7 @@ import hlsim
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import list_pretrained
-from hlsim.evaluation.fingerprint import fingerprint
+from hlsim.evaluation.running.fingerprint import _hash_sources, fingerprint
 from hlsim.plugins import WaveformPlugin
 
 N3 = Audiogram.standard("N3")
@@ -81,3 +81,17 @@ def test_objects_that_cannot_be_described_need_an_attribute(thing: Any) -> None:
     first = fingerprint(thing)
     thing.fingerprint = "version 2"
     assert None is not first != fingerprint(thing)
+
+
+@pytest.mark.parametrize(
+    ("file", "counts"),
+    [("metrics/new.py", True), ("clock.py", True), ("cli/new.py", False), ("notes.md", False)],
+)
+def test_the_hash_of_the_code_covers_all_that_scores_depend_on(
+    tmp_path: Path, file: str, counts: bool
+) -> None:
+    (tmp_path / "calibration.py").write_text("LEVEL = 94.0")
+    before = _hash_sources.__wrapped__(tmp_path)
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text("LEVEL = 90.0")
+    assert (_hash_sources.__wrapped__(tmp_path) != before) == counts

@@ -3,10 +3,11 @@
 import os
 import signal
 import time
+from typing import Any
 
 import pytest
 
-from hlsim.evaluation.parallel import run_parallel
+from hlsim.evaluation.running.parallel import Crash, run_parallel
 
 pytest.importorskip("joblib")
 
@@ -29,9 +30,11 @@ def test_tasks_come_back_with_their_results_and_an_exception_ends_the_run() -> N
 
 
 @pytest.mark.slow  # Processes take seconds to start, because they import hlsim.
-def test_a_process_that_ends_ends_the_run_with_a_reason() -> None:
-    with pytest.raises(ValueError, match="run again with fewer jobs"):
-        list(run_parallel(end_process_at_three, range(8), jobs=2))
+@pytest.mark.parametrize("settings", [{"jobs": 2}, {"jobs": 1, "in_processes": True}])
+def test_a_process_that_ends_costs_only_its_task(settings: dict[str, Any]) -> None:
+    results = dict(run_parallel(end_process_at_three, range(8), **settings))
+    assert isinstance(results.pop(3), Crash)
+    assert results == {number: number**2 for number in (0, 1, 2, 4, 5, 6, 7)}
 
 
 @pytest.mark.slow
@@ -46,6 +49,6 @@ def test_a_cluster_of_two_workers() -> None:
 
 def test_an_address_without_a_scheduler_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("hlsim.evaluation.parallel.CONNECTION_TIMEOUT", 0.2)
+    monkeypatch.setattr("hlsim.evaluation.running.parallel.CONNECTION_TIMEOUT", 0.2)
     with pytest.raises(ValueError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         list(run_parallel(abs, [1], dask="tcp://127.0.0.1:9"))

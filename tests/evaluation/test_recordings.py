@@ -1,5 +1,6 @@
 """Recorded speech scored from folders and from a manifest."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ from torch import Tensor
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
-from hlsim.evaluation.recordings import _read_manifest
+from hlsim.evaluation.recorded_items import read_manifest
 from hlsim.files import sha256
 from hlsim.metrics import haspi
+from hlsim.shortcuts import example_speech
 
 pytest.importorskip("pandas")
 
@@ -165,10 +167,12 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         ("L1,left,aided", "L1,left,", "line 3: expected a value in the column condition"),
         ("N3\nL2", "N4\nL2", "line 3: expected the audiogram of earlier rows of L1 left"),
         (",snr,", ",spl,", "expected no column spl, .* pass the option --spl"),
-        (",5,N3", ",x,N3", "line 2: could not convert string to float: 'x'"),
+        (",5,N3", ",x,N3", "line 2: expected a number in dB in the column snr, .* got 'x'"),
+        (",5,N3", ",-inf,N3", "line 2: expected a number in dB in the column snr"),
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
         ("before/a", "../a", "line 2: expected the path of a file below"),
-        ("condition,", "treatment,", "line 2: expected a value in the column condition"),
+        ("condition,", "treatment,", "line 2: there is no column condition, only listener, ear, "),
+        ("listener,ear", "ear,Ear", "line 1: the column ear appears twice"),
         (",audiogram\n", ",ear_of\n", "line 2: there is no audiogram of listener 'L1'"),
     ],
 )
@@ -176,7 +180,7 @@ def test_the_line_of_an_invalid_row_is_named(
     corpus: Path, old: str, new: str, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        _read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
+        read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
 
 
 def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> None:
@@ -184,21 +188,25 @@ def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> N
     unused = LEVELS.replace("80", "NR")  # Only ears that are used are validated.
     manifest = write_manifest(corpus, MANIFEST.replace(",audiogram\n", ",remark\n"))
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,R,{LEVELS}\nL3,left,{unused}\n")
-    assert {r.audiogram for r in _read_manifest(manifest, audiograms=ears)} == {N4}
+    assert {r.audiogram for r in read_manifest(manifest, audiograms=ears)} == {N4}
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,left,{LEVELS}\n")
     with pytest.raises(ValueError, match="line 4: there is no audiogram of listener 'L2'"):
-        _read_manifest(manifest, audiograms=ears)
+        read_manifest(manifest, audiograms=ears)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "expected either a manifest"),
+        ({}, "expected the ear of the files in folders .* got none"),
+        ({"audiogram": N4, "audiograms": "standard"}, "got both; pass one"),
+        ({"audiogram": N4, "conditions": {"A": "after"}}, "got both; name all folders"),
+        ({"audiogram": N4, "before": None, "after": None}, "expected either a manifest"),
+        ({"audiogram": N4, "root": "."}, "root has no effect on folders"),
         ({"audiogram": N4, "full_scale_spl": 300.0}, "full_scale_spl"),
         ({"audiogram": N4, "measures": ["loudness"]}, "unknown measures: loudness"),
         ({"audiogram": N4, "baseline": "unaided"}, "no condition 'unaided'"),
         ({"audiogram": N4, "better_ear": True}, "one left and one right ear"),
-        ({"audiogram": N4, "manifest": "study.csv"}, "expected either a manifest"),
+        ({"audiogram": N4, "manifest": "study.csv"}, "a manifest or folders, got both"),
     ],
 )
 def test_invalid_settings_are_rejected_before_scoring(
@@ -226,3 +234,183 @@ def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
         path.write_bytes(b"no audio")
     with pytest.raises(ValueError, match="none of 2 items could be scored"):
         haspi_report(**folders(corpus), audiogram=N4)
+
+
+def write_ears(folder: Path, noises: dict[tuple[str, str, int], float], item: str = "") -> Path:
+    """Write a manifest of one utterance per number, and its files.
+
+    Args:
+        folder: Folder of the files.
+        noises: Level of the noise by condition, ear and number of the utterance; NaN breaks a file.
+        item: Text of the column ``item``.
+    """
+    clean = example_speech()[:16000]
+    rows = ["listener,ear,condition,clean,processed,item,audiogram"]
+    for (condition, ear, number), noise in noises.items():
+        name = f"{condition}-{ear}-{number}.wav"
+        generator = torch.Generator().manual_seed(number)
+        write_audio(folder / f"c{number}.wav", clean * (1.0 + number), 16000)
+        signal = clean + noise * torch.randn(16000, generator=generator)
+        soundfile.write(folder / name, signal.numpy(), 16000, subtype="FLOAT")
+        rows.append(f"A,{ear},{condition},c{number}.wav,{name},{item},N1")
+    path = folder / "study.csv"
+    path.write_text("\n".join(rows))
+    return path
+
+
+BOTH_EARS = {
+    (condition, ear, number): noise
+    for condition in ("unaided", "aid")
+    for ear, noise in (("left", 0.01), ("right", 0.5))
+    for number in range(3)
+}
+
+
+def test_an_utterance_that_lacks_the_score_of_an_ear_is_left_out(tmp_path: Path) -> None:
+    noises = {**BOTH_EARS, ("aid", "left", 1): math.nan}
+    del noises["aid", "left", 0]
+    path = write_ears(tmp_path, noises)
+    report = haspi_report(manifest=path, measures=["stoi"], better_ear=True, jobs=1)
+    (comparison,) = report.comparisons
+    assert (comparison.overall.n, comparison.left_out) == (1, 2)
+    assert abs(comparison.overall.delta) < 0.01
+    assert report.failures.item.tolist() == [0, 1]
+    assert report.failures.failure.str.startswith("left ear: ").all()
+    assert "add its file" in report.failures.failure.iloc[0]
+    assert report.table.stoi.isna().sum() == 2
+
+
+def test_ears_that_all_lack_a_score_are_an_error(tmp_path: Path) -> None:
+    noises = {key: math.nan if key[1] == "left" else noise for key, noise in BOTH_EARS.items()}
+    path = write_ears(tmp_path, noises)
+    with pytest.raises(ValueError, match=r"none of 3 items could be scored; .*left ear: "):
+        haspi_report(manifest=path, measures=["stoi"], better_ear=True, jobs=1)
+
+
+@pytest.mark.parametrize("better_ear", [False, True])
+def test_different_clean_files_with_one_label_are_different_items(
+    tmp_path: Path, better_ear: bool
+) -> None:
+    path = write_ears(tmp_path, BOTH_EARS, item="sentence 1")
+    report = haspi_report(manifest=path, measures=["stoi"], better_ear=better_ear, jobs=1)
+    assert report.comparisons[0].overall.n == (3 if better_ear else 6)
+
+
+def test_both_ears_may_have_clean_files_of_their_own(tmp_path: Path) -> None:
+    text = write_ears(tmp_path, BOTH_EARS, item="s").read_text()
+    rows = [row for row in text.split("\n") if "-1.wav" not in row and "-2.wav" not in row]
+    (tmp_path / "right.wav").write_bytes((tmp_path / "c0.wav").read_bytes())
+    rows = [row.replace("c0.wav", "right.wav") if "right" in row else row for row in rows]
+    path = tmp_path / "two.csv"
+    path.write_text("\n".join(rows))
+    report = haspi_report(manifest=path, measures=["stoi"], better_ear=True, jobs=1)
+    assert report.table.item.nunique() == 1
+    path.write_text("\n".join(rows[:2]))
+    with pytest.raises(ValueError, match="A s has the ears left; add the missing rows"):
+        haspi_report(manifest=path, measures=["stoi"], better_ear=True, jobs=1)
+
+
+def test_items_are_not_identified_by_joined_or_rounded_texts(tmp_path: Path) -> None:
+    rows = [
+        ("A B", "C", "5"),
+        ("A", "B C", "5"),
+        ("A", "B C", "5.0000001"),
+        ("A", "B C", ""),
+    ]
+    path = tmp_path / "study.csv"
+    lines = [f"{a},{item},{snr},aid,c.wav,p.wav,N3" for a, item, snr in rows]
+    path.write_text("listener,item,snr,condition,clean,processed,audiogram\n" + "\n".join(lines))
+    assert len(read_manifest(path)) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "snr"),
+    [("5", 5.0), ("-2,5", -2.5), ("5 dB", 5.0), ("inf", math.inf), ("", math.nan)],
+)
+def test_texts_of_an_snr(tmp_path: Path, text: str, snr: float) -> None:
+    path = tmp_path / "study.csv"
+    path.write_text(f"condition;clean;processed;snr;audiogram\naid;c.wav;p.wav;{text};N3\n")
+    (recording,) = read_manifest(path)
+    assert recording.snr == pytest.approx(snr, nan_ok=True)
+
+
+def test_speech_in_quiet_is_a_null_in_json(tmp_path: Path) -> None:
+    path = write_ears(tmp_path, {("aid", "left", 0): 0.01})
+    text = path.read_text().replace(",audiogram", ",audiogram,snr").replace(",N1", ",N1,inf")
+    path.write_text(text)
+    report = haspi_report(manifest=path, measures=["stoi"], jobs=1)
+    assert report.to_dict()["rows"][0]["snr"] is None
+    json.dumps(report.to_dict(), allow_nan=False)
+
+
+def test_both_channels_of_a_file_have_one_gain(tmp_path: Path) -> None:
+    speech = example_speech()[:16000]
+    for name in ("c.wav", "p.wav"):
+        write_audio(tmp_path / name, torch.stack([speech, 0.1 * speech]), 16000)
+    rows = [f"L,{ear},aid,c.wav,p.wav,N3" for ear in ("left", "right")]
+    path = tmp_path / "study.csv"
+    path.write_text("listener,ear,condition,clean,processed,audiogram\n" + "\n".join(rows))
+    table = haspi_report(manifest=path, measures=["stoi"], spl=65.0, jobs=1).table
+    left, right = table.clean_level
+    assert left - right == pytest.approx(20.0, abs=1e-3)
+    assert 10 * math.log10((10 ** (left / 10) + 10 ** (right / 10)) / 2) == pytest.approx(65.0)
+
+
+def test_thresholds_of_a_manifest_have_the_names_of_a_table_of_ears(tmp_path: Path) -> None:
+    path = tmp_path / "study.csv"
+    path.write_text("Condition,CLEAN,Processed,500 Hz,4k\naid,c.wav,p.wav,60,80\n")
+    (recording,) = read_manifest(path, audiogram=N4)
+    assert recording.audiogram == Audiogram([60, 80], [500, 4000])
+
+
+def test_outputs_that_are_late_are_named(tmp_path: Path) -> None:
+    speech = example_speech()[:16000]
+    generator = torch.Generator().manual_seed(0)
+    for name, lag in (("clean", 0), ("after", 512), ("before", -100)):
+        signal = speech.roll(lag) + (0.0 if name == "clean" else 0.5) * speech.std() * torch.randn(
+            16000, generator=generator
+        )
+        write_audio(tmp_path / name / "a.wav", signal, 16000)
+    report = haspi_report(**folders(tmp_path), audiogram=N4, measures=["stoi"])
+    assert report.table.lag_ms.tolist() == [-6.25, 32.0]
+    (note,) = report.notes
+    assert "2 of 2 outputs" in note
+    assert "1 under after (median +32.0 ms)" in note
+
+
+def test_folders_of_many_systems_are_scored_for_all_ears_of_a_table(corpus: Path) -> None:
+    ears = corpus / "ears.csv"
+    ears.write_text("listener,ear,hl_500,hl_4000\nL1,left,20,40\nL2,right,50,60\n")
+    systems = {"noisy": corpus / "before", "A": corpus / "after", "B": corpus / "after"}
+    settings: dict[str, Any] = {"measures": ["stoi"], "jobs": 1}
+    report = haspi_report(corpus / "clean", conditions=systems, audiograms=ears, **settings)
+    assert report.names == ["noisy", "A", "B"]
+    names = ["L1 left a.b", "L1 left p2/c", "L2 right a.b", "L2 right p2/c"]
+    assert report.table.name.drop_duplicates().tolist() == names
+    assert (report.table.listener == report.table.name.str[:2]).all()
+    assert [(c.before, c.after) for c in report.comparisons if c.planned] == [("noisy", "B")]
+    ears.write_text("hl_500,hl_4000\n20,40\n50,60\n")
+    unnamed = haspi_report(corpus / "clean", conditions=systems, audiograms=ears, **settings)
+    assert unnamed.table.listener.unique().tolist() == ["row 1", "row 2"]
+    ears.write_text("listener,hl_500,hl_4000\nA,20,40\nA,50,60\n")
+    with pytest.raises(ValueError, match="got several of listener 'A'"):
+        haspi_report(corpus / "clean", conditions=systems, audiograms=ears, **settings)
+
+
+def test_a_frame_of_pandas_is_a_manifest(corpus: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    path = write_manifest(corpus, MANIFEST)
+    frame = pandas.read_csv(path)
+    frame["snr"] = [5.0, 5.0, math.nan, math.nan, math.nan]
+    recordings = read_manifest(frame, corpus)
+    assert [r.snr for r in recordings] == pytest.approx([5.0, math.nan], nan_ok=True)
+    assert [list(r.outputs) for r in recordings] == [
+        ["unaided", "aided"],
+        ["unaided", "aided", "loud"],
+    ]
+    frame["listener"] = None
+    assert {r.listener for r in read_manifest(frame, corpus)} == {""}
+    with pytest.raises(ValueError, match="got an empty DataFrame"):
+        read_manifest(frame[:0])
+    with pytest.raises(ValueError, match="the manifest, row 1: expected a value"):
+        read_manifest(frame.assign(condition=["a", "", "b", "c", "d"]), corpus)

@@ -128,3 +128,10 @@ def test_invalid_scores_are_rejected(before: list[float], after: list[float]) ->
         paired_comparison(before, after)
     with pytest.raises(ValueError, match="expected 6 values or more"):
         bootstrap_interval(before)
+
+
+def test_equal_differences_share_a_rank_in_either_precision() -> None:
+    before, after = [0.01, 0.77, 0.98, 0.59], [0.32, 0.19, 0.67, 0.20]
+    single = [np.array(scores, dtype=np.float32).tolist() for scores in (before, after)]
+    assert paired_comparison(*single).w == paired_comparison(before, after).w == 1.5
+    assert paired_comparison(*single).p_w == paired_comparison(before, after).p_w == 0.375

@@ -1,11 +1,12 @@
 """Stored scores: their file, and lines that are cut short."""
 
+import json
 import math
 from pathlib import Path
 
 import pytest
 
-from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.running.store import ScoreStore
 
 
 def test_records_are_read_again(tmp_path: Path) -> None:
@@ -21,7 +22,7 @@ def test_records_are_read_again(tmp_path: Path) -> None:
     assert ScoreStore(path).scores == {"a": {"score": 0.5}, "b": {"file": "ü"}}
 
 
-@pytest.mark.parametrize("cut", [1, 20])
+@pytest.mark.parametrize("cut", [2, 20])
 def test_lines_that_are_cut_short_or_no_records_are_ignored(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "scores.jsonl"
     store = ScoreStore(path)
@@ -33,3 +34,12 @@ def test_lines_that_are_cut_short_or_no_records_are_ignored(tmp_path: Path, cut:
     assert damaged.scores == {"a": {"score": 0.25}}
     damaged.append("c", {"score": 0.75})
     assert ScoreStore(path).scores == {"a": {"score": 0.25}, "c": {"score": 0.75}}
+
+
+def test_each_line_of_the_file_is_a_score(tmp_path: Path) -> None:
+    path = tmp_path / "scores.jsonl"
+    for key in ("a", "b"):
+        ScoreStore(path).append(key, {"score": 0.25})
+    lines = path.read_text().split("\n")
+    assert lines.pop() == ""
+    assert [json.loads(line)["key"] for line in lines] == ["a", "b"]

@@ -1,5 +1,7 @@
 """A study's table: its rows, its failures, stored values, and a run that is killed."""
 
+import os
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -107,6 +109,60 @@ def test_a_column_that_exists_is_rejected(items: list[Item]) -> None:
     measure = Measure("copy", lambda item, output: {"listener": 1.0}, settings="1")
     with pytest.raises(ValueError, match="listener, a column that exists already"):
         run_study(items, gains(1), [measure], jobs=1)
+
+
+@pytest.mark.parametrize("column", ["failure", "condition", "gap", "peak"])
+def test_a_column_of_the_table_is_rejected_at_the_first_value(
+    items: list[Item], column: str
+) -> None:
+    calls = []
+
+    def compute(item: Item, output: Tensor) -> dict[str, float]:
+        calls.append(item.name)
+        return {column: 1.0}
+
+    with pytest.raises(ValueError, match=f"own returns {column}, a column that exists already"):
+        run_study(items, gains(1), [MEASURES[0], Measure("own", compute)], jobs=1)
+    assert len(calls) == 1
+
+
+def test_a_change_of_the_code_or_of_facts_that_a_measure_uses_computes_scores_again(
+    items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, calls = tmp_path / "scores.jsonl", []
+
+    def compute(item: Item, output: Tensor) -> dict[str, float]:
+        calls.append(item.name)
+        return {"words": float(len(item.facts["text"]))}
+
+    def count_calls(text: str, **changes: Any) -> int:
+        calls.clear()
+        item = replace(items[0], facts={"text": text})
+        measure = replace(Measure("words", compute, settings="1"), **changes)
+        table = run_study([item], gains(1), [measure], store=ScoreStore(path), jobs=1)
+        assert table.words[0] == len(text) or not calls
+        return len(calls)
+
+    assert [count_calls(text) for text in ("one", "one", "two", "one")] == [1, 0, 1, 0]
+    assert count_calls("one", uses_facts=False) == 1
+    assert count_calls("two", uses_facts=False) == 0, "a measure that uses no facts"
+    monkeypatch.setattr("hlsim.evaluation.running.fingerprint.__version__", "9.9.9")
+    assert count_calls("one") == 1
+
+
+def end_process(item: Item, output: Tensor) -> dict[str, float]:
+    if item.name == "item 1":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"fragile": 1.0}
+
+
+@pytest.mark.slow  # Processes take seconds to start.
+def test_a_crash_costs_only_its_score(items: list[Item]) -> None:
+    measures = [MEASURES[0], Measure("fragile", end_process, may_crash=True)]
+    table = run_study(items, gains(1), measures, jobs=1)
+    assert table.peak.tolist() == pytest.approx([0.2, 0.4, 0.6])
+    assert table.fragile.isna().tolist() == [False, True, False]
+    assert "crash in compiled code" in table.failure[1]
 
 
 def test_only_missing_values_are_computed(items: list[Item], tmp_path: Path) -> None:

@@ -4,8 +4,12 @@ import base64
 import hashlib
 import re
 from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
 
-from hlsim.report.page import Card, Page, Picture, Player, Section, Sound, Table
+import pytest
+
+from hlsim.report.page import Card, Page, Picture, Player, Section, Sound, Table, write_page
 
 VOID_TAGS = {"meta", "link", "img", "input", "br"}
 
@@ -91,3 +95,34 @@ def test_columns_without_values_are_left_out_of_a_table() -> None:
     rows = [{"Aid": "a", "SNR": "n/a", "n": "n/a"}, {"Aid": "b", "SNR": "n/a", "n": "1"}]
     table = Table.from_rows("Scores", rows)
     assert (table.header, table.rows) == (["Aid", "n"], [["a", "n/a"], ["b", "1"]])
+
+
+def test_names_have_no_meaning_in_markdown() -> None:
+    name = "![x](http://a.b/c.png) *a* `b` | [l](u) ~~c~~ <img> _d_"
+    section = Section(name, [name, f"# {name}", f"> {name}"], [Table(name, (name,), [(name,)])])
+    text = Page(name, name, [section]).markdown()
+    assert not re.search(
+        r"(?<!\\)[\[\]*`|~<]", re.sub(r"^\|.*?\|$|^\*\*|\*\*$|&lt;", "", text, flags=re.M)
+    )
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert all(len(re.findall(r"(?<!\\)\|", row)) == 2 for row in rows)
+    assert all(not re.search(r"(?<!\\)[\[*`]", row) for row in rows)
+    assert "\n\\# " in text and "\n\\> " in text
+
+
+def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_page(Page("first", "", []), {}, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    write_text = Path.write_text
+
+    def fill_disk(path: Path, *arguments: Any, **settings: Any) -> int:
+        if path.name == "report.html":
+            raise OSError(28, "No space left on device")
+        return write_text(path, *arguments, **settings)
+
+    monkeypatch.setattr(Path, "write_text", fill_disk)
+    with pytest.raises(ValueError, match="No space left on device"):
+        write_page(Page("second", "", []), {}, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

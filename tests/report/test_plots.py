@@ -45,3 +45,12 @@ def test_colours_of_conditions() -> None:
     assert colours["none"] == UNAIDED_COLOUR
     assert colours["NAL-R, same level"] == (colours["mine"], 0.6)
     assert len({str(colour) for colour in colours.values()}) == 4
+
+
+def test_settings_of_the_user_neither_change_a_picture_nor_are_changed() -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    curves = {"a": ([250, 4000], [1.0, 2.0], {"color": "#2f7ed8"})}
+    expected = curves_picture(curves, "A title", "level (dB)").data
+    with matplotlib.rc_context({"text.usetex": True, "axes.linewidth": 5.0}):
+        assert curves_picture(curves, "A title", "level (dB)").data == expected
+        assert matplotlib.rcParams["text.usetex"]

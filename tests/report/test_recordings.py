@@ -11,7 +11,7 @@ from hlsim.audio import write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Condition, Evaluation, compare
 from hlsim.evaluation.measures import MEASURES
-from hlsim.evaluation.recordings import Recording
+from hlsim.evaluation.recorded_items import Recording
 from hlsim.report.page import write_page
 from hlsim.report.recordings import report_page
 

@@ -1,9 +1,9 @@
 """Fingerprints: hashes that show whether a stored score is still valid.
 
 A fingerprint covers everything that decides the outputs of a module: class names, settings and
-tensors, and the version of hlsim. Source code is not read, so that editing it invalidates nothing.
-Authors of modules outside hlsim add an attribute ``fingerprint``, such as a version, and change it
-when the outputs change.
+tensors. The code of hlsim has a hash of its own, ``code_version``, which is part of the key of each
+stored score. Authors of modules outside hlsim add an attribute ``fingerprint``, such as a version,
+and change it when the outputs change.
 """
 
 from __future__ import annotations
@@ -11,16 +11,52 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor, nn
 
+import compensators
 from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 """Attributes of every module, which say nothing about its outputs."""
+
+_ROOMS_WITHOUT_SCORES = frozenset({"cli", "report", "training"})
+"""Packages of hlsim that no score depends on: commands, pages and training."""
+
+
+def code_version() -> str:
+    """Return the version of hlsim with a hash of its source code, on which all scores depend.
+
+    The code of commands, pages and training does not count.
+
+    >>> code_version() == code_version()
+    True
+    """
+    return (
+        f"{__version__} {_hash_sources(Path(__file__).parents[2], Path(compensators.__path__[0]))}"
+    )
+
+
+@cache
+def _hash_sources(*folders: Path) -> str:
+    """Compute the SHA-256 of all source files in which scores may be computed.
+
+    Args:
+        folders: Folders of the packages.
+    """
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            place = path.relative_to(folder)
+            if place.parts[0] not in _ROOMS_WITHOUT_SCORES:
+                digest.update(f"{folder.name}/{place.as_posix()}\n".encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def fingerprint(processing: Any) -> str | None:
@@ -56,7 +92,7 @@ def fingerprint(processing: Any) -> str | None:
     modules = processing.named_modules()
     parts = {name: [_name(module), _public_attributes(module)] for name, module in modules}
     try:
-        return value_hash([__version__, parts, tensors])
+        return value_hash([parts, tensors])
     except TypeError:
         return None
 

@@ -6,6 +6,7 @@ The file holds one JSON object per line, so that two runs can share it and peopl
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -54,6 +55,9 @@ class ScoreStore:
         line = json.dumps(score, ensure_ascii=False, allow_nan=False)
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.path, "a", encoding="utf-8") as file:
-                file.write(f"\n{line}")  # The line before this one may be cut short.
+            with open(self.path, "a+b") as file:
+                # An interruption may have cut the last line short, which then has no end.
+                file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
+                line_break = "" if file.read(1) in (b"", b"\n") else "\n"
+                file.write(f"{line_break}{line}\n".encode())
         self.scores[key] = values

@@ -22,6 +22,16 @@ CONNECTION_TIMEOUT = 10.0
 DEAD_PROCESS_ERRORS = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker")
 """Types of the errors that joblib and Dask raise when a process has ended."""
 
+CRASH = "the process ended, after a crash in compiled code or because memory ran out"
+"""Reason why a task has no result after a ``Crash``."""
+
+_TASKS_IN_FLIGHT = 8
+"""Number of tasks per process among which is the one whose process ended."""
+
+
+class Crash:
+    """Result of a task whose process has ended."""
+
 
 def describe_error(error: Exception) -> str:
     """Describe an exception in one line, with its type unless it is a ValueError.
@@ -57,20 +67,25 @@ def run_parallel(
     *,
     jobs: int | None = None,
     dask: str | None = None,
-) -> Iterator[tuple[Task, Result]]:
+    in_processes: bool = False,
+) -> Iterator[tuple[Task, Result | Crash]]:
     """Call a function for each task, and yield the tasks with their results, in the same order.
+
+    If a process ends, the next tasks are repeated one by one, so that the result of the task that
+    ended it is a ``Crash`` and all others have their results.
 
     Args:
         function: Function of a task, which can be pickled. An exception that it raises ends the
             run.
         tasks: Arguments of the function.
-        jobs: Number of processes; all cores by default. With 1, tasks run in this process.
+        jobs: Number of processes; all cores by default. With 1, tasks run in this process, which a
+            crash ends.
         dask: Address of a Dask scheduler, whose workers replace the processes. The workers must be
             able to import hlsim and to read the same files.
+        in_processes: Whether tasks run in another process even if ``jobs`` is 1.
 
     Raises:
-        ValueError: No scheduler answers, or a process has ended, after a crash in compiled code or
-            because memory ran out.
+        ValueError: No scheduler answers.
         MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not
             installed.
 
@@ -85,15 +100,30 @@ def run_parallel(
             jobs = None
         stack.enter_context(joblib.parallel_config(**settings))
         pool = joblib.Parallel(n_jobs=jobs or -1, return_as="generator")
-        try:
-            yield from zip(tasks, pool(map(joblib.delayed(function), tasks)), strict=True)
-        except Exception as error:
-            if type(error).__name__ not in DEAD_PROCESS_ERRORS:
-                raise
-            raise ValueError(
-                "a process ended, after a crash in compiled code or because memory ran out; run "
-                "again with fewer jobs (--jobs), which continues with what is stored"
-            ) from error
+        single_pool = joblib.Parallel(n_jobs=2)  # With 1, it would be no process of its own.
+        call = joblib.delayed(function)
+        finished = 0
+        alone = len(tasks) if in_processes and jobs == 1 else 0
+        while finished < len(tasks):
+            if not alone:
+                try:
+                    for result in pool(map(call, tasks[finished:])):
+                        yield tasks[finished], result
+                        finished += 1
+                except Exception as error:
+                    if type(error).__name__ not in DEAD_PROCESS_ERRORS:
+                        raise
+                    alone = _TASKS_IN_FLIGHT * joblib.cpu_count()
+                continue
+            try:
+                [result] = single_pool([call(tasks[finished])])
+            except Exception as error:
+                if type(error).__name__ not in DEAD_PROCESS_ERRORS:
+                    raise
+                result = Crash()
+            yield tasks[finished], result
+            finished += 1
+            alone -= 1
 
 
 def _connect(scheduler: str) -> Any:

@@ -1,0 +1,468 @@
+"""Items that were recorded in files, which folders, a manifest or a table of pandas name.
+
+A manifest is a CSV file with one row for each output file::
+
+    listener,ear,condition,clean,processed,snr,hl_250,hl_500,...,hl_8000
+    L1,left,unaided,clean/s01.flac,noisy/s01.flac,5,35,35,...,65
+    L1,left,NAL-R,clean/s01.flac,nalr/L1-left/s01.flac,5,35,35,...,65
+
+It needs the columns ``condition``, ``clean`` and ``processed``; paths are relative to the root. It
+may have ``listener``, ``ear`` (left or right), ``item`` and ``snr`` (dB). Rows with the same
+listener, ear, clean file, item and SNR form one item. Its audiogram is in columns ``hl_250`` and so
+on, as in tables of ears, in a column ``audiogram`` by its standard name, or in a second file by
+``listener`` and ``ear``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from hlsim.audio import find_audio, read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram.listener import EAR_NAMES, EARS, Listener
+from hlsim.audiogram.table import read_audiograms, read_listeners
+from hlsim.audiogram.value import column_frequency, convert_at
+from hlsim.calibration import check_full_scale, dbfs
+from hlsim.evaluation.running.fingerprint import value_hash
+from hlsim.evaluation.study import Item
+from hlsim.files import path_below, read_table, sha256
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_REQUIRED_COLUMNS = ("condition", "clean", "processed")
+"""Columns that every row of a manifest must fill."""
+
+_COLUMNS = (*_REQUIRED_COLUMNS, "listener", "ear", "item", "snr", "audiogram", "spl")
+"""Columns of a manifest whose meaning is known, beside those of thresholds."""
+
+_Rows = Sequence[tuple[str, Mapping[str, str]]]
+"""Rows of a manifest: the place of each in messages, and its texts by column."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Recorded outputs of one or more conditions for one utterance and one ear, in files.
+
+    Args:
+        utterance: Name of the utterance, the same for both ears of a listener.
+        clean: File of clean speech.
+        outputs: File of the output under each condition, by the name of the condition, or the error
+            because of which there is none.
+        audiogram: The ear.
+        listener: Name of the listener; empty if unknown.
+        ear: ``"left"``, ``"right"`` or empty, which selects the channel of a file with two
+            channels.
+        snr: Signal-to-noise ratio in dB; NaN if unknown, infinite for speech in quiet.
+        full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
+        spl: Level of the clean file in dB SPL over all its channels, which replaces
+            ``full_scale_spl``; None uses ``full_scale_spl``.
+        seed: Seed of the study. The seed of an item depends on this seed and on the contents of its
+            clean file.
+
+    >>> ear = Audiogram.standard("N3")
+    >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
+    'L1 left s01 5 dB'
+    """
+
+    utterance: str
+    clean: Path
+    outputs: Mapping[str, Path | ValueError]
+    audiogram: Audiogram
+    listener: str = ""
+    ear: str = ""
+    snr: float = math.nan
+    full_scale_spl: float = 94.0
+    spl: float | None = None
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """Listener, ear, utterance and SNR, if they are known."""
+        return join_name(self.listener, self.ear, self.utterance, self.snr)
+
+    @property
+    def both_ears_name(self) -> str:
+        """Listener, utterance and SNR, if they are known."""
+        return join_name(self.listener, self.utterance, self.snr)
+
+    @property
+    def utterance_key(self) -> tuple[str, str, float | None]:
+        """Listener, utterance and SNR, which both ears share, as a key that equals itself."""
+        snr = None if math.isnan(self.snr) else self.snr
+        return self.listener, self.utterance, snr
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Columns of the table that describe the recording, without its name."""
+        return {
+            "listener": self.listener,
+            "ear": self.ear,
+            "utterance": self.utterance,
+            "snr": self.snr,
+            "severity": self.audiogram.severity,
+            "audiogram": list(self.audiogram.thresholds),
+        }
+
+    def digest(self, condition: str) -> str:
+        """Return a hash of both files, the ear, the level and the seed."""
+        files = [_file_hash(self.clean), _file_hash(self._output_file(condition))]
+        level = [self.full_scale_spl, self.spl]
+        return value_hash([files, level, self.ear, self.audiogram.thresholds, self.seed])
+
+    def load(self) -> Item:
+        """Read the clean speech. Outputs are read when they are measured.
+
+        Raises:
+            ValueError: The file cannot be read.
+        """
+        waveform, rate = read_audio(self.clean)
+        clean = self._select_channel(self.clean, waveform)
+        full_scale = self.full_scale_spl
+        if self.spl is not None:
+            # Both ears have one gain, because the difference of their levels counts.
+            level = float(dbfs(waveform.double().flatten()))
+            full_scale = check_full_scale(self.spl - level)
+        return Item(
+            self.name,
+            clean,
+            clean,
+            self.audiogram,
+            sample_rate=rate,
+            full_scale_spl=full_scale,
+            seed=(self.seed + int(_file_hash(self.clean)[:8], 16)) % 2**32,
+            facts=self.facts,
+            recorded=partial(self._read_output, rate),
+        )
+
+    def _output_file(self, condition: str) -> Path:
+        file = self.outputs.get(condition)
+        if file is None:
+            raise ValueError(
+                f"no output of {self.name} is recorded under {condition}; add its file, for "
+                "example by a row of the manifest"
+            )
+        if isinstance(file, ValueError):
+            raise file
+        return file
+
+    def _read_output(self, rate: int, condition: str) -> Tensor:
+        path = self._output_file(condition)
+        waveform, output_rate = read_audio(path)
+        if output_rate != rate:
+            raise ValueError(
+                f"{path}: expected the sample rate of {self.clean}, {rate} Hz, got {output_rate} "
+                "Hz; resample one of the files"
+            )
+        return self._select_channel(path, waveform)
+
+    def _select_channel(self, path: Path, waveform: Tensor) -> Tensor:
+        """Return the ear's channel in float64. Shape: (channels, time) -> (time,).
+
+        Args:
+            path: File of the waveform, for the message.
+            waveform: Samples of all channels.
+
+        Raises:
+            ValueError: It is not known which channel is that of the ear.
+        """
+        channels = len(waveform)
+        if channels > 2 or (channels == 2 and not self.ear):
+            raise ValueError(
+                f"{path}: expected one channel, or two if the ear is named left or right (column "
+                f"ear of a manifest), got {channels}; write the ear's channel to a file"
+            )
+        return waveform[EARS.index(self.ear) if channels == 2 else 0].double()
+
+
+def _file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file, which is read again only if its size or time has changed."""
+    state = path.stat()
+    return _hash_of_state(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=65536)
+def _hash_of_state(path: Path, size: int, time: int) -> str:
+    return sha256(path)
+
+
+def join_name(*parts: str | float) -> str:
+    """Join the known parts of an item's name. A number is an SNR in dB.
+
+    >>> join_name("L1", "", "s01", 5.0), join_name("s01", math.nan), join_name("s01", math.inf)
+    ('L1 s01 5 dB', 's01', 's01 in quiet')
+    """
+    texts = []
+    for part in parts:
+        if isinstance(part, str):
+            texts.append(part)
+        elif part == math.inf:
+            texts.append("in quiet")
+        elif not math.isnan(part):
+            texts.append(f"{part:g} dB")
+    return " ".join(filter(None, texts))
+
+
+def read_folders(
+    clean: str | Path,
+    folders: Mapping[str, str | Path],
+    ears: Sequence[tuple[str, str, Audiogram]],
+    **settings: Any,
+) -> list[Recording]:
+    """Return one recording per ear and file of a folder of clean speech.
+
+    Args:
+        clean: Folder of clean speech.
+        folders: Folder of the outputs by condition. The files of all folders have the same names,
+            whatever their extension.
+        ears: Name of the listener, name of the ear and audiogram of each ear; names may be empty.
+        settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
+
+    Raises:
+        ValueError: The names differ.
+
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> folder, ears = EXAMPLE_FILE.parent, [("L1", "left", Audiogram.standard("N3"))]
+    >>> [recording.name for recording in read_folders(folder, {"mine": folder}, ears)]
+    ['L1 left example']
+    """
+    speech = _files_by_name(clean)
+    outputs = {condition: _files_by_name(folder) for condition, folder in folders.items()}
+    for condition, files in outputs.items():
+        different_names = sorted(files.keys() ^ speech.keys())
+        if different_names:
+            raise ValueError(
+                f"{clean} and {folders[condition]}: expected files with the same names, but only "
+                f"one of them has {different_names[0]} ({len(different_names)} differences); "
+                "rename, add or remove files"
+            )
+    recordings = []
+    for listener, ear, audiogram in ears:
+        for name, path in speech.items():
+            files_of_name = {condition: files[name] for condition, files in outputs.items()}
+            recordings.append(
+                Recording(name, path, files_of_name, audiogram, listener, ear, **settings)
+            )
+    return recordings
+
+
+def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
+    """Return name of the listener, name of the ear and audiogram of each ear of a table.
+
+    A row without a listener is called by its number.
+
+    Args:
+        audiograms: Table of ears, see ``read_audiograms``, or Clarity's ``listeners.json``.
+
+    >>> read_named_ears("standard")[0]
+    ('N1', '', Audiogram('N1'))
+    """
+    if str(audiograms).lower().endswith(".json"):
+        listeners = read_listeners(audiograms).items()
+        return [(name, side, ear) for name, both in listeners for side, ear in both.ears().items()]
+    ears = []
+    for number, (row, audiogram) in enumerate(read_audiograms(audiograms), start=1):
+        columns = {column.lower(): text for column, text in row.items()}
+        side = EAR_NAMES.get(columns.get("ear", "").lower(), "")
+        ears.append((columns.get("listener") or f"row {number}", side, audiogram))
+    names = [(listener, side) for listener, side, _ in ears]
+    for listener, side in names:
+        if names.count((listener, side)) > 1:
+            raise ValueError(
+                f"{audiograms}: expected one row for each ear, got several of listener "
+                f"{listener!r}, ear {side!r}; name the listener and the ear of each row"
+            )
+    return ears
+
+
+def _files_by_name(folder: str | Path) -> dict[str, Path]:
+    """Return the audio files of a folder by their path below it, without extension."""
+    files: dict[str, Path] = {}
+    for path in find_audio(folder):
+        name = path.relative_to(folder).with_suffix("").as_posix()
+        if name in files:
+            raise ValueError(f"{files[name]} and {path} differ in their extension; keep one")
+        files[name] = path
+    return files
+
+
+def read_manifest(
+    manifest: str | Path | DataFrame,
+    root: str | Path | None = None,
+    audiogram: Audiogram | None = None,
+    audiograms: str | Path | None = None,
+    **settings: Any,
+) -> list[Recording]:
+    """Return the recordings of a manifest, in the order of their first rows.
+
+    Args:
+        manifest: CSV file or DataFrame with one row per output and the columns that the top of this
+            module describes: ``condition``, ``clean`` and ``processed``, and others if they are
+            known.
+        root: Folder to which the paths are relative; by default that of the manifest, or the
+            current folder for a DataFrame.
+        audiogram: The ear of rows without an audiogram.
+        audiograms: File of listeners, see ``read_listeners``.
+        settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
+
+    Raises:
+        ValueError: A row is not valid; the message names its line.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "m.csv"
+    ...     _ = path.write_text("condition,clean,processed,audiogram\\nmine,c/1.wav,p/1.wav,N3\\n")
+    ...     [recording.name for recording in read_manifest(path)]
+    ['c/1']
+    """
+    is_file = isinstance(manifest, (str, Path))
+    rows = _rows_of_file(manifest) if is_file else _rows_of_frame(manifest)
+    folder = root if root is not None else (Path(manifest).parent if is_file else Path())
+    columns = rows[0][1]
+    if "spl" in columns:
+        raise ValueError(
+            f"{rows[0][0]}: expected no column spl, because all files have one level; remove it, "
+            "and pass the option --spl (spl in Python)"
+        )
+    for column in _REQUIRED_COLUMNS:
+        if column not in columns:
+            raise ValueError(
+                f"{rows[0][0]}: there is no column {column}, only {', '.join(columns)}; add it"
+            )
+    listeners: dict[str, Listener] = {}
+    if audiograms is not None:
+        listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})
+    recordings: dict[tuple[Any, ...], Recording] = {}
+    for place, row in rows:
+        recording = convert_at(place, _read_row, row, folder, listeners, audiogram, settings)
+        key = (*recording.utterance_key, recording.ear, recording.clean)
+        if key in recordings:
+            recording = convert_at(place, _merge, recordings[key], recording)
+        recordings[key] = recording
+    return list(recordings.values())
+
+
+def _rows_of_file(path: Any) -> _Rows:
+    """Return the rows of a CSV file."""
+    return [
+        (f"{path}, line {line}", _known_columns(f"{path}, line 1", row))
+        for line, row in read_table(path, "the manifest")
+    ]
+
+
+def _rows_of_frame(frame: Any) -> _Rows:
+    """Return the rows of a DataFrame, whose missing values become empty texts."""
+    records = frame.astype(object).where(frame.notna(), "").to_dict("records")
+    if not records:
+        raise ValueError("expected a manifest with rows, got an empty DataFrame; add rows")
+    rows = []
+    for label, record in zip(frame.index, records, strict=True):
+        texts = {str(column).strip(): str(value).strip() for column, value in record.items()}
+        rows.append((f"the manifest, row {label}", _known_columns("the manifest", texts)))
+    return rows
+
+
+def _known_columns(place: str, row: Mapping[str, str]) -> dict[str, str]:
+    """Return a row with the names of known columns in lower case, whatever their case was."""
+    known: dict[str, str] = {}
+    for column, text in row.items():
+        name = column.lower() if column.lower() in _COLUMNS else column
+        if name in known:
+            raise ValueError(f"{place}: the column {name} appears twice; remove one of the two")
+        known[name] = text
+    return known
+
+
+def _merge(earlier: Recording, recording: Recording) -> Recording:
+    """Return a recording with the outputs of an earlier one of the same item.
+
+    Raises:
+        ValueError: Both have an output under one condition, or their ears differ.
+    """
+    for condition in earlier.outputs.keys() & recording.outputs.keys():
+        raise ValueError(
+            f"expected one row of {recording.name} under condition {condition}, got a second one; "
+            "remove one of them, or give both different values in the column item"
+        )
+    if recording.audiogram != earlier.audiogram:
+        raise ValueError(
+            f"expected the audiogram of earlier rows of {recording.name}, got another one; write "
+            "one audiogram in all its rows"
+        )
+    return replace(recording, outputs={**earlier.outputs, **recording.outputs})
+
+
+def _read_row(
+    row: Mapping[str, str],
+    root: str | Path,
+    listeners: Mapping[str, Listener],
+    audiogram: Audiogram | None,
+    settings: Mapping[str, Any],
+) -> Recording:
+    """Return the recording of a row of a manifest, which has one output.
+
+    Args:
+        row: Texts by column.
+        root: Folder to which the paths are relative.
+        listeners: Listeners by their name.
+        audiogram: The ear if neither the row nor ``listeners`` has an audiogram.
+        settings: Further arguments of the recording.
+    """
+    for column in _REQUIRED_COLUMNS:
+        if not row[column]:
+            raise ValueError(f"expected a value in the column {column}, got none; fill it in")
+    listener, text = row.get("listener", ""), row.get("ear", "")
+    ear = EAR_NAMES.get(text.lower(), "")
+    if text and not ear:
+        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
+    thresholds = {
+        column: value
+        for column, value in row.items()
+        if column not in _COLUMNS and column_frequency(column) is not None
+    }
+    if any(thresholds.values()):
+        audiogram = Audiogram.from_row(thresholds)
+    elif row.get("audiogram"):
+        audiogram = Audiogram.standard(row["audiogram"])
+    elif listener in listeners:
+        audiogram = getattr(listeners[listener], ear, None) or audiogram
+    if audiogram is None:
+        raise ValueError(
+            f"there is no audiogram of listener {listener!r}, ear {text!r}; add columns hl_250, "
+            "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
+            "ear"
+        )
+    return Recording(
+        utterance=row.get("item") or str(Path(row["clean"]).with_suffix("")),
+        clean=path_below(root, row["clean"]),
+        outputs={row["condition"]: path_below(root, row["processed"])},
+        audiogram=audiogram,
+        listener=listener,
+        ear=ear,
+        snr=_parse_snr(row.get("snr", "")),
+        **settings,
+    )
+
+
+def _parse_snr(text: str) -> float:
+    """Return the SNR in dB of a text such as "5", "2,5 dB" or "inf" (in quiet); NaN of no text."""
+    number = text.lower().removesuffix("db").strip().replace(",", ".")
+    if not number:
+        return math.nan
+    try:
+        snr = float(number)
+    except ValueError:
+        snr = math.nan
+    if not snr > -math.inf:
+        raise ValueError(
+            f"expected a number in dB in the column snr, such as 5, or inf for speech in quiet, "
+            f"got {text!r}; correct it, or leave it empty if the ratio is unknown"
+        )
+    return snr

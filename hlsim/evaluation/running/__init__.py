@@ -1,0 +1,1 @@
+"""Runs of studies: in parallel, with stored scores, and with hashes that keep them valid."""
