@@ -99,8 +99,8 @@ class QualityReference(Reference):
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
-        equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes signals
-            that NAL-R or another prescription has amplified.
+        equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes
+            signals that NAL-R or another prescription has amplified.
         keep: Store the clean signals' features, about 18 MB per second in float32; otherwise they
             are computed for each score.
 
