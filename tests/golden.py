@@ -56,15 +56,16 @@ COMMITTED_FILE = Path(__file__).with_name("golden.npz")
 LOCAL_FILE = Path(os.environ["HLSIM_GOLDEN"]) if os.environ.get("HLSIM_GOLDEN") else None
 
 # Largest differences on another machine or with another version of torch, relative to the peak of
-# the array. Each is a few times the largest difference that was measured between AVX-512, AVX2 and
-# no vector instructions on one machine.
+# the array. Each is two to ten times the largest difference that was measured between AVX-512, AVX2
+# and no vector instructions of torch, and the SSE kernels of oneDNN, MKL and OpenBLAS.
 EXACT = 1e-6
-RESAMPLED = 1e-5  # hlsim's own resampling takes part
+RESAMPLED_NETWORK = 5e-5  # a network between two resamplings
 SINGLE_PRECISION = (
     2e-5  # float32 spectra, whose smallest powers differ most; float64 cases keep to EXACT
 )
 LOSS = 5e-4  # logarithms and phases of such spectra
 GRADIENT = 2e-2  # through roots, logarithms and ratios of such spectra, which are steep near zero
+LOSS_GRADIENT = 4e-2  # through the coherence of such spectra, too
 
 SAMPLES = 256  # values of an array that are stored as they are
 SUMS = 64  # sums with random signs, which together see every value of an array
@@ -494,7 +495,7 @@ def msbg_cases() -> dict[str, Case]:
 
 
 def network_cases() -> dict[str, Case]:
-    resampled_case = partial(Case, tolerance=RESAMPLED, gradient_tolerance=GRADIENT)
+    resampled_case = partial(Case, tolerance=RESAMPLED_NETWORK, gradient_tolerance=GRADIENT)
     cases = {}
     for kind in ("", "-cnn", "-light", "-lstm", "-mamba", "-transformer"):
         name = f"neuro-msbg{kind}"
@@ -552,7 +553,7 @@ def loss_cases() -> dict[str, Case]:
         functions[f"loss with the normal-hearing reference through {name}"] = reference
         functions[f"HASPILoss through {name}"] = partial(haspi_loss, name)
     return {
-        name: Case(function, tolerance=LOSS, gradient_tolerance=GRADIENT)
+        name: Case(function, tolerance=LOSS, gradient_tolerance=LOSS_GRADIENT)
         for name, function in functions.items()
     }
 
@@ -574,12 +575,11 @@ def metric_cases() -> dict[str, Case]:
 
 
 def resampling_cases() -> dict[str, Case]:
-    case = partial(Case, tolerance=RESAMPLED)
     in_double = partial(resampled, 44100, 16000, torch.float64)
-    cases = {"resample 44100 to 16000 Hz, float64": case(in_double)}
+    cases = {"resample 44100 to 16000 Hz, float64": Case(in_double)}
     upwards = ((16000, 44100), (16000, 48000), (16000, 24000))
     for source, target in (*upwards, (44100, 16000), (48000, 16000), (22050, 16000)):
-        cases[f"resample {source} to {target} Hz"] = case(partial(resampled, source, target))
+        cases[f"resample {source} to {target} Hz"] = Case(partial(resampled, source, target))
     return cases
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,14 @@ def test_demo_and_tests_are_one_line_each() -> None:
             rf"<!-- {marker} -->\n```sh\n(.*)\n```", README.read_text(encoding="utf-8")
         )
         assert found is not None and found[1].endswith(f"&& .venv/bin/{last}")
+
+
+def test_the_address_to_clone_is_that_of_the_metadata() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    address = project["urls"]["Repository"]
+    assert f"`git clone {address} && cd hlsim`" in README.read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f'repository-code: "{address}"' in citation
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_named)

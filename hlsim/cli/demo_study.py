@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from lightning.pytorch.callbacks import Callback
 
 from compensators import NALR, load_compensator
 from hlsim.audio import find_audio, read_audio
@@ -41,6 +44,27 @@ _SPEECH_LEVEL = 65.0
 _MAX_SECONDS = 5.0  # of an utterance that is scored, so that HASPI takes half as long
 
 
+class DurationEstimate(Callback):
+    """Callback that prints the expected duration of the demo, from the pace of the first steps.
+
+    >>> DurationEstimate().last_step
+    60
+    """
+
+    first_step = 10  # the steps before are slower, because they reserve memory
+    last_step = 60
+    scoring_steps = 900  # as long as scores and page take, with as many processes as cores
+
+    def on_train_batch_end(self, trainer: Any, module: Any, *arguments: Any) -> None:
+        step = trainer.global_step
+        if step == self.first_step:
+            self.start = time.monotonic()
+        elif step == self.last_step:
+            pace = (time.monotonic() - self.start) / (self.last_step - self.first_step)
+            minutes = pace * (trainer.max_steps - step + self.scoring_steps) / 60.0
+            module.print(f"The demo will take about {minutes:.1f} minutes more")
+
+
 def run_demo(
     out: str | Path,
     audiogram: Audiogram,
@@ -56,7 +80,7 @@ def run_demo(
     Args:
         out: Folder of the results.
         audiogram: The ear.
-        steps: Number of training steps; 3000 take about three minutes on two cores.
+        steps: Number of training steps.
         jobs: Number of processes that compute scores; all cores by default.
         progress: Function that is called with the number of values so far and of all values.
 
@@ -72,6 +96,7 @@ def run_demo(
             CompensatorRecipe(steps=steps),
             out=folder / "training",
             audiogram=audiogram,
+            callbacks=[DurationEstimate()],
         )
     trained, nal_r = load_compensator(checkpoint), NALR()
     conditions = [

@@ -3,18 +3,26 @@
 import json
 from pathlib import Path
 from statistics import fmean
+from types import SimpleNamespace
 
 import pytest
 
-from hlsim.cli.demo_study import SPEECH
+from hlsim.cli.demo_study import SPEECH, DurationEstimate
 from tests.helpers import run_short_demo
 
 pytest.importorskip("lightning")
 pytest.importorskip("joblib")
 
 
-def test_demo_writes_a_page_that_agrees_with_the_table(tmp_path: Path, speech_dir: Path) -> None:
+def test_demo_writes_a_page_that_agrees_with_the_table(
+    tmp_path: Path,
+    speech_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(DurationEstimate, "last_step", 15)
     text = run_short_demo(tmp_path, speech_dir, steps=20)
+    assert capsys.readouterr().out.count("The demo will take about ") == 1
     out = tmp_path / "out"
     report = json.loads((out / "report.json").read_text())
     rows = report["rows"]
@@ -47,3 +55,18 @@ def test_demo_writes_a_page_that_agrees_with_the_table(tmp_path: Path, speech_di
     (row,) = [line for line in transcripts if f"/{rows[-1]['name']}.flac" in line]
     assert f"Its words: {row.split(' | ')[2]}" in page
     assert "for 20 steps" in page and "exceeds 110 dB SPL" in page
+
+
+def test_the_duration_follows_from_the_pace_of_the_first_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("hlsim.cli.demo_study.time.monotonic", lambda: now)
+    lines: list[str] = []
+    estimate, module = DurationEstimate(), SimpleNamespace(print=lines.append)
+    for step in range(1, 101):
+        now += 5.0 if step <= estimate.first_step else 0.06
+        trainer = SimpleNamespace(global_step=step, max_steps=3000)
+        estimate.on_train_batch_end(trainer, module)
+    seconds = 0.06 * (3000 - estimate.last_step + estimate.scoring_steps)
+    assert lines == [f"The demo will take about {seconds / 60.0:.1f} minutes more"]
