@@ -15,7 +15,7 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -44,7 +44,7 @@ from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import check_number, check_rate, check_waveform
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
-from hlsim.torchtools import broadcast_shape, flatten_items
+from hlsim.torchtools import Audio, as_samples, as_type_of, broadcast_shape, flatten_items
 
 Slider = float | Tensor
 """Value of a slider, 0 to 1: one number, or one value per item."""
@@ -110,8 +110,8 @@ class Wearable(MeasuredAid):
     def stream(self, audiogram: AudiogramLike, **sliders: Slider) -> Stream:
         """Return a function that processes a signal in chunks of any size, as it arrives.
 
-        The output is that for the whole signal, ``latency`` samples late. The sliders are
-        attributes of the stream that may be set between chunks.
+        The output is that for the whole signal, ``latency`` samples late. The method ``set`` of the
+        stream changes sliders between chunks.
 
         Args:
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
@@ -120,8 +120,8 @@ class Wearable(MeasuredAid):
                 number or one value per item; by default those of ``SLIDERS``.
 
         Raises:
-            ValueError: The sample rate is not 16000 Hz, or the audiogram is not valid.
-            AttributeError: The aid has no such slider.
+            ValueError: The sample rate is not 16000 Hz, the audiogram is not valid, or the aid has
+                no such slider.
         """
         return Stream(self, audiogram, **sliders)
 
@@ -301,11 +301,16 @@ class Stream:
     Chunks may have any number of samples. The output has as many, and is delayed by ``aid.latency``
     samples. It is that of the aid for the whole signal, without gradients.
 
-    Sliders of the aid, such as ``noise_reduction``, are attributes that may be set at any time.
-    They take 0.1 s from 0 to 1, so that nothing clicks. For more than eight items, a chunk needs at
-    least nine samples, because a smaller one looks like an array with time first.
+    Sliders of the aid, such as ``noise_reduction``, may be set at any time. They take 0.1 s from 0
+    to 1, so that nothing clicks. For more than eight items, a chunk needs at least nine samples,
+    because a smaller one looks like an array with time first.
+
+    Chunks are tensors or NumPy arrays, and so are the outputs.
 
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
+
+    Attributes:
+        sliders: Present value of each slider by its name.
 
     Args:
         aid: Aid at 16 kHz.
@@ -317,12 +322,11 @@ class Stream:
         ValueError: The aid has another sample rate, or rejects the ear; a call rejects the value of
             a slider, other leading dimensions than before, and samples that are NaN or infinite,
             which would affect all later output. After a rejected chunk, the stream goes on as if
-            there had been none.
-        AttributeError: An attribute is set that is not a slider of the aid.
+            there had been none. The aid has no such slider.
 
     >>> import hlsim
     >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")
-    >>> stream.noise_reduction = 0.3
+    >>> stream.set(noise_reduction=0.3)
     >>> stream(torch.zeros(100)).shape
     torch.Size([100])
     """
@@ -339,24 +343,33 @@ class Stream:
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
         self._shape = self._batch = torch.Size()
         self._partial_hop = self._fitted = self._sliders = torch.empty(0)
-        for name, slider in {**aid.SLIDERS, **sliders}.items():
-            setattr(self, name, slider)
+        self.sliders: dict[str, Slider] = dict(aid.SLIDERS)
+        self.set(**sliders)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not name.startswith("_") and name not in self._aid.SLIDERS:
-            sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
-            aid = type(self._aid).__name__
-            raise AttributeError(f"the stream of a {aid} has no slider {name}; it has {sliders}")
-        super().__setattr__(name, value)
+    def set(self, **sliders: Slider) -> None:
+        """Set sliders, which move to their new values in the chunks that follow.
 
-    def __call__(self, chunk: Tensor) -> Tensor:
-        check_waveform(chunk, "chunk", full_scale_spl=self._aid.full_scale_spl)
-        if not bool(chunk.isfinite().all()):
+        Args:
+            sliders: Value from 0 to 1 under each slider's name, one number or one value per item.
+
+        Raises:
+            ValueError: The aid has no such slider.
+        """
+        unknown = [name for name in sliders if name not in self.sliders]
+        if unknown:
+            aid, known = type(self._aid).__name__, ", ".join(self.sliders) or "no sliders"
+            raise ValueError(f"the stream of a {aid} has no slider {unknown[0]}; it has {known}")
+        self.sliders |= sliders
+
+    def __call__(self, chunk: Audio) -> Audio:
+        waveform = as_samples(chunk)
+        check_waveform(waveform, "chunk", full_scale_spl=self._aid.full_scale_spl)
+        if not bool(waveform.isfinite().all()):
             raise ValueError("expected finite samples in a chunk, got NaN or infinity")
-        with torch.no_grad(), torch.autocast(chunk.device.type, enabled=False):
-            self._prepare(chunk)
+        with torch.no_grad(), torch.autocast(waveform.device.type, enabled=False):
+            self._prepare(waveform)
             gain = gain_to_pascals(self._aid.full_scale_spl)
-            samples = flatten_items(chunk, self._batch, self._fitted.dtype) * gain
+            samples = flatten_items(waveform, self._batch, self._fitted.dtype) * gain
             outputs = []
             while samples.shape[-1] > 0:
                 count = HOP - self._partial_hop.shape[-1]
@@ -365,12 +378,13 @@ class Stream:
                 outputs.append(self._process(samples[:, :count]))
                 samples = samples[:, count:]
             output = soft_limit(torch.cat(outputs, -1), self._aid.limit_spl) / gain
-            return output.reshape(*self._batch, -1).to(chunk.dtype)
+            output = output.reshape(*self._batch, -1).to(waveform.dtype)
+            return as_type_of(chunk, output)
 
     def flush(self) -> Tensor:
         """Return the output that is still missing because of the delay, and begin again.
 
-        The next chunk is the beginning of another signal.
+        The next chunk is the beginning of another signal. The output is a tensor.
 
         Shape: -> (..., latency), with the leading dimensions of the chunks.
         """
@@ -389,14 +403,17 @@ class Stream:
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
                 f"got {tuple(chunk.shape)}"
             )
-        values = [getattr(self, name) for name in self._aid.SLIDERS]
+        values = [*self.sliders.values()]
         self._sliders = self._aid.stack_sliders(values, self._batch, self._fitted)
         if is_first:
             self._state = self._aid.initial_state(self._sliders)
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
 
     def _process(self, samples: Tensor) -> Tensor:
-        """Process whole hops, or samples that do not go beyond the end of the current hop."""
+        """Process either whole hops, or a piece that ends within the current hop.
+
+        Shape: (items, time) -> (items, time).
+        """
         position, time, state = self._partial_hop.shape[-1], samples.shape[-1], self._state
         self._partial_hop = hops = torch.cat((self._partial_hop, samples), -1)
         if hops.shape[-1] % HOP == 0:

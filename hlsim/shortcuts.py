@@ -5,9 +5,8 @@ from __future__ import annotations
 import platform
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -21,9 +20,8 @@ from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.files import write_atomically
 from hlsim.simulators import load_simulator
+from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
 from hlsim.version import __version__
-
-Audio = TypeVar("Audio", Tensor, NDArray[Any])
 
 EXAMPLE_SPL = 65.0
 """Level of conversational speech in dB SPL."""
@@ -118,7 +116,7 @@ def simulate(
     """
     model = load_simulator(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     with torch.no_grad():
-        return _as_input(model(_as_finite_tensor(audio), ear), audio)
+        return as_type_of(audio, model(_as_finite_tensor(audio), ear))
 
 
 def compensate(
@@ -156,7 +154,7 @@ def compensate(
     """
     aid = load_compensator(compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     with torch.no_grad():
-        return _as_input(aid(_as_finite_tensor(audio), ear), audio)
+        return as_type_of(audio, aid(_as_finite_tensor(audio), ear))
 
 
 def listen(
@@ -193,7 +191,7 @@ def listen(
     gain = gain_to_pascals(full_scale_spl)
     pascals = {}
     for label, signal in signals.items():
-        tensor = _as_tensor(signal).detach().cpu()
+        tensor = as_samples(signal).detach().cpu()
         if tensor.ndim != 1 and tensor.shape[:-1] != (2,):
             raise ValueError(
                 f"expected shape (time,) or (2, time), got {tuple(tensor.shape)} for {label!r}; "
@@ -265,9 +263,9 @@ def info() -> str:
     return "\n".join(lines)
 
 
-def _as_finite_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
+def _as_finite_tensor(audio: Samples) -> Tensor:
     """Return the samples as a tensor, without NaN and infinity."""
-    samples = _as_tensor(audio)
+    samples = as_samples(audio)
     invalid = int((~samples.isfinite()).sum())
     if invalid:
         raise ValueError(
@@ -275,31 +273,3 @@ def _as_finite_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
             "remove or replace them"
         )
     return samples
-
-
-def _as_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
-    """Return the samples as a tensor; a NumPy array must hold floating-point numbers."""
-    if isinstance(audio, Tensor):
-        return audio
-    if isinstance(audio, tuple | str | Path):
-        kind = "a tuple" if isinstance(audio, tuple) else f"the path {str(audio)!r}"
-        raise ValueError(
-            f"expected samples, got {kind}; write: speech, rate = hlsim.load_audio(path), and pass "
-            "speech and sample_rate=rate"
-        )
-    samples = np.asarray(audio)
-    if not np.issubdtype(samples.dtype, np.floating):
-        is_integer = np.issubdtype(samples.dtype, np.integer)
-        fix = "; divide 16-bit samples by 32768, then set their level with set_level"
-        raise ValueError(
-            "expected a tensor or an array of floating-point samples, got "
-            f"{type(audio).__name__} of {samples.dtype}{fix if is_integer else ''}"
-        )
-    # A copy, because torch takes no array that is reversed, read-only or in another byte order.
-    size = min(samples.dtype.itemsize, 8)
-    return torch.from_numpy(np.array(samples, dtype=f"f{size}", order="C"))
-
-
-def _as_input(result: Tensor, audio: Audio) -> Audio:
-    """Return the result as a tensor or an array, as the input was."""
-    return result if isinstance(audio, Tensor) else result.numpy()

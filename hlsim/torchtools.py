@@ -9,17 +9,24 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import update_wrapper, wraps
+from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
 Values = TypeVar("Values")
+Samples = Tensor | NDArray[Any]
+"""Signal that functions of signals accept."""
+
+Audio = TypeVar("Audio", Tensor, NDArray[Any])
+"""Type of a signal and of the result, which is an array if the signal is one."""
 
 STORE_BYTES = 2**28
 """Size of the store of constants. MSBG's filters take 5 MiB per second of signal."""
@@ -154,6 +161,48 @@ def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
         values = np.ascontiguousarray(values)
     tensor = torch.as_tensor(values)
     return tensor.to(device=device, dtype=dtype.to_complex() if tensor.is_complex() else dtype)
+
+
+def as_samples(signal: Samples) -> Tensor:
+    """Return samples as a tensor. Arrays are copied.
+
+    Args:
+        signal: Tensor, which is returned as it is, or array of floating-point numbers.
+
+    Raises:
+        ValueError: The signal is neither.
+
+    >>> as_samples(np.ones(2, np.float32)[::-1])
+    tensor([1., 1.])
+    """
+    if isinstance(signal, Tensor):
+        return signal
+    if isinstance(signal, tuple | str | Path):
+        kind = "a tuple" if isinstance(signal, tuple) else f"the path {str(signal)!r}"
+        raise ValueError(
+            f"expected samples, got {kind}; write: speech, rate = hlsim.load_audio(path), and pass "
+            "speech and sample_rate=rate"
+        )
+    samples = np.asarray(signal)
+    if not np.issubdtype(samples.dtype, np.floating):
+        is_integer = np.issubdtype(samples.dtype, np.integer)
+        fix = "; divide 16-bit samples by 32768, then set their level with set_level"
+        raise ValueError(
+            "expected a tensor or an array of floating-point samples, got "
+            f"{type(signal).__name__} of {samples.dtype}{fix if is_integer else ''}"
+        )
+    # A copy, because torch takes no array that is reversed, read-only or in another byte order.
+    size = min(samples.dtype.itemsize, 8)
+    return torch.from_numpy(np.array(samples, dtype=f"f{size}", order="C"))
+
+
+def as_type_of(signal: Audio, result: Tensor) -> Audio:
+    """Return a result as a tensor or as an array, depending on the type of the signal.
+
+    >>> as_type_of(np.ones(2), torch.tensor(0.5))
+    np.float32(0.5)
+    """
+    return result if isinstance(signal, Tensor) else result.numpy()[()]
 
 
 def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tensor:

@@ -40,7 +40,7 @@ def assert_equals_stream(
     stream, outputs, expected = aid.stream(ears), [], []
     for number, samples in enumerate(signal.split(inputs["samples"].shape[-1], -1)):
         if number == 20 and aid.SLIDERS:
-            stream.noise_reduction = 0.2
+            stream.set(noise_reduction=0.2)
             inputs["sliders"] = torch.tensor([[0.2, 1.0]] * len(signal))
         results = call(inputs | {"samples": samples})
         outputs.append(results.pop("output"))

@@ -58,7 +58,7 @@ class Live:
 
     def __init__(
         self,
-        stream: Callable[[Tensor], Tensor],
+        stream: Any,
         full_scale_spl: float,
         ears: int = 1,
         latency: int = 0,
@@ -94,6 +94,11 @@ class Live:
             played.fill(0.0)
             self.error = str(error) or type(error).__name__
 
+    @property
+    def _sliders(self) -> dict[str, float]:
+        """Values of the stream's sliders by their names; a simulator has none."""
+        return getattr(self.stream, "sliders", {})
+
     def press(self, key: str) -> None:
         """Move a slider by 0.1.
 
@@ -102,10 +107,10 @@ class Live:
                 more amplification. Other keys have no effect.
         """
         for name, (down, up) in KEYS.items():
-            if key in (down, up) and hasattr(self.stream, name):
+            if key in (down, up) and name in self._sliders:
                 step = SLIDER_STEP if key == up else -SLIDER_STEP
-                value = min(1.0, max(0.0, getattr(self.stream, name) + step))
-                setattr(self.stream, name, round(value, 3))
+                value = min(1.0, max(0.0, self._sliders[name] + step))
+                self.stream.set(**{name: round(value, 3)})
 
     def status(self) -> str:
         """Return a line of text with levels, sliders and drop-outs.
@@ -123,9 +128,9 @@ class Live:
             ]
             parts.append(f"in {texts[0]}, out {texts[1]} dB SPL")
         for name, keys in KEYS.items():
-            if hasattr(self.stream, name):
+            if name in self._sliders:
                 label = name.replace("_", " ")
-                parts.append(f"{label} {getattr(self.stream, name):.1f} ({'/'.join(keys)})")
+                parts.append(f"{label} {self._sliders[name]:.1f} ({'/'.join(keys)})")
         return ", ".join([*parts, f"drop-outs {self.drop_outs}"])
 
 

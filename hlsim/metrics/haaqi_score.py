@@ -38,7 +38,7 @@ from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Equalisation, Noise, match_pair
 from hlsim.metrics.quality import QualityParts, QualityReference
-from hlsim.torchtools import constant, not_compiled
+from hlsim.torchtools import Audio, Samples, as_type_of, constant, not_compiled
 
 ENVELOPE_SEGMENT = 192
 """Samples of a segment of the smoothed envelopes, 8 ms at 24 kHz."""
@@ -58,8 +58,8 @@ MODULATION_ORDER = 128
 
 @not_compiled  # tracing takes minutes
 def haaqi(
-    output: Tensor,
-    clean: Tensor,
+    output: Audio,
+    clean: Samples,
     audiogram: AudiogramLike,
     *,
     sample_rate: int = 16000,
@@ -69,7 +69,7 @@ def haaqi(
     seed: int = 0,
     whole_khz: bool = False,
     equalisation: Equalisation = 1,
-) -> Tensor:
+) -> Audio:
     """Compute HAAQI version 1 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean music that NAL-R has amplified for the same
@@ -92,7 +92,7 @@ def haaqi(
             NAL-R or another prescription has amplified.
 
     Returns:
-        Scores. Shape: (...,).
+        Scores, an array if ``output`` is one. Shape: (...,).
 
     Raises:
         ValueError: Signals of other shapes, too short, or not finite; clean music that is silent or
@@ -107,7 +107,7 @@ def haaqi(
     >>> bool(scores[0] > scores[1])
     True
     """
-    output, clean, lengths = match_pair(output, clean, sample_rate, lengths)
+    matched, clean, lengths = match_pair(output, clean, sample_rate, lengths)
     reference = HaaqiReference(
         clean,
         audiogram,
@@ -118,7 +118,7 @@ def haaqi(
         equalisation=equalisation,
         keep=False,
     )
-    return reference.score(output, noise=noise, seed=seed)
+    return as_type_of(output, reference.score(matched, noise=noise, seed=seed))
 
 
 def _split_by_rate(waves: Tensor) -> Tensor:

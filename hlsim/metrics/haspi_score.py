@@ -41,13 +41,13 @@ from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.reference import PreparedBatch, Reference
-from hlsim.torchtools import constant, not_compiled
+from hlsim.torchtools import Audio, Samples, as_type_of, constant, not_compiled
 
 
 @not_compiled  # tracing takes minutes
 def haspi(
-    output: Tensor,
-    clean: Tensor,
+    output: Audio,
+    clean: Samples,
     audiogram: AudiogramLike,
     *,
     sample_rate: int = 16000,
@@ -56,7 +56,7 @@ def haspi(
     noise: Noise = "expected",
     seed: int = 0,
     whole_khz: bool = False,
-) -> Tensor:
+) -> Audio:
     """Compute HASPI version 2 of each item: the intelligibility for an impaired ear, 0 to 1.
 
     The score compares the output of an aid in the impaired ear with clean speech in a normal ear.
@@ -88,7 +88,7 @@ def haspi(
             change by up to 0.005.
 
     Returns:
-        Scores. Shape: (...,).
+        Scores, an array if ``output`` is one. Shape: (...,).
 
     Raises:
         ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
@@ -99,7 +99,7 @@ def haspi(
     >>> bool(haspi(speech, speech, "N4") < haspi(speech, speech, "NH"))
     True
     """
-    output, clean, lengths = match_pair(output, clean, sample_rate, lengths)
+    matched, clean, lengths = match_pair(output, clean, sample_rate, lengths)
     reference = HaspiReference(
         clean,
         sample_rate=sample_rate,
@@ -108,7 +108,7 @@ def haspi(
         whole_khz=whole_khz,
         keep=False,
     )
-    return reference.score(output, audiogram, noise=noise, seed=seed)
+    return as_type_of(output, reference.score(matched, audiogram, noise=noise, seed=seed))
 
 
 class HaspiReference(Reference):
@@ -140,7 +140,7 @@ class HaspiReference(Reference):
 
     def __init__(
         self,
-        clean: Tensor,
+        clean: Samples,
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
@@ -203,12 +203,12 @@ class HaspiReference(Reference):
 
     def score(
         self,
-        output: Tensor,
+        output: Audio,
         audiogram: AudiogramLike,
         *,
         noise: Noise = "expected",
         seed: int = 0,
-    ) -> Tensor:
+    ) -> Audio:
         """Return the HASPI of each output of an aid.
 
         Args:
@@ -219,14 +219,14 @@ class HaspiReference(Reference):
             seed: Seed of the drawn noise of each item.
 
         Returns:
-            Scores, 0 to 1. Shape: (...,).
+            Scores, 0 to 1, an array if ``output`` is one. Shape: (...,).
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device; an audiogram or
                 seed out of range.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
-        return _intelligibility(self._compare_all(output, noise, seed, ears))
+        return as_type_of(output, _intelligibility(self._compare_all(output, noise, seed, ears)))
 
 
 class _Channels(NamedTuple):

@@ -17,13 +17,13 @@ from hlsim.checks import Lengths
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.pair import Equalisation, Noise, match_pair
 from hlsim.metrics.quality import QualityParts, QualityReference
-from hlsim.torchtools import not_compiled
+from hlsim.torchtools import Audio, Samples, as_type_of, not_compiled
 
 
 @not_compiled  # tracing takes minutes
 def hasqi(
-    output: Tensor,
-    clean: Tensor,
+    output: Audio,
+    clean: Samples,
     audiogram: AudiogramLike,
     *,
     sample_rate: int = 16000,
@@ -33,7 +33,7 @@ def hasqi(
     seed: int = 0,
     whole_khz: bool = False,
     equalisation: Equalisation = 1,
-) -> Tensor:
+) -> Audio:
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean speech that NAL-R has amplified for the same impaired
@@ -55,7 +55,7 @@ def hasqi(
             NAL-R or another prescription has amplified.
 
     Returns:
-        Scores. Shape: (...,).
+        Scores, an array if ``output`` is one. Shape: (...,).
 
     Raises:
         ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
@@ -66,7 +66,7 @@ def hasqi(
     >>> round(float(hasqi(speech, speech, "NH")), 2)
     0.99
     """
-    output, clean, lengths = match_pair(output, clean, sample_rate, lengths)
+    matched, clean, lengths = match_pair(output, clean, sample_rate, lengths)
     reference = HasqiReference(
         clean,
         audiogram,
@@ -77,7 +77,7 @@ def hasqi(
         equalisation=equalisation,
         keep=False,
     )
-    return reference.score(output, noise=noise, seed=seed)
+    return as_type_of(output, reference.score(matched, noise=noise, seed=seed))
 
 
 class HasqiReference(QualityReference):

@@ -30,7 +30,7 @@ from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.dsp.fft import power, rfft
 from hlsim.metrics.pair import check_finite, match_pair
 from hlsim.metrics.reference import map_on_cores
-from hlsim.torchtools import constant
+from hlsim.torchtools import Audio, Samples, as_type_of, constant
 
 RATE = 10000
 """Sample rate in Hz at which the score is defined."""
@@ -64,7 +64,7 @@ their cross-spectrum. The two products are the squared powers of the left and of
 """
 
 
-def mbstoi(output: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor:
+def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
     """Compute MBSTOI of each item: the intelligibility of speech at two ears, about 0 to 1.
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
@@ -79,7 +79,7 @@ def mbstoi(output: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns:
-        Scores. Shape: (...).
+        Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
         ValueError: Signals of other shapes, on different devices or not finite; clean speech that
@@ -90,11 +90,11 @@ def mbstoi(output: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor
     >>> round(float(mbstoi(clean, clean)), 2)
     1.0
     """
-    output, clean, _ = match_pair(output, clean, sample_rate)
+    matched, clean, _ = match_pair(output, clean, sample_rate)
     check_two_channels(clean)
     *items, _, time = clean.shape
-    precision = torch.float32 if output.device.type == "mps" else torch.float64
-    signals = torch.stack([clean, output], -3).to(precision).reshape(-1, 2, 2, time)
+    precision = torch.float32 if clean.device.type == "mps" else torch.float64
+    signals = torch.stack([clean, matched], -3).to(precision).reshape(-1, 2, 2, time)
     check_finite("output or clean", signals)
     is_sounding = signals[:, 0].flatten(1).any(-1).tolist()
     if not all(is_sounding):
@@ -104,7 +104,7 @@ def mbstoi(output: Tensor, clean: Tensor, *, sample_rate: int = 16000) -> Tensor
     batches = signals.split(1 if signals.device.type == "cpu" else len(signals))
     with torch.autocast(signals.device.type, enabled=False):
         scores = map_on_cores(lambda batch: _score_batch(batch, sample_rate), batches, signals)
-    return torch.cat(scores).to(clean.dtype).reshape(items)
+    return as_type_of(output, torch.cat(scores).to(clean.dtype).reshape(items))
 
 
 def _score_batch(signals: Tensor, rate: int) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
+from hlsim.torchtools import Samples, as_samples
 
 SHORTEST_SECONDS = 0.7
 """Shortest signal in seconds for which a score can be trusted."""
@@ -86,9 +87,11 @@ def check_finite(name: str, signals: Tensor) -> None:
 
 
 def match_pair(
-    output: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None = None
+    output: Samples, clean: Samples, sample_rate: int, lengths: Lengths | None = None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Cut an output and a clean signal to one length, and validate that they can be compared.
+
+    Arrays are converted to tensors.
 
     The precision of the clean signal becomes that of the output if this is higher.
 
@@ -109,8 +112,8 @@ def match_pair(
     >>> clean.dtype
     torch.float64
     """
-    check_waveform(output, "output")
-    check_waveform(clean, "clean")
+    output = check_waveform(as_samples(output), "output")
+    clean = check_waveform(as_samples(clean), "clean")
     times = output.shape[-1], clean.shape[-1]
     time = common_length(times, check_rate(sample_rate), ("output", "clean"))
     output, clean = output[..., :time], clean[..., :time]

@@ -30,7 +30,7 @@ from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNEL
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Equalisation, Noise
 from hlsim.metrics.reference import PreparedBatch, Reference
-from hlsim.torchtools import constant
+from hlsim.torchtools import Audio, Samples, as_type_of, constant
 
 NALR_ORDER = 140
 """Order of the filter that amplifies the clean signal."""
@@ -125,7 +125,7 @@ class QualityReference(Reference):
 
     def __init__(
         self,
-        clean: Tensor,
+        clean: Samples,
         audiogram: AudiogramLike,
         *,
         sample_rate: int = 16000,
@@ -147,7 +147,7 @@ class QualityReference(Reference):
             keep=keep,
         )
 
-    def score(self, output: Tensor, *, noise: Noise = "expected", seed: int = 0) -> Tensor:
+    def score(self, output: Audio, *, noise: Noise = "expected", seed: int = 0) -> Audio:
         """Return the score of each output of an aid.
 
         Args:
@@ -158,15 +158,17 @@ class QualityReference(Reference):
             seed: Seed of the drawn noise of each item.
 
         Returns:
-            Scores, 0 to 1. Shape: (...,).
+            Scores, 0 to 1, an array if ``output`` is one. Shape: (...,).
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device.
         """
-        return self.parts(output, noise=noise, seed=seed).combined
+        return as_type_of(output, self.parts(output, noise=noise, seed=seed).combined)
 
-    def parts(self, output: Tensor, *, noise: Noise = "expected", seed: int = 0) -> QualityParts:
+    def parts(self, output: Samples, *, noise: Noise = "expected", seed: int = 0) -> QualityParts:
         """Return the score of each output of an aid with its nonlinear and its linear part.
+
+        The parts of arrays are tensors, too.
 
         Args:
             output: Outputs of the shape, rate and scale of the clean signals. Shape: (...,

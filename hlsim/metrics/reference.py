@@ -30,7 +30,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
 from hlsim.metrics.pair import SHORTEST_SECONDS, Noise, check_finite, check_pair
-from hlsim.torchtools import broadcast_shape, on_host
+from hlsim.torchtools import Samples, as_samples, broadcast_shape, on_host
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -83,7 +83,7 @@ class Reference(ABC):
 
     def __init__(
         self,
-        clean: Tensor,
+        clean: Samples,
         audiogram: AudiogramLike | None,
         *,
         sample_rate: int = 16000,
@@ -95,7 +95,7 @@ class Reference(ABC):
         rate = check_rate(sample_rate)
         self._rate = 1000 * round(rate / 1000) if whole_khz else rate
         self._full_scale_spl = check_full_scale(full_scale_spl)
-        check_waveform(clean, "clean", full_scale_spl=full_scale_spl)
+        clean = check_waveform(as_samples(clean), "clean", full_scale_spl=full_scale_spl)
         self._clean = clean.detach()
         self._rows = self._clean.reshape(-1, clean.shape[-1])
         items, time = self._rows.shape
@@ -199,16 +199,17 @@ class Reference(ABC):
             Numbers for each item from which its score follows. Shape: (items, numbers).
         """
 
-    def _compare_all(self, output: Tensor, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
+    def _compare_all(self, output: Samples, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
         """Validate outputs, and compare them with the clean signals.
 
         The arguments are those of ``_compare``. Shape: (..., time) -> (..., numbers).
         """
         check_choice("noise", noise, Noise)
         check_number("seed", seed, 0, 2**32 - 1, whole=True)
-        check_waveform(output, "output", full_scale_spl=self._full_scale_spl)
-        check_pair(output, self._clean)
-        rows = output.reshape(self._rows.shape)
+        outputs = as_samples(output)
+        check_waveform(outputs, "output", full_scale_spl=self._full_scale_spl)
+        check_pair(outputs, self._clean)
+        rows = outputs.reshape(self._rows.shape)
         check_finite("output", rows)
 
         def compare(group: int) -> Tensor:
@@ -217,7 +218,7 @@ class Reference(ABC):
 
         with torch.autocast(rows.device.type, enabled=False):
             numbers = map_on_cores(compare, range(len(self._groups)), rows)
-        return torch.cat(numbers).reshape(*output.shape[:-1], -1)
+        return torch.cat(numbers).reshape(*outputs.shape[:-1], -1)
 
 
 def map_on_cores(

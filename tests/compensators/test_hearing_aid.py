@@ -55,7 +55,7 @@ def test_a_slider_moves_in_a_stream_without_a_click() -> None:
     stream = aid.stream(EAR, noise_reduction=0.0, amplification=0.0)
     before, after = tone(1000.0, 60.0, 2.0).split(16000)
     outputs = [stream(before)]
-    stream.amplification = 1.0
+    stream.set(amplification=1.0)
     outputs += [stream(chunk) for chunk in after.split(160)]
     output = torch.cat(outputs)
     assert level_spl(output[24000:]) > level_spl(output[8000:15000]) + 10.0
@@ -70,11 +70,12 @@ def test_sliders_of_a_stream_are_tensors_or_numbers_by_name() -> None:
     by_tensor, by_number = aid.stream(EAR, noise_reduction=slider), aid.stream(EAR)
     assert torch.equal(by_tensor(signal), by_number(signal))
     slider.fill_(0.0)
-    by_number.noise_reduction = 0.0
+    by_number.set(noise_reduction=0.0)
     assert torch.equal(by_tensor(signal), by_number(signal))
     for stream, name in ((by_number, "volume"), (WDRC().stream(EAR), "noise_reduction")):
-        with pytest.raises(AttributeError):
-            setattr(stream, name, 0.0)
+        with pytest.raises(ValueError, match=f"has no slider {name}; it has "):
+            stream.set(**{name: 0.0})
+    assert by_number.sliders == {"noise_reduction": 0.0, "amplification": 1.0}
 
 
 def test_a_bad_slider_raises_value_error() -> None:

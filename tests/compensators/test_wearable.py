@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -64,6 +65,21 @@ def test_chunks_of_any_size_equal_the_whole_signal(
     whole = aid(signal, ears)
     assert_close(torch.cat([*outputs, stream.flush()], -1)[:, aid.latency :], whole)
     assert_close(stream(signal)[:, 64:], whole[:, :-64])  # flush begins again
+
+
+@both_aids
+def test_a_stream_of_arrays_returns_arrays(name: str, noise: Tensor) -> None:
+    """An audio library hands over arrays, which may be read-only and not contiguous."""
+    aid = build_wearable(name)
+    chunks = noise[:, :1000].T.numpy().T
+    chunks.setflags(write=False)
+    stream, of_arrays = aid.stream(EAR), aid.stream(EAR)
+    for start in (0, 300):
+        output = of_arrays(chunks[:, start : start + 300])
+        assert isinstance(output, np.ndarray) and output.dtype == np.float32
+        assert torch.equal(torch.from_numpy(output), stream(noise[:, start : start + 300]))
+    with pytest.raises(ValueError, match="expected a tensor or an array of floating-point samples"):
+        of_arrays(np.zeros((2, 64), np.int16))
 
 
 @both_aids

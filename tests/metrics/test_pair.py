@@ -1,9 +1,13 @@
-"""Signals of nearly equal lengths are cut to the shorter one, and others are rejected."""
+"""Lengths that differ, and NumPy arrays in place of tensors."""
 
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 
-from hlsim.metrics import haspi, mbstoi
+from hlsim.metrics import HaspiReference, HasqiReference, haaqi, haspi, hasqi, mbstoi
 
 
 def test_signals_of_nearly_equal_lengths_are_cut() -> None:
@@ -18,3 +22,28 @@ def test_signals_of_nearly_equal_lengths_are_cut() -> None:
     assert torch.equal(score, mbstoi(output[:, :12000], clean[:, :12000]))
     with pytest.raises(ValueError, match=r"differ by 0\.1 s at most"):
         haspi(torch.cat((output, clean), -1), clean, "N3")
+
+
+@pytest.mark.parametrize("score", [haspi, hasqi, haaqi])
+def test_scores_of_arrays_are_arrays(score: Callable[..., Any]) -> None:
+    clean = 0.02 * torch.randn(2, 12000)
+    output = 0.5 * clean
+    expected = score(output, clean, "N3")
+    scores = score(output.numpy(), clean.numpy(), "N3")
+    assert isinstance(scores, np.ndarray) and scores.dtype == np.float32
+    assert scores.tolist() == expected.tolist()
+    of_one_item = score(output[0].numpy(), clean[0], "N3")
+    assert isinstance(of_one_item, np.float32)
+    assert float(of_one_item) == pytest.approx(float(expected[0]), abs=1e-6)
+    with pytest.raises(ValueError, match="divide 16-bit samples by 32768"):
+        score(output.short().numpy(), clean, "N3")
+
+
+def test_mbstoi_and_prepared_references_take_arrays() -> None:
+    clean = 0.02 * torch.randn(2, 12000)
+    output = (0.5 * clean).numpy()
+    assert mbstoi(output, clean) == mbstoi(0.5 * clean, clean).item()
+    haspi_of = HaspiReference(clean.numpy())
+    assert haspi_of.score(output, "N3").tolist() == haspi(0.5 * clean, clean, "N3").tolist()
+    hasqi_of = HasqiReference(clean.numpy(), "N3")
+    assert hasqi_of.score(output).tolist() == hasqi_of.parts(output).combined.tolist()
