@@ -25,7 +25,9 @@ LIMITER_SAMPLES = 4096
 """Approximate number of samples from which the percentile of an item's gradients is taken."""
 
 
-def limit_gradient_spikes(output: Tensor, sample_rate: int) -> Tensor:
+def limit_gradient_spikes(
+    output: Tensor, sample_rate: int, lengths: Tensor | None = None
+) -> Tensor:
     """Return a waveform unchanged, and limit its gradient in the backward pass.
 
     In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
@@ -42,6 +44,8 @@ def limit_gradient_spikes(output: Tensor, sample_rate: int) -> Tensor:
     Args:
         output: Output of an aid.
         sample_rate: Sample rate in Hz.
+        lengths: Number of samples of each item of a padded batch, (...), on the CPU. By default,
+            all items are as long as the batch.
 
     >>> samples = torch.randn(1, 1600, requires_grad=True)
     >>> gradient = torch.ones(1, 1600)
@@ -50,7 +54,7 @@ def limit_gradient_spikes(output: Tensor, sample_rate: int) -> Tensor:
     >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
     True
     """
-    limited: Tensor = _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate))
+    limited: Tensor = _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
     return limited
 
 
@@ -58,16 +62,16 @@ class _GradientLimiter(torch.autograd.Function):
     """Identity whose gradient is limited, as ``limit_gradient_spikes`` describes."""
 
     @staticmethod
-    def forward(waveform: Tensor, block: int) -> Tensor:
+    def forward(waveform: Tensor, block: int, lengths: Tensor | None) -> Tensor:
         return waveform.view_as(waveform)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
-        waveform, ctx.block = inputs
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int, Tensor | None], output: Tensor) -> None:
+        waveform, ctx.block, ctx.lengths = inputs
         ctx.save_for_backward(waveform)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (waveform,) = ctx.saved_tensors
         time = gradient.shape[-1]
         powers = _split(waveform, ctx.block).square().mean(-1)
@@ -76,8 +80,7 @@ class _GradientLimiter(torch.autograd.Function):
         # Samples behind the end of an item have no gradient, and are left out.
         counted = sounding.unsqueeze(-1) & (sizes > 0.0)
         candidates = torch.where(counted, sizes, math.nan).flatten(-2)
-        sample = candidates[..., :: max(1, time // LIMITER_SAMPLES)]
-        usual = sample.nanquantile(0.9, -1, keepdim=True).nan_to_num(nan=math.inf)
+        usual = _usual_sizes(candidates, time, ctx.lengths).nan_to_num(nan=math.inf)
         limit = usual * torch.where(sounding, MAX_GRADIENT_RATIO, 1.0)
         factor = (limit / sizes.amax(-1)).clamp_max(1.0)
 
@@ -91,7 +94,29 @@ class _GradientLimiter(torch.autograd.Function):
             "a criterion that limits the gradient ('coherent-bands', 'haspi', 'hasqi') has no "
             "second derivative; use 'bands', 'paper' or a function"
         )
-        return differentiable_once(gradient * factors[..., :time], message), None
+        return differentiable_once(gradient * factors[..., :time], message), None, None
+
+
+def _usual_sizes(candidates: Tensor, time: int, lengths: Tensor | None) -> Tensor:
+    """Compute the 90th percentile of magnitudes from about ``LIMITER_SAMPLES`` of each item.
+
+    Shape: (..., n) -> (..., 1).
+
+    Args:
+        candidates: Magnitudes; NaN where a sample is not counted.
+        time: Number of samples of the batch, at most n.
+        lengths: Number of samples of each item, (...), or None if each has ``time``.
+    """
+    if lengths is None:
+        sample = candidates[..., :: max(1, time // LIMITER_SAMPLES)]
+        return sample.nanquantile(0.9, -1, keepdim=True)
+    # Each item is sampled as densely as it would be alone, so that padding changes no gradient.
+    items = candidates.reshape(-1, candidates.shape[-1])
+    quantiles = [
+        item[: length : max(1, length // LIMITER_SAMPLES)].nanquantile(0.9)
+        for item, length in zip(items, lengths.flatten().tolist(), strict=True)
+    ]
+    return torch.stack(quantiles).reshape(*lengths.shape, 1)
 
 
 def _split(samples: Tensor, block: int) -> Tensor:

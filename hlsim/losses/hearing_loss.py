@@ -316,7 +316,7 @@ class HearingLossLoss(nn.Module):
         """
         limited = output
         if any(criterion.limits_gradient for criterion in self.criteria.values()):
-            limited = limit_gradient_spikes(output, self.sample_rate)
+            limited = limit_gradient_spikes(output, self.sample_rate, lengths)
         perceived = self._frozen.simulate(limited, ears, lengths)
         batch, time = perceived.shape[:-1], perceived.shape[-1]
         gain = gain_to_pascals(self.full_scale_spl)

@@ -217,6 +217,21 @@ def test_padded_item_has_the_value_that_it_has_alone(
             assert float(batch[name][item]) == pytest.approx(float(part), rel=2e-3), (name, end)
 
 
+@pytest.mark.parametrize("criterion", [*WEIGHTS, "haspi", "hasqi"])
+def test_gradient_of_an_item_does_not_depend_on_the_padding(criterion: str, clean: Tensor) -> None:
+    """The limit of the gradient is a percentile of the item's own samples."""
+    loss = HearingLossLoss(N4, simulator="neuro-msbg-light", criterion=criterion)
+    signal = clean.flatten().repeat(2)[None, :12000].double()
+    loss.double()
+    output = 1.5 * signal + 0.003 * torch.randn_like(signal)
+    alone = compute(loss, output, signal)
+    pad = nn.ZeroPad1d((0, 40000))
+    value, slope = compute(loss, pad(output), pad(signal), None, [12000])
+    close(value, alone[0], rtol=1e-6, atol=0.0)
+    close(slope[:, :12000], alone[1], rtol=0.0, atol=1e-4 * float(alone[1].abs().max()))
+    assert not bool(slope[:, 12000:].any())
+
+
 def test_samples_after_the_end_do_not_count(options: Options, clean: Tensor) -> None:
     loss = HearingLossLoss([N3, S2], **options)
     after = torch.zeros_like(clean)
