@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from numbers import Real
 from typing import Any, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -260,6 +261,8 @@ def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
     if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
         kind = getattr(waveform, "dtype", None) or type(waveform).__name__
         fix = "; divide 16-bit samples by 32768" if kind == torch.int16 else ""
+        if isinstance(waveform, np.ndarray):
+            kind, fix = f"a NumPy array of {kind}", "; convert it: torch.from_numpy(x).float()"
         raise ValueError(
             f"expected {name} to be a floating-point tensor with time last, got {kind}{fix}"
         )
@@ -290,10 +293,17 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
     ends = torch.as_tensor(lengths, device="cpu")
     if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
         ends = ends.unsqueeze(-1)
-    is_whole = ends.dtype in (torch.int32, torch.int64)
-    if not is_whole or ends.shape != shape[:-1] or not bool(((ends >= 1) & (ends <= time)).all()):
-        raise ValueError(
-            f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}, got "
-            f"{describe(lengths)}"
-        )
-    return ends.long()
+    is_float = ends.is_floating_point()
+    is_whole = not is_float and not ends.is_complex() and ends.dtype != torch.bool
+    samples = ends.long()
+    if is_whole and ends.shape == shape[:-1] and bool(((samples >= 1) & (samples <= time)).all()):
+        return samples
+    fix = ""
+    if is_float:
+        fix = "; convert them by .long()"
+    if is_float and bool((ends <= 1.0).all()):
+        fix = f"; multiply relative lengths by the time: (lengths * {time}).round().long()"
+    raise ValueError(
+        f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}, got "
+        f"{describe(lengths)}{fix}"
+    )

@@ -123,6 +123,28 @@ def test_a_batch_of_few_samples_is_no_time_first_array() -> None:
 def test_lengths_are_whole_numbers_of_samples() -> None:
     assert check_lengths((3, 10), torch.Size((2, 10))).tolist() == [3, 10]
     assert check_lengths(torch.tensor([3, 10]), torch.Size((2, 1, 10))).tolist() == [[3], [10]]
+    for dtype in (torch.int16, torch.uint16, torch.uint8, torch.int32):
+        ends = check_lengths(torch.tensor([3, 10], dtype=dtype), torch.Size((2, 10)))
+        assert ends.tolist() == [3, 10] and ends.dtype == torch.int64
+
+
+@pytest.mark.parametrize(
+    ("lengths", "fix"),
+    [
+        ([0.5, 1.0], r"multiply relative lengths by the time: \(lengths \* 10\)"),
+        (torch.tensor([3.0, 10.0]), r"convert them by \.long\(\)"),
+    ],
+)
+def test_error_about_lengths_names_the_fix(lengths: Any, fix: str) -> None:
+    with pytest.raises(ValueError, match=fix):
+        check_lengths(lengths, torch.Size((2, 10)))
+
+
+def test_error_about_an_array_names_the_fix() -> None:
+    array = torch.zeros(10).numpy()
+    for call in (check_waveform, level_spl):
+        with pytest.raises(ValueError, match="NumPy array of float32; convert it: torch.from_num"):
+            call(array)
 
 
 @pytest.mark.parametrize("lengths", [[0, 3], [3, 11], [0.5, 1.0], [3], [True, True]])

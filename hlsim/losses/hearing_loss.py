@@ -1,5 +1,6 @@
 """Training losses of hearing aids: what an impaired ear perceives, compared with a normal ear."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
@@ -164,6 +165,7 @@ class HearingLossLoss(nn.Module):
         self.ears = ears
         self.criteria, self.weights = read_criterion(criterion, weights)
         self._two_ears = has_listeners(audiogram)
+        self._has_warned_of_order = False
         self._frozen = FrozenSimulator(
             simulator, self.sample_rate, self.full_scale_spl, normal, reference, checkpoint
         )
@@ -292,6 +294,14 @@ class HearingLossLoss(nn.Module):
             raise ValueError(
                 "expected output and clean with the same shape, "
                 f"got {tuple(output.shape)} and {tuple(clean.shape)}"
+            )
+        if clean.requires_grad and not output.requires_grad and not self._has_warned_of_order:
+            self._has_warned_of_order = True
+            warnings.warn(
+                "only clean requires a gradient, not output; did you swap the arguments? Pass the "
+                "output of the aid first: loss(output, clean). There are no further warnings of "
+                "this loss",
+                stacklevel=3,
             )
         stored = self._unregistered.thresholds
         ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)

@@ -495,7 +495,18 @@ def test_autocast_does_not_change_the_loss(options: Options, clean: Tensor) -> N
         assert_same(expected, (value.detach(), slope))
 
 
-# Errors
+# Warnings and errors
+
+
+def test_swapped_arguments_cause_one_warning(clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, simulator="msbg")
+    output = (3.0 * clean).requires_grad_()
+    with pytest.warns(UserWarning, match="did you swap the arguments") as warnings:
+        loss(clean, output)
+        loss(clean, output)
+        HearingLossLoss(N3, simulator="msbg")(output, clean)
+    assert len(warnings) == 1
+
 
 SIGNAL = torch.randn(2, 1600)
 N7 = Audiogram.standard("N7")
