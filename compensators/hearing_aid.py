@@ -17,6 +17,7 @@ from compensators.smoothing import follow_peaks
 from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
+from hlsim.torchtools import built_in_float32
 
 DEFAULT_NOISE_REDUCTION = 0.5
 """Share of the attenuation by default.
@@ -83,6 +84,7 @@ class HearingAid(Wearable):
 
     SLIDERS: ClassVar = {"noise_reduction": DEFAULT_NOISE_REDUCTION, "amplification": 1.0}
 
+    @built_in_float32
     def __init__(
         self,
         config: HearingAidConfig | None = None,

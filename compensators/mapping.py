@@ -21,7 +21,7 @@ from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
-from hlsim.torchtools import constant
+from hlsim.torchtools import built_in_float32, constant
 
 NEPER_DB = 20.0 / math.log(10.0)
 """One neper in dB."""
@@ -66,6 +66,7 @@ class MappingCompensator(MeasuredAid, EarNetwork):
 
     config: MappingConfig
 
+    @built_in_float32
     def __init__(
         self,
         config: MappingConfig | None = None,

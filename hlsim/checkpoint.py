@@ -54,7 +54,10 @@ def read_checkpoint(
     kinds: Mapping[str, Callable[[Settings], Config]],
     build: Callable[[Config], Model],
 ) -> Model:
-    """Load a model from a checkpoint. The model is on torch's default device.
+    """Load a model from a checkpoint. The model is on torch's default device, or else on the CPU.
+
+    The device ``meta``, on which models are built before their weights are loaded, is no place for
+    a model that has its weights.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
@@ -102,8 +105,11 @@ def read_checkpoint(
     except (TypeError, ValueError, RuntimeError, safetensors.SafetensorError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"{folder}: weights and configuration do not fit: {reason}") from error
+    device = torch.get_default_device()
+    if device.type == "meta":
+        return model
     with torch.inference_mode(False):
-        return model.to(torch.get_default_device())
+        return model.to(device)
 
 
 def read_record(name: str | Path) -> dict[str, Any]:

@@ -56,6 +56,31 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
     return call
 
 
+def built_in_float32(construct: Callable[P, None]) -> Callable[P, None]:
+    """Decorate a constructor so that it uses float32, whatever torch's default type.
+
+    The networks compute with complex numbers, which torch does not have in half precision.
+
+    >>> torch.set_default_dtype(torch.bfloat16)
+    >>> class Layer(torch.nn.Linear):
+    ...     __init__ = built_in_float32(torch.nn.Linear.__init__)
+    >>> Layer(2, 2).weight.dtype
+    torch.float32
+    >>> torch.set_default_dtype(torch.float32)
+    """
+
+    @wraps(construct)
+    def call(*args: P.args, **kwargs: P.kwargs) -> None:
+        default = torch.get_default_dtype()
+        torch.set_default_dtype(torch.float32)
+        try:
+            construct(*args, **kwargs)
+        finally:
+            torch.set_default_dtype(default)
+
+    return call
+
+
 def without_modes(
     function: Callable[P, Result], /, *arguments: P.args, **options: P.kwargs
 ) -> Result:

@@ -143,7 +143,9 @@ def test_error_about_lengths_names_the_fix(lengths: Any, fix: str) -> None:
 def test_error_about_an_array_names_the_fix() -> None:
     array = torch.zeros(10).numpy()
     for call in (check_waveform, level_spl):
-        with pytest.raises(ValueError, match="NumPy array of float32; convert it: torch.from_num"):
+        with pytest.raises(
+            ValueError, match=r"NumPy array of float32; convert it: torch\.from_num"
+        ):
             call(array)
 
 

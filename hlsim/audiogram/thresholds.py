@@ -51,14 +51,17 @@ def as_thresholds(
     torch.Size([2, 8])
     """
     if isinstance(audiogram, np.ndarray) and audiogram.ndim > 1:
-        audiogram = torch.tensor(audiogram.astype(np.float32))
+        audiogram = torch.from_numpy(audiogram.astype(np.float32))
     listed = _list_ears(audiogram)
     if listed is None:
         return _check_tensor(audiogram, highest)
     ears, shape = listed
     for ear in ears:
         check_range(ear.thresholds, highest)
-    return torch.tensor([ear.thresholds for ear in ears]).reshape(*shape, len(FREQUENCIES))
+    # Whatever torch's default type and device, for example ``meta``
+    rows = [ear.thresholds for ear in ears]
+    thresholds = torch.tensor(rows, dtype=torch.float32, device="cpu")
+    return thresholds.reshape(*shape, len(FREQUENCIES))
 
 
 def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None:

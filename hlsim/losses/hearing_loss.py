@@ -357,9 +357,12 @@ class HearingLossLoss(nn.Module):
         """Move modules that are not registered along with the loss, but not to half precision."""
 
         def move(tensor: Tensor) -> Tensor:
-            moved = function(tensor)
+            # The function may drop the values, as ``to_empty`` does: no state dict restores those
+            # of modules that are not registered.
+            moved = function(tensor.new_empty(0))
             is_half = moved.is_floating_point() and moved.dtype.itemsize < 4
-            return tensor.to(moved.device) if is_half else moved
+            device = tensor.device if moved.is_meta else moved.device
+            return tensor.to(device, tensor.dtype if is_half else moved.dtype)
 
         super()._apply(function, recurse)
         for module in (self.simulator, self._frozen.normal, self._unregistered.criterion):

@@ -19,7 +19,7 @@ from torch.nn import functional
 from hlsim.dsp.erb import ERB_AT_0_HZ, erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant, differentiable_once
 
 FRAME = 256
 """Length of a frame in samples at 44.1 kHz."""
@@ -196,8 +196,9 @@ def smear_spectrum(
         spectrum: Spectra of pressures in Pa.
         matrix: Matrix by which power spectra are multiplied: one for all items, or one per item.
         gradient_floor: Bound of the gradients, which are computed as if smearing multiplied each
-            power by this factor at least and by its reciprocal at most. With 0, gradients have no
-            bound where smearing changes the sign of a power or fills an empty frequency.
+            power by this factor at least and by its reciprocal at most. A bounded gradient has no
+            second derivative. With 0, gradients have no bound where smearing changes the sign of a
+            power or fills an empty frequency.
 
     Returns:
         The smeared spectrum and its power.
@@ -295,6 +296,15 @@ class _SmearSpectrum(torch.autograd.Function):
             torch.addcmul(g_real, spectrum.real, weight),
             torch.addcmul(g_imag, spectrum.imag, weight),
         )
+        if floor:
+            # A bounded gradient is no exact derivative, and its own derivative would be wrong.
+            message = (
+                "the gradient of a network with structure='bands', such as neuro-msbg-light, is "
+                "bounded and has no second derivative; use neuro-msbg or msbg"
+            )
+            spectrum_gradient = differentiable_once(spectrum_gradient, message)
+            if matrix_gradient is not None:
+                matrix_gradient = differentiable_once(matrix_gradient, message)
         return spectrum_gradient, matrix_gradient, None
 
 

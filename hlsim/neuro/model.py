@@ -25,6 +25,7 @@ from hlsim.neuro.encoder import (
 )
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
+from hlsim.torchtools import built_in_float32
 
 POWER_FLOOR = 1e-11
 """Power in Pa^2 that is added to powers before square roots."""
@@ -47,10 +48,12 @@ class NeuroMSBG(EarNetwork):
 
     With ``config.prior``, the spectrogram is first multiplied by an estimate of MSBG's gains by its
     own formulae, which is also the fourth input channel, and the network corrects it. With the
-    structure ``bands``, a smaller network corrects the gains in MSBG's frequency channels.
+    structure ``bands``, a smaller network corrects the gains in MSBG's frequency channels. The
+    gradient of this structure is bounded where smearing nearly empties a frequency, so that it may
+    differ from the derivative by a few percent, and it has no second derivative.
 
     ``torch.func.grad`` works with all kinds of blocks. On a CPU, second derivatives work with
-    ``cnn`` and ``lstm`` blocks.
+    ``cnn`` and ``lstm`` blocks of the other structures. Those that do not exist raise RuntimeError.
 
     Source: the Neuro-MSBG paper, Section III and Equation 1.
 
@@ -81,6 +84,7 @@ class NeuroMSBG(EarNetwork):
 
     config: NeuroConfig
 
+    @built_in_float32
     def __init__(
         self,
         config: NeuroConfig | None = None,

@@ -79,6 +79,11 @@ class EarNetwork(nn.Module):
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         weight = next(self.parameters())
+        if weight.is_meta:
+            raise ValueError(
+                f"{type(self).__name__} was built on the meta device and has no weights; build it "
+                "on the CPU, or load a state dict with assign=True"
+            )
         if weight.device != waveform.device:
             raise ValueError(
                 f"expected the waveform on {weight.device}, the device of {type(self).__name__}, "

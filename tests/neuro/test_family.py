@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hlsim import Audiogram, NeuroMSBG
+from hlsim import Audiogram, NeuroMSBG, load_pretrained
 from hlsim.data.ears import draw_thresholds
 from hlsim.neuro import NeuroConfig
 from hlsim.training.recipes import SimulatorRecipe
@@ -144,3 +144,11 @@ def test_derivatives_are_exact_or_raise(kind: str) -> None:
     (curvature,) = torch.autograd.grad(directional_slope, leaf)
     expected = (slope(wave + 1e-8 * direction) - slope(wave - 1e-8 * direction)) / 2e-8
     assert float((curvature - expected).norm() / expected.norm()) < 1e-4
+
+
+def test_bounded_gradient_of_bands_has_no_second_derivative() -> None:
+    model = load_pretrained("neuro-msbg-light")
+    leaf = (0.02 * torch.randn(1, 800)).requires_grad_()
+    (slope,) = torch.autograd.grad(model(leaf, N3).square().sum(), leaf, create_graph=True)
+    with pytest.raises(RuntimeError, match="no second derivative; use neuro-msbg or msbg"):
+        torch.autograd.grad(slope.sum(), leaf)
