@@ -114,7 +114,7 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
 
     Returns:
         A list with two members per row: the number of its last line, and its values by column,
-        without surrounding blanks. Missing values are empty.
+        without surrounding blanks. Missing values are empty. Rows without any value are left out.
 
     Raises:
         ValueError: The file cannot be read or has no rows, a column appears twice, or a row has too
@@ -148,7 +148,8 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
                         "values that contain the separator into quotes"
                     )
                 values = {name: value.strip() for name, value in row.items() if name}
-                rows.append((reader.line_num, values))
+                if any(values.values()):  # spreadsheets write rows of commas
+                    rows.append((reader.line_num, values))
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path}: {contents} must be a CSV file in UTF-8 or cp1252 ({error})"

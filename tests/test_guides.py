@@ -36,6 +36,7 @@ NOT_RUN = {
     "huggingface_hub": "needs a network",
     "LightningModule": "is part of a program",
     "mine.ckpt": "is part of a program",
+    "read_sas": "needs a file of NHANES; tests/audiogram/test_table.py runs it",
     'loss = hlsim.HearingLossLoss("N3", simulator': "is part of a program",
 }
 """Texts in commands and programs that are not run, with the reason."""

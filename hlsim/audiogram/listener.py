@@ -6,20 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from hlsim.audiogram.scale import EarName
+from hlsim.audiogram.scale import EARS, EarName
 from hlsim.audiogram.value import Audiogram, EarLike, as_audiogram
-
-EARS: tuple[EarName, EarName] = ("left", "right")
-
-EAR_NAMES: dict[str, EarName] = {
-    "l": "left",
-    "le": "left",
-    "left": "left",
-    "r": "right",
-    "re": "right",
-    "right": "right",
-}
-"""Texts for an ear in a table, in lower case."""
 
 
 @dataclass(frozen=True)

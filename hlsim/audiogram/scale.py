@@ -4,8 +4,23 @@ from typing import Literal
 
 EarName = Literal["left", "right"]
 
+EARS: tuple[EarName, EarName] = ("left", "right")
+
+EAR_NAMES: dict[str, EarName] = {
+    "l": "left",
+    "le": "left",
+    "left": "left",
+    "r": "right",
+    "re": "right",
+    "right": "right",
+}
+"""Texts for an ear in a table, in lower case."""
+
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 """The eight audiometric frequencies in Hz at which networks, losses and aids take thresholds."""
+
+LOWEST_HZ, HIGHEST_HZ = 100.0, 20000.0
+"""Range of the frequencies in Hz at which an audiogram may have thresholds."""
 
 LOWEST_LEVEL, HIGHEST_LEVEL = -10.0, 120.0
 """Range of the thresholds of an audiogram in dB HL."""

@@ -1,41 +1,52 @@
-"""Audiograms and listeners in files."""
+"""Audiograms and listeners in files and in pandas' data frames."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from hlsim.audiogram.listener import EAR_NAMES, Listener
-from hlsim.audiogram.scale import HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD
-from hlsim.audiogram.value import Audiogram, convert_at
+from hlsim.audiogram.columns import threshold_columns
+from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD, EarName
+from hlsim.audiogram.value import Audiogram, convert_at, ears_in_row
+from hlsim.checks import reject_duplicates
 from hlsim.files import read_table
 
 _Builders = Mapping[str, Callable[[], Listener]]
 """Functions that build listeners, under the names of the listeners."""
 
+_Row = tuple[str, dict[str, str]]
+"""The place of a row for messages, and its texts by column."""
+
 
 def read_audiograms(
-    path: str | Path, *, simulated: bool = False
+    path: str | Path | Any, *, simulated: bool = False
 ) -> list[tuple[dict[str, str], Audiogram]]:
-    """Read the audiograms of a CSV file with one row per ear.
+    """Read the audiograms of a table with one row per ear, per listener or per threshold.
 
-    A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``.25k``
-    (``Audiogram.from_row`` describes the details); other columns may have any name. The table may
-    have commas, semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
+    A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``.25k``, or ``L250`` and
+    ``R250`` if each row has both ears. A long table has the columns ``frequency`` and
+    ``threshold``, and ``listener`` and ``ear`` if it has several ears. Other columns may have any
+    name. A file may have commas, semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
-        path: The file, or ``"standard"`` for Bisgaard's audiograms N1 to N7 and S1 to S3.
+        path: A CSV file, a pandas ``DataFrame``, or ``"standard"`` for Bisgaard's audiograms N1 to
+            N7 and S1 to S3.
         simulated: Whether the audiograms are for a simulator. Then thresholds above 100 dB HL are
             rejected, and N7, which has them, is left out of the standard audiograms.
 
     Returns:
-        A list with two members per row: the texts of the row by column, and its audiogram.
+        A list with two members per ear: the texts of its row by column, and its audiogram. For a
+        row with both ears, the text in the column ``ear`` is ``left`` or ``right``.
 
     Raises:
-        ValueError: The file cannot be read, has no rows, or a row is not an audiogram. The message
-            names the file, the line and the column.
+        ValueError: The file cannot be read, has no rows, a row is not an audiogram, or a column
+            looks like thresholds and is not understood. The message names the file, the line and
+            the column.
 
     Example:
         >>> import hlsim
@@ -44,24 +55,28 @@ def read_audiograms(
         ({'listener': 'N4'}, Audiogram('N4'))
     """
     highest = HIGHEST_SIMULATED if simulated else HIGHEST_LEVEL
-    if str(path) == "standard":
+    if isinstance(path, str | Path) and str(path) == "standard":
         standard = [(name, Audiogram.standard(name)) for name in STANDARD if name != "NH"]
         return [({"listener": name}, ear) for name, ear in standard if max(ear.levels) <= highest]
-    ears = []
-    for line, row in read_table(path, "audiograms"):
-        ear = convert_at(f"{path}, line {line}", Audiogram.from_row, row, highest)
-        ears.append((row, ear))
-    return ears
+    audiograms = []
+    for place, row in _read_rows(path):
+        for name, ear in convert_at(place, _read_ears, row, highest).items():
+            is_named = name is None or text_in(row, "ear") != ""
+            audiograms.append((row if is_named else {**row, "ear": str(name)}, ear))
+    return audiograms
 
 
-def read_listeners(path: str | Path, names: Collection[str] | None = None) -> dict[str, Listener]:
-    """Read listeners from Clarity's ``listeners.json`` or from a CSV file.
+def read_listeners(
+    path: str | Path | Any, names: Collection[str] | None = None
+) -> dict[str, Listener]:
+    """Read listeners from Clarity's ``listeners.json`` or from a table.
 
-    The CSV file has one row per ear, with the columns ``listener`` and ``ear`` (left or right, L or
-    R, LE or RE) beside the thresholds that ``read_audiograms`` describes.
+    The table has a column ``listener``. It has one row per ear, with the column ``ear`` (left or
+    right, L or R, LE or RE), one row per listener with both ears, or one row per threshold, as
+    ``read_audiograms`` describes.
 
     Args:
-        path: The file. Its name ends in ``.json`` if it is Clarity's.
+        path: A file, whose name ends in ``.json`` if it is Clarity's, or a pandas ``DataFrame``.
         names: Names of the listeners to read, by default all. Other listeners are not validated.
 
     Returns:
@@ -74,23 +89,45 @@ def read_listeners(path: str | Path, names: Collection[str] | None = None) -> di
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
-    ...     _ = Path(f"{folder}/ears.csv").write_text("listener,ear,500 Hz\\nA,L,20\\nA,R,30\\n")
+    ...     _ = Path(f"{folder}/ears.csv").write_text("listener,L500,R500\\nA,20,30\\n")
     ...     read_listeners(f"{folder}/ears.csv")
     {'A': Listener(left=Audiogram({500: 20}), right=Audiogram({500: 30}))}
     """
-    is_json = str(path).lower().endswith(".json")
+    is_file = isinstance(path, str | Path)
+    is_json = is_file and str(path).lower().endswith(".json")
     builders = _read_entries(path) if is_json else _group_rows(path)
+    source = path if is_file else "the table"
     for name in names or ():
         if name not in builders:
             examples = ", ".join([*builders][:5])
-            raise ValueError(f"{path}: no listener {name!r}; expected a name such as {examples}")
+            raise ValueError(f"{source}: no listener {name!r}; expected a name such as {examples}")
     return {name: builders[name]() for name in (builders if names is None else names)}
+
+
+def text_in(row: Mapping[str, str], name: str) -> str:
+    """Return the text of a row in a column whose name may have capitals, or an empty text.
+
+    Args:
+        row: Texts by column.
+        name: Name of the column in lower case.
+
+    Raises:
+        ValueError: Two columns have this name.
+
+    >>> text_in({"Ear": "L", "500 Hz": "20"}, "ear")
+    'L'
+    """
+    columns = [column for column in row if column.strip().lower() == name]
+    if len(columns) > 1:
+        raise ValueError(f"columns {' and '.join(columns)} have the same name; rename one of them")
+    return row[columns[0]].strip() if columns else ""
 
 
 def _read_entries(path: str | Path) -> _Builders:
     """Read Clarity's ``listeners.json``, and return functions that build the listeners."""
     try:
-        entries = json.loads(Path(path).read_text(encoding="utf-8"))
+        text = Path(path).read_text(encoding="utf-8")
+        entries = json.loads(text, object_pairs_hook=reject_duplicates)
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: cannot read listeners: {error}") from error
     if not isinstance(entries, Mapping) or not entries:
@@ -101,33 +138,124 @@ def _read_entries(path: str | Path) -> _Builders:
     }
 
 
-def _group_rows(path: str | Path) -> _Builders:
-    """Read the rows of a CSV file, and return functions that build the listeners."""
-    rows: dict[str, list[tuple[str, dict[str, str]]]] = {}
-    for line, row in read_table(path, "audiograms"):
-        place = f"{path}, line {line}"
-        columns = {column.lower(): text for column, text in row.items()}
-        name = columns.get("listener")
+def _group_rows(path: str | Path | Any) -> _Builders:
+    """Read the rows of a table, and return functions that build the listeners."""
+    rows: dict[str, list[_Row]] = {}
+    for place, row in _read_rows(path):
+        name = convert_at(place, text_in, row, "listener")
         if not name:
             raise ValueError(f"{place}: expected a name in the column listener, got none; add it")
-        rows.setdefault(name, []).append((place, columns))
-    return {name: partial(_join_ears, rows_of_name) for name, rows_of_name in rows.items()}
+        rows.setdefault(name, []).append((place, row))
+    return {name: partial(_join_ears, name, rows_of_name) for name, rows_of_name in rows.items()}
 
 
-def _join_ears(rows: Sequence[tuple[str, dict[str, str]]]) -> Listener:
+def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
     """Return the listener of one or two rows."""
-    ears: dict[str, Audiogram | None] = {"left": None, "right": None}
+    ears: dict[EarName, Audiogram] = {}
     for place, row in rows:
-        text = row.get("ear", "")
-        ear = EAR_NAMES.get(text.lower())
-        if ear is None:
+        for name, ear in convert_at(place, _read_ears, row).items():
+            if name is None:
+                text = text_in(row, "ear")
+                raise ValueError(
+                    f"{place}: expected left or right in the column ear, got {text!r}; correct it"
+                )
+            if name in ears:
+                raise ValueError(
+                    f"{place}: expected one row for the {name} ear of listener {listener}, got a "
+                    "second one; remove one of them"
+                )
+            ears[name] = ear
+    return Listener(ears.get("left"), ears.get("right"))
+
+
+def _read_ears(
+    row: Mapping[str, str], highest: float = HIGHEST_LEVEL
+) -> dict[EarName | None, Audiogram]:
+    """Return the audiograms of a row by ear, which its columns or its column ``ear`` name."""
+    ears = ears_in_row(row, highest)
+    name = EAR_NAMES.get(text_in(row, "ear").lower())
+    if None in ears:
+        return {name: ears[None]}
+    if name is not None:
+        raise ValueError(
+            f"columns of thresholds name the ear, and the column ear has {text_in(row, 'ear')!r}; "
+            "remove the column ear"
+        )
+    return ears
+
+
+def read_rows(table: str | Path | Any, contents: str) -> list[tuple[str, dict[str, str]]]:
+    """Read the rows of a CSV file or of a pandas ``DataFrame``.
+
+    Args:
+        table: The file or the data frame.
+        contents: Description of the contents for error messages, such as "the manifest".
+
+    Returns:
+        A list with two members per row: its place for messages, and its texts by column. Missing
+        values are empty.
+
+    Raises:
+        ValueError: The file cannot be read, there are no rows, or a column appears twice.
+    """
+    if isinstance(table, str | Path):
+        return [(f"{table}, line {line}", row) for line, row in read_table(table, contents)]
+    names = [str(column).strip() for column in table.columns]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{contents}: the column {repeated[0]} appears twice; rename one of them")
+    if not len(table):
+        raise ValueError(f"{contents}: expected a table with rows, got no rows; add them")
+    cells = table.astype(object).where(table.notna(), "").astype(str)
+    rows = zip(table.index, cells.itertuples(index=False, name=None), strict=True)
+    return [
+        (
+            f"{contents}, row {index}",
+            {name: text.strip() for name, text in zip(names, row, strict=True)},
+        )
+        for index, row in rows
+    ]
+
+
+def _read_rows(table: str | Path | Any) -> list[_Row]:
+    """Read the rows of a table of ears, and join those of a long one."""
+    rows = read_rows(table, "audiograms")
+    columns = {_without_units(column): column for column in rows[0][1]}
+    is_long = {"frequency", "threshold"} <= columns.keys() and not threshold_columns(rows[0][1])
+    return _widen(rows, columns["frequency"], columns["threshold"]) if is_long else rows
+
+
+def _without_units(column: str) -> str:
+    """Return the words of a column's name in lower case, without units."""
+    words = re.findall("[a-z]+", column.lower())
+    return " ".join(word for word in words if word not in ("hz", "db", "hl"))
+
+
+def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
+    """Join the rows of each ear of a table with one threshold per row.
+
+    Args:
+        rows: Rows of the table.
+        frequency: Name of the column of frequencies in Hz.
+        threshold: Name of the column of thresholds in dB HL.
+    """
+    names = [column for column in rows[0][1] if column not in (frequency, threshold)]
+    has_ears = {"listener", "ear"} <= {column.lower() for column in names}
+    if names and not has_ears:
+        raise ValueError(
+            f"{rows[0][0]}: expected the columns listener and ear beside {frequency} and "
+            f"{threshold}, got {', '.join(names)}; add or rename columns"
+        )
+    ears: dict[tuple[str, ...], _Row] = {}
+    for place, row in rows:
+        ear = {name: text_in(row, name) for name in ("listener", "ear") if has_ears}
+        _, wide = ears.setdefault(tuple(ear.values()), (place, ear))
+        text = row[frequency]
+        column = text if re.search("k|hz", text.lower()) else f"{text} Hz"
+        if column in wide:
             raise ValueError(
-                f"{place}: expected left or right in the column ear, got {text!r}; correct it"
+                f"{place}: expected one threshold at {column} for this ear, got a second one; "
+                "remove one of them"
             )
-        if ears[ear] is not None:
-            raise ValueError(
-                f"{place}: expected one row for the {ear} ear of listener {row['listener']}, got a "
-                "second one; remove one of them"
-            )
-        ears[ear] = convert_at(place, Audiogram.from_row, row)
-    return Listener(**ears)
+        wide[column] = row[threshold]
+    return [*ears.values()]

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.audiogram.listener import EARS, Listener
-from hlsim.audiogram.scale import FREQUENCIES, HIGHEST_SIMULATED, LOWEST_LEVEL
+from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.scale import EARS, FREQUENCIES, HIGHEST_SIMULATED, LOWEST_LEVEL
 from hlsim.audiogram.value import Audiogram, EarLike, check_range, find_audiogram
 from hlsim.torchtools import broadcast_shape, known_on_host, on_device, on_host
 

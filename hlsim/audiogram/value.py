@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -14,10 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.plot import EAR_STYLES, frequency_axis
 from hlsim.audiogram.scale import (
+    EARS,
     FREQUENCIES,
+    HIGHEST_HZ,
     HIGHEST_LEVEL,
+    LOWEST_HZ,
     LOWEST_LEVEL,
     SEVERITIES,
     SEVERITY_LIMITS,
@@ -28,8 +31,6 @@ from hlsim.extras import require
 
 Result = TypeVar("Result")
 
-# a frequency, "k" for kHz, and the name of a remark on the frequency
-_COLUMN = re.compile(r"(?:hl[_ ]?)?(\d+\.?\d*|\.\d+) ?(k?)(?:hz)?(_.+)?", re.IGNORECASE)
 _UNMEASURED = ("", "na", "n/a", "null", "none", "nan")
 
 
@@ -47,8 +48,8 @@ class Audiogram:
     Args:
         levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or
             NaN was not measured, and is left out.
-        frequencies: Ascending frequencies in Hz; by default 250, 500, 1000, 2000, 3000, 4000, 6000
-            and 8000, the ``FREQUENCIES``.
+        frequencies: Ascending frequencies from 100 to 20000 Hz; by default 250, 500, 1000, 2000,
+            3000, 4000, 6000 and 8000, the ``FREQUENCIES``.
 
     Raises:
         ValueError: The numbers of levels and frequencies differ, no level was measured, one is out
@@ -76,17 +77,17 @@ class Audiogram:
         is_measured = ~np.isnan(levels)
         levels, frequencies = levels[is_measured], frequencies[is_measured]
         check_range(levels, HIGHEST_LEVEL, frequencies)
-        ascending = len(levels) > 0 and frequencies[0] > 0 and (np.diff(frequencies) > 0).all()
+        ascending = len(levels) > 0 and (np.diff(frequencies) > 0).all()
         overlaps = (
             ascending
-            and FREQUENCIES[0] <= frequencies[-1] < math.inf
-            and frequencies[0] <= FREQUENCIES[-1]
+            and LOWEST_HZ <= frequencies[0] <= FREQUENCIES[-1]
+            and FREQUENCIES[0] <= frequencies[-1] <= HIGHEST_HZ
         )
         if not overlaps:
             raise ValueError(
-                "expected levels at ascending frequencies in Hz that overlap the range from "
-                f"{FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g}, got levels at "
-                f"{frequencies.tolist()} Hz; sort the frequencies, or multiply kHz by 1000"
+                f"expected levels at ascending frequencies from {LOWEST_HZ:g} to {HIGHEST_HZ:g} "
+                f"Hz that overlap the range from {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g}, got "
+                f"levels at {frequencies.tolist()} Hz; sort them, or multiply kHz by 1000"
             )
         object.__setattr__(self, "levels", tuple(levels.tolist()))
         object.__setattr__(self, "frequencies", tuple(frequencies.tolist()))
@@ -192,42 +193,29 @@ class Audiogram:
 
     @classmethod
     def from_row(cls, row: Mapping[str, str], highest: float = HIGHEST_LEVEL) -> Audiogram:
-        """Convert a row of a table into an audiogram.
-
-        A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``1k``, in any order
-        and case. Other columns are ignored, and so are remarks on a frequency, such as
-        ``hl_8000_extrapolated_flat``. A frequency was not measured if its value is empty, ``NA``,
-        ``null``, ``None`` or ``nan``.
+        """Convert a row of a table with the thresholds of one ear into an audiogram.
 
         Args:
-            row: Texts by column.
+            row: Texts by column. Columns of thresholds have the names that ``threshold_columns``
+                describes.
             highest: Highest level allowed, in dB HL.
 
         Raises:
-            ValueError: The row has no measured threshold, two of one frequency, one that is not a
-                number from -10 to ``highest``, or a column that begins with ``hl`` by mistake.
+            ValueError: The row has no measured threshold, those of both ears, two of one frequency,
+                one that is not a number from -10 to ``highest``, or a column that is not
+                understood.
+
+        >>> Audiogram.from_row({"hl_500": "20", "1k": "30"})
+        Audiogram({500: 20, 1000: 30})
         """
-        points: dict[float, float] = {}
-        columns: dict[float, str] = {}
-        for column, text in row.items():
-            frequency = column_frequency(column)
-            if frequency is None:
-                continue
-            if frequency in columns:
-                raise ValueError(
-                    f"columns {columns[frequency]!r} and {column!r} have the same frequency; "
-                    "remove one of them"
-                )
-            columns[frequency] = column
-            if str(text).strip().lower() not in _UNMEASURED:
-                points[frequency] = _parse_level(text, column, highest)
-        if not points:
+        ears = ears_in_row(row, highest)
+        if len(ears) > 1:
             raise ValueError(
-                "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got "
-                f"the columns {', '.join(row)}; add columns or thresholds"
+                "expected the thresholds of one ear, got those of both; read the table with "
+                "read_audiograms or read_listeners"
             )
-        frequencies = tuple(sorted(points))
-        return cls(tuple(points[frequency] for frequency in frequencies), frequencies)
+        (ear,) = ears.values()
+        return ear
 
     def to_clarity(self) -> Any:
         """Return pyclarity's ``Audiogram`` with the same levels and frequencies.
@@ -287,6 +275,8 @@ def find_audiogram(ear: Any) -> Audiogram | None:
         return Audiogram(ear.levels, ear.frequencies)
     if isinstance(ear, Mapping):
         return _from_mapping(ear)
+    if hasattr(ear, "to_dict") and hasattr(ear, "index"):  # a Series of pandas
+        return _from_series(ear)
     if isinstance(ear, np.ndarray | Tensor):
         return Audiogram(tuple(ear.tolist())) if ear.ndim == 1 else None
     if isinstance(ear, Sequence) and ear and all(isinstance(level, Real | None) for level in ear):
@@ -304,6 +294,22 @@ def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
             "for two ears, pass Listener(left, right)"
         ) from None
     return Audiogram(tuple(levels[frequency] for frequency in frequencies), tuple(frequencies))
+
+
+def _from_series(series: Any) -> Audiogram | None:
+    """Convert a ``Series`` of thresholds by position, by frequency or by column of a table.
+
+    Another object of pandas gives None.
+    """
+    if series.ndim != 1:
+        return None
+    labels = list(series.index)
+    if labels == list(range(len(labels))):
+        return Audiogram(tuple(series))
+    if any(isinstance(label, str) for label in labels):
+        texts = series.astype(object).where(series.notna(), "").astype(str)
+        return Audiogram.from_row({str(label): text for label, text in texts.items()})
+    return _from_mapping(series.to_dict())
 
 
 def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -> Tensor:
@@ -328,6 +334,50 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     total = sum(high, start=torch.zeros_like(rounded[0]))
     # The sum is compared, because CUDA may round a mean in another way.
     return torch.stack([total > limit * len(high) for limit in SEVERITY_LIMITS]).sum(0)
+
+
+def ears_in_row(
+    row: Mapping[str, str], highest: float = HIGHEST_LEVEL
+) -> dict[EarName | None, Audiogram]:
+    """Convert the thresholds of a row of a table into audiograms, by the ear that columns name.
+
+    A frequency was not measured if its value is empty, ``NA``, ``null``, ``None`` or ``nan``. An
+    ear without a measured threshold is left out.
+
+    Args:
+        row: Texts by column.
+        highest: Highest level allowed, in dB HL.
+
+    Returns:
+        The left and the right ear, or one ear under None if columns do not name the ear.
+
+    Raises:
+        ValueError: There is no measured threshold, a column is not understood, a text is not a
+            level from -10 to ``highest``, some columns name an ear and others do not, or a remark
+            is a number.
+
+    >>> ears_in_row({"L500": "20", "R500": "30"})
+    {'left': Audiogram({500: 20}), 'right': Audiogram({500: 30})}
+    """
+    points: dict[EarName | None, dict[float, float]] = {}
+    for column, meaning in threshold_columns(row).items():
+        text = str(row[column]).strip()
+        if meaning.is_remark:
+            _check_remark(text, column)
+        elif text.lower() not in _UNMEASURED:
+            level = _parse_level(text, column, highest)
+            points.setdefault(meaning.ear, {})[meaning.hz] = level
+    if not points:
+        raise ValueError(
+            "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got the "
+            f"columns {', '.join(row)}; add columns or thresholds"
+        )
+    if None in points and len(points) > 1:
+        raise ValueError(
+            "expected all columns of thresholds to name the ear, such as L500 and R500, or none of "
+            f"them, got {', '.join(threshold_columns(row))}; rename the columns"
+        )
+    return {ear: _from_mapping(points[ear]) for ear in (None, *EARS) if ear in points}
 
 
 def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
@@ -376,18 +426,16 @@ def check_range(
         )
 
 
-def column_frequency(column: str) -> float | None:
-    """Return the frequency in Hz of a column of thresholds, or ``None`` for another column.
-
-    >>> column_frequency("1k"), column_frequency("hl_500"), column_frequency("listener")
-    (1000.0, 500.0, None)
-    """
-    match = _COLUMN.fullmatch(column)
-    if match is None and re.match(r"hl[_ ]?\d", column, re.IGNORECASE):
-        raise ValueError(f"column {column!r}: expected hl_ and a frequency in Hz, such as hl_500")
-    if match is None or match[3]:
-        return None
-    return float(match[1]) * (1000.0 if match[2] else 1.0)
+def _check_remark(text: str, column: str) -> None:
+    """Raise ValueError if a remark on a frequency is a number, which may be a threshold."""
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return
+    raise ValueError(
+        f"column {column!r} is {text!r}; expected a remark in words, because another column has "
+        "this frequency; rename the column if it holds no thresholds, or remove one of the two"
+    )
 
 
 def _parse_level(text: str, column: str, highest: float) -> float:

@@ -25,6 +25,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
+from hlsim.checks import reject_duplicates
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.conditions import NAL_R, UNAIDED
@@ -208,7 +209,7 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
     """Return the names of scenes and listeners in ``scenes_listeners.json``."""
     try:
         text = path.read_text(encoding="utf-8")
-        entries = json.loads(text, object_pairs_hook=_unique_keys)
+        entries = json.loads(text, object_pairs_hook=reject_duplicates)
         pairs = [(scene, name) for scene, listeners in entries.items() for name in listeners]
         # A text instead of a list of names would give its letters.
         if any(isinstance(listeners, str) for listeners in entries.values()):
@@ -223,14 +224,6 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
             "listeners for each scene"
         ) from error
     return pairs
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the members of a JSON object; of equal keys, Python would take the last one."""
-    entries = dict(pairs)
-    if len(entries) < len(pairs):
-        raise ValueError("an object has the same key twice")
-    return entries
 
 
 def _make_conditions(

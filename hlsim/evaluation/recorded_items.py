@@ -26,13 +26,15 @@ from torch import Tensor
 
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram.listener import EAR_NAMES, EARS, Listener
-from hlsim.audiogram.table import read_audiograms, read_listeners
-from hlsim.audiogram.value import column_frequency, convert_at
+from hlsim.audiogram.columns import threshold_columns
+from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.scale import EAR_NAMES, EARS
+from hlsim.audiogram.table import read_audiograms, read_listeners, read_rows
+from hlsim.audiogram.value import convert_at, ears_in_row
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.running.fingerprint import value_hash
 from hlsim.evaluation.study import Item
-from hlsim.files import path_below, read_table, sha256
+from hlsim.files import path_below, sha256
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -323,7 +325,10 @@ def read_manifest(
     ['c/1']
     """
     is_file = isinstance(manifest, (str, Path))
-    rows = _rows_of_file(manifest) if is_file else _rows_of_frame(manifest)
+    rows = [
+        (place, convert_at(place, _known_columns, row))
+        for place, row in read_rows(manifest, "the manifest")
+    ]
     folder = root if root is not None else (Path(manifest).parent if is_file else Path())
     columns = rows[0][1]
     if "spl" in columns:
@@ -349,33 +354,13 @@ def read_manifest(
     return list(recordings.values())
 
 
-def _rows_of_file(path: Any) -> _Rows:
-    """Return the rows of a CSV file."""
-    return [
-        (f"{path}, line {line}", _known_columns(f"{path}, line 1", row))
-        for line, row in read_table(path, "the manifest")
-    ]
-
-
-def _rows_of_frame(frame: Any) -> _Rows:
-    """Return the rows of a DataFrame, whose missing values become empty texts."""
-    records = frame.astype(object).where(frame.notna(), "").to_dict("records")
-    if not records:
-        raise ValueError("expected a manifest with rows, got an empty DataFrame; add rows")
-    rows = []
-    for label, record in zip(frame.index, records, strict=True):
-        texts = {str(column).strip(): str(value).strip() for column, value in record.items()}
-        rows.append((f"the manifest, row {label}", _known_columns("the manifest", texts)))
-    return rows
-
-
-def _known_columns(place: str, row: Mapping[str, str]) -> dict[str, str]:
+def _known_columns(row: Mapping[str, str]) -> dict[str, str]:
     """Return a row with the names of known columns in lower case, whatever their case was."""
     known: dict[str, str] = {}
     for column, text in row.items():
         name = column.lower() if column.lower() in _COLUMNS else column
         if name in known:
-            raise ValueError(f"{place}: the column {name} appears twice; remove one of the two")
+            raise ValueError(f"the column {name} appears twice; remove one of the two")
         known[name] = text
     return known
 
@@ -422,13 +407,9 @@ def _read_row(
     ear = EAR_NAMES.get(text.lower(), "")
     if text and not ear:
         raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
-    thresholds = {
-        column: value
-        for column, value in row.items()
-        if column not in _COLUMNS and column_frequency(column) is not None
-    }
-    if any(thresholds.values()):
-        audiogram = Audiogram.from_row(thresholds)
+    if any(row[column] for column in threshold_columns(row)):
+        ears = {str(name or ""): ear_of_row for name, ear_of_row in ears_in_row(row).items()}
+        audiogram = ears.get("") or ears.get(ear)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
     elif listener in listeners:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram.listener import EARS
+from hlsim.audiogram.scale import EARS
 from hlsim.evaluation.comparison import PlannedComparison, compare
 from hlsim.evaluation.conditions import AFTER, BEFORE
 from hlsim.evaluation.measures import ALIGNMENT, LEVELS, find_measures

@@ -143,6 +143,7 @@ BAD_FILES = {
     "e.json": json.dumps({"L1": {key: ENTRY[key] for key in list(ENTRY)[:3]}}),
     "f.csv": "listener,ear,hl_500\nA,both,20\n",
     "g.csv": "listener,ear,hl_500\nA,l,20\nA,left,20\n",
+    "i.json": f'{{"L1": {json.dumps(ENTRY)}, "L1": {json.dumps(ENTRY)}}}',
     "h.csv": "listener,ear,hl_500\n,l,20\n",
 }
 

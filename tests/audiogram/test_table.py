@@ -1,15 +1,18 @@
 """Tables of audiograms as spreadsheets, clinics and apps write them."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 import hlsim
-from hlsim import Audiogram
+from hlsim import Audiogram, Listener
 from hlsim.audiogram import STANDARD
-from hlsim.audiogram.table import read_audiograms
+from hlsim.audiogram.scale import EAR_NAMES
+from hlsim.audiogram.table import read_audiograms, read_listeners, text_in
 
-EARS_FILE = Path(__file__).parents[2] / "examples" / "ears.csv"
+ROOT = Path(__file__).parents[2]
+EARS_FILE = ROOT / "examples" / "ears.csv"
 
 
 def read_text(folder: Path, text: str) -> list[Audiogram]:
@@ -31,6 +34,17 @@ def read_text(folder: Path, text: str) -> list[Audiogram]:
         "hl_250;hl_500;hl_1000\n10;22,5;30\n",
         "hl_250\thl_500\thl_1000\n10\t22,5\t30\n",
         "hl_250,hl_500,hl_1000,hl_1000_masked\n10,22.5,30,yes\n",
+        '250 Hz,500 Hz,"1,000 Hz"\n10,22.5,30\n',
+        "250 Hz;500 Hz;1.000 Hz\n10;22,5;30\n",
+        "250 Hz,500 Hz,1 000 Hz\n10,22.5,30\n",
+        "250 Hz,500 Hz,1\u202f000 Hz\n10,22.5,30\n",
+        "250 Hz*,500 Hz (dB HL),AC 1000\n10,22.5,30\n",
+        '"250\nHz","500\nHz","1000\nHz"\n10,22.5,30\n',
+        "250 Hz R,500_R,right 1k\n10,22.5,30\n",
+        "AUXU1K1R,2nd visit,2019-05-01,bc_500,250,500,1000\n7,7,7,7,10,22.5,30\n",
+        "hl_250,hl_500,hl_1000,hl_8000_extrapolated_flat\n10,22.5,30,30\n",
+        "hl_250,hl_500,hl_1000\n,,\n10,22.5,30\n,,\n",
+        "Frequency (Hz),Threshold (dB HL)\n1000,30\n250,10\n500,22.5\n",
     ],
 )
 def test_columns_are_found_whatever_their_order_case_and_delimiter(
@@ -61,7 +75,22 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
         ("hl_250,hl_500\n,NA\n", ["line 2", "measured"]),
         ("hl_250,hl_8000dB\n10,20\n", ["line 2", "hl_8000dB"]),
         ("hl_500,0.5 kHz\n10,20\n", ["line 2", "hl_500", "0.5 kHz"]),
-        ("0.5,1,2\n10,20,30\n", ["line 2", "multiply kHz by 1000"]),
+        ("0.5,1,2\n10,20,30\n", ["line 2", "0.5", "multiply kHz by 1000"]),
+        ("250,500,1,2,4,8\n10,20,30,40,50,60\n", ["line 2", "'1'", "multiply kHz by 1000"]),
+        ("hl_250,hl_1\n10,20\n", ["line 2", "hl_1"]),
+        ("250 Hz,2019\n10,95\n", ["line 2", "2019", "rename"]),
+        ("250 Hz,1000,30000 Hz\n10,20,30\n", ["line 2", "30000 Hz"]),
+        ("250 Hz,1,000 Hz\n10,20,30\n", ["line 2", "'1'"]),
+        ("250 Hz,4000_masked\n10,20\n", ["line 2", "4000_masked", "rename"]),
+        ("250 Hz,4000 Hz,4000_masked\n10,20,30\n", ["line 2", "4000_masked", "30"]),
+        ("250 Hz,500 Hz left/right\n10,20\n", ["line 2", "500 Hz left/right"]),
+        ("250 Hz,mean of 500 and 1000 Hz\n10,20\n", ["line 2", "mean of 500 and 1000 Hz"]),
+        ("250 Hz,R 500 Hz\n10,20\n", ["line 2", "R 500 Hz", "name the ear"]),
+        ("ear,R 500 Hz\nL,20\n", ["line 2", "'L'", "column ear"]),
+        ("frequency,threshold,subject\n500,20,A\n", ["line 2", "listener and ear", "subject"]),
+        ("frequency,threshold\n500,20\n500,30\n", ["line 3", "500 Hz", "second"]),
+        ("frequency,threshold\n500,20\n.5k,30\n", ["line 2", "same frequency"]),
+        ("frequency,threshold\n1,20\n2,30\n", ["line 2", "1 Hz"]),
     ],
 )
 def test_errors_name_the_file_and_the_cell(tmp_path: Path, text: str, words: list[str]) -> None:
@@ -90,3 +119,68 @@ def test_standard_audiograms_have_a_name_in_place_of_a_file() -> None:
 def test_the_example_table_has_the_standard_ears_that_simulators_take() -> None:
     tables = [read_audiograms(path, simulated=True) for path in (EARS_FILE, "standard")]
     assert [ear for _, ear in tables[0]] == [ear for _, ear in tables[1]]
+
+
+def test_both_ears_in_one_row_and_one_row_per_threshold(tmp_path: Path) -> None:
+    tables = {
+        "wide.csv": "Listener,L250,L1k,right_250,R 1000 Hz\nA,10,20,30,40\nB,,15,,\n",
+        "long.csv": "listener,ear,frequency,threshold\nA,L,250,10\nA,L,1k,20\nA,re,250,30\n"
+        "A,re,1000 Hz,40\nB,left,1000,15\n",
+    }
+    left, right = Audiogram((10, 20), (250, 1000)), Audiogram((30, 40), (250, 1000))
+    expected = [("A", left), ("A", right), ("B", Audiogram((15,), (1000,)))]
+    for name, text in tables.items():
+        path = tmp_path / name
+        path.write_text(text)
+        ears = read_audiograms(path)
+        assert [(text_in(row, "listener"), ear) for row, ear in ears] == expected
+        sides = [EAR_NAMES[text_in(row, "ear").lower()] for row, _ in ears]
+        assert sides == ["left", "right", "left"]
+        people = read_listeners(path)
+        assert people == {"A": Listener(left, right), "B": Listener(expected[2][1], None)}
+
+
+def test_a_data_frame_is_read_as_a_file_is() -> None:
+    pandas = pytest.importorskip("pandas")
+    columns = {"listener": ["A", "A"], "ear": ["L", "R"], 500: [20.0, None], "4 kHz": [30, 45]}
+    frame = pandas.DataFrame(columns, index=[7, 9])
+    left, right = Audiogram((20, 30), (500, 4000)), Audiogram((45,), (4000,))
+    assert [ear for _, ear in read_audiograms(frame)] == [left, right]
+    assert read_listeners(frame, ["A"]) == {"A": Listener(left, right)}
+    with pytest.raises(ValueError, match="the table: no listener 'B'"):
+        read_listeners(frame, ["B"])
+    with pytest.raises(ValueError, match="row 9: column 4 kHz is '450'"):
+        read_audiograms(frame.assign(**{"4 kHz": [30, 450]}))
+    with pytest.raises(ValueError, match="no rows"):
+        read_audiograms(frame[:0])
+    with pytest.raises(ValueError, match="ear appears twice"):
+        read_audiograms(frame.rename(columns={"listener": "ear"}))
+
+
+@pytest.mark.parametrize("columns", ["hl_500,HL_500,listener,ear", "hl_500,listener,Ear,ear"])
+def test_columns_that_differ_in_capitals_are_not_one_column(tmp_path: Path, columns: str) -> None:
+    path = tmp_path / "ears.csv"
+    path.write_text(f"{columns}\n20,60,A,L\n")
+    for read in (read_audiograms, read_listeners):
+        with pytest.raises(ValueError, match=r"line 2: columns .*same"):
+            read(path)
+
+
+def test_the_guide_reads_nhanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    pandas = pytest.importorskip("pandas")
+    guide = (ROOT / "docs/guide/ears.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(import pandas\n.*?)```", guide, re.DOTALL)
+    codes = ("500", "1K1", "2K", "3K", "4K", "6K", "8K")
+    columns = ["SEQN", "AUXU1K2R", *(f"AUXU{code}{ear}" for code in codes for ear in "LR")]
+    rows = [
+        [93703.0, 15.0, *(5.0 * n for n in range(14))],
+        [93704.0, 15.0, *([None] * 14)],
+        [93705.0, 15.0, 10.0, 666.0, *([None] * 11), 888.0],
+    ]
+    monkeypatch.setattr(pandas, "read_sas", lambda path: pandas.DataFrame(rows, columns=columns))
+    names: dict[str, dict[str, Listener]] = {}
+    exec(program, names)
+    hz = (500, 1000, 2000, 3000, 4000, 6000, 8000)
+    both = [Audiogram(tuple(5.0 * n for n in range(first, 14, 2)), hz) for first in (0, 1)]
+    expected = {"93703": Listener(*both), "93705": Listener(Audiogram((10,), (500,)), None)}
+    assert names["people"] == expected

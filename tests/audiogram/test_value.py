@@ -140,3 +140,21 @@ def test_pyclaritys_audiograms_are_ears() -> None:
     assert isinstance(theirs, clarity.Audiogram) and as_audiogram(theirs) == ear
     levels = as_thresholds([theirs, clarity.AUDIOGRAM_MILD])
     assert levels.tolist() == [list(ear.levels), [10, 15, 19, 25, 28, 31, 35, 38]]
+
+
+def test_frequencies_in_khz_are_refused() -> None:
+    for ear in ({250: 20, 1: 40}, {1: 20, 2: 30, 500: 40}, {500: 20, 48000: 30}, {0.25: 10, 8: 20}):
+        with pytest.raises(ValueError, match=r"100 to 20000 Hz.*multiply kHz by 1000"):
+            as_audiogram(ear)
+
+
+def test_a_series_is_an_ear_by_position_frequency_or_column() -> None:
+    pandas = pytest.importorskip("pandas")
+    n3 = Audiogram.standard("N3")
+    assert as_audiogram(pandas.Series(n3.levels)) == n3
+    by_hz = pandas.Series({4000: 60.0, 500: None, 1000: 40.0})
+    assert as_audiogram(by_hz) == as_audiogram({1000: 40, 4000: 60})
+    row = pandas.Series({"listener": "A", "500 Hz": 35, "4 kHz": 60.0})
+    assert as_audiogram(row) == as_audiogram({500: 35, 4000: 60})
+    with pytest.raises(ValueError, match="DataFrame"):
+        as_audiogram(pandas.DataFrame({"500 Hz": [20]}))

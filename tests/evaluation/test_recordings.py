@@ -172,7 +172,7 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
         ("before/a", "../a", "line 2: expected the path of a file below"),
         ("condition,", "treatment,", "line 2: there is no column condition, only listener, ear, "),
-        ("listener,ear", "ear,Ear", "line 1: the column ear appears twice"),
+        ("listener,ear", "ear,Ear", "line 2: the column ear appears twice"),
         (",audiogram\n", ",ear_of\n", "line 2: there is no audiogram of listener 'L1'"),
     ],
 )
@@ -410,7 +410,7 @@ def test_a_frame_of_pandas_is_a_manifest(corpus: Path) -> None:
     ]
     frame["listener"] = None
     assert {r.listener for r in read_manifest(frame, corpus)} == {""}
-    with pytest.raises(ValueError, match="got an empty DataFrame"):
+    with pytest.raises(ValueError, match="the manifest: expected a table with rows"):
         read_manifest(frame[:0])
     with pytest.raises(ValueError, match="the manifest, row 1: expected a value"):
         read_manifest(frame.assign(condition=["a", "", "b", "c", "d"]), corpus)

@@ -1,0 +1,130 @@
+"""Columns of thresholds in a table, by the names that spreadsheets and clinics use."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_HZ, LOWEST_HZ, EarName
+
+_USUAL_HZ = {
+    *(125, 250, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000, 8000),
+    *(9000, 10000, 11200, 12000, 12500, 14000, 15000, 16000, 18000, 20000),
+}
+"""Frequencies of audiometry, which may stand alone in the name of a column."""
+
+_KNOWN_WORDS = {*EAR_NAMES, "ac", "air", "conduction", "ear", "hl", "hz", "threshold"}
+
+_OTHER_LEVELS = {"bc", "bone", "extrapolated"}
+"""Words of columns that do not hold measured thresholds of air conduction."""
+
+# thousands may be separated, and a decimal comma is as good as a point
+_NAME = re.compile(
+    r"""(?P<before>\D*?)
+    (?P<number>\d{1,3}(?:[ ,.']\d{3})+(?!\d) | \d+(?:[.,]\d+)? | [.,]\d+)
+    [ ]?(?P<kilo>k?)(?P<after>.*)""",
+    re.VERBOSE,
+)
+
+
+class ThresholdColumn(NamedTuple):
+    """Meaning of a column about thresholds.
+
+    Attributes:
+        ear: Ear that the column's name mentions, or None.
+        hz: Frequency in Hz.
+        is_remark: Whether the column holds a remark on another column of this frequency.
+    """
+
+    ear: EarName | None
+    hz: float
+    is_remark: bool = False
+
+
+def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
+    """Find the columns of thresholds among the columns of a table, and the remarks on them.
+
+    A column of thresholds is called ``hl_250``, ``250``, ``250 Hz``, ``1,000 Hz`` or ``1k``, in any
+    case, perhaps with an ear, as in ``L250``, ``right_250`` or ``250 Hz (R)``. Columns such as
+    ``hl_250_masked`` are remarks on ``hl_250``. Columns of bone conduction and extrapolated levels
+    are left out, as is everything that does not look like thresholds.
+
+    Args:
+        columns: Names of all columns.
+
+    Returns:
+        The meaning of each column of thresholds or remarks, by its name.
+
+    Raises:
+        ValueError: A name looks like that of thresholds, but is not understood or has a frequency
+            below 100 or above 20000 Hz, or two columns have the same frequency and ear.
+
+    >>> threshold_columns(["name", "R 1k"])
+    {'R 1k': ThresholdColumn(ear='right', hz=1000.0, is_remark=False)}
+    """
+    meanings = {}
+    names: dict[ThresholdColumn, str] = {}
+    for column in columns:
+        meaning = _read_name(column)
+        if meaning is None:
+            continue
+        meanings[column] = meaning
+        if meaning.is_remark:
+            continue
+        if meaning in names:
+            raise ValueError(
+                f"columns {names[meaning]!r} and {column!r} have the same frequency; remove one of "
+                "them"
+            )
+        names[meaning] = column
+    measured_hz = {meaning.hz for meaning in names}
+    for column, meaning in meanings.items():
+        if meaning.hz not in measured_hz:
+            raise ValueError(
+                f"column {column!r}: expected a name such as hl_500, 500 Hz, 500 or R 500 for "
+                "thresholds; rename the column"
+            )
+    return meanings
+
+
+def _read_name(column: str) -> ThresholdColumn | None:
+    """Return the meaning of a column, or None if it has nothing to do with thresholds."""
+    name = " ".join(column.lower().replace("_", " ").split())
+    match = _NAME.match(name)
+    if match is None:
+        return None
+    before, after = (re.findall(r"[a-z]+|\d+", match[part]) for part in ("before", "after"))
+    words = {*before, *after}
+    has_hz = bool(words & {"hz", "khz"})
+    is_explicit = has_hz or before[:1] == ["hl"]
+    # "500 dB" is no frequency, but "dB HL 500" is one
+    may_have_unit = has_hz or not after
+    known = _KNOWN_WORDS | {"db", "dbhl"} if may_have_unit else _KNOWN_WORDS
+    is_known = words <= known
+    hz = _read_hz(match["number"], bool(match["kilo"]))
+    if words & _OTHER_LEVELS:
+        return None
+    begins_with_frequency = hz in _USUAL_HZ and known.issuperset(before)
+    if not (is_known or is_explicit or begins_with_frequency):
+        return None
+    ears = {EAR_NAMES[word] for word in words if word in EAR_NAMES}
+    ear = next(iter(ears), None)
+    if not is_known or len(ears) > 1:
+        return ThresholdColumn(ear, hz, is_remark=True)
+    is_frequency = is_explicit or bool(match["kilo"]) or hz in _USUAL_HZ
+    if not (is_frequency and LOWEST_HZ <= hz <= HIGHEST_HZ):
+        raise ValueError(
+            f"column {column!r}: expected a frequency from {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz, such "
+            "as 500, 1k or 1414 Hz; multiply kHz by 1000, or rename a column of other values"
+        )
+    return ThresholdColumn(ear, hz)
+
+
+def _read_hz(number: str, is_in_khz: bool) -> float:
+    """Convert the text of a frequency into a number in Hz."""
+    if is_in_khz:
+        return 1000.0 * float(number.replace(" ", "").replace(",", "."))
+    if re.fullmatch(r"\d{1,3}([ ,.']\d{3})+", number):
+        return float(re.sub(r"\D", "", number))
+    return float(number.replace(",", "."))
