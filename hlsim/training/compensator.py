@@ -57,8 +57,7 @@ class CompensatorTraining(TrainingModule):
         if not self.trains_amplification:
             network.correct.requires_grad_(False)
         elif isinstance(network, HearingAid) and not (self.denoising or self.intelligibility):
-            for part in (network.enter, network.recur, network.leave):
-                part.requires_grad_(False)
+            network.noise_reduction_network.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
