@@ -1,11 +1,11 @@
 """Checkpoints: folders in which trained models are saved, and from which they are loaded.
 
 A folder has three files: the weights (``model.safetensors``), the settings of the model with hashes
-(``config.json``) and a model card (``README.md``). A fourth file, ``model.older.safetensors``, exists
-while a model replaces an older one. The weights are those whose hash is in ``config.json``, so that
-one of the two models can be loaded at any time. No pickles are read or written, so that loading runs
-no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or ``hearing-aid``,
-says which class of model it holds.
+(``config.json``) and a model card (``README.md``). A fourth file, ``model.older.safetensors``,
+exists while a model replaces an older one. The weights are those whose hash is in ``config.json``,
+so that one of the two models can be loaded at any time. No pickles are read or written, so that
+loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or
+``hearing-aid``, says which class of model it holds.
 """
 
 import hashlib
