@@ -24,7 +24,6 @@ class WDRC(Wearable):
     and is 3 at most. The delay is 4 ms.
 
     Args:
-        audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
@@ -38,7 +37,7 @@ class WDRC(Wearable):
         ValueError: A value is out of range.
 
     >>> import hlsim
-    >>> WDRC("N3")(hlsim.example_speech()).shape
+    >>> WDRC()(hlsim.example_speech(), "N3").shape
     torch.Size([64320])
     """
 
@@ -46,7 +45,6 @@ class WDRC(Wearable):
 
     def __init__(
         self,
-        audiogram: AudiogramLike | None = None,
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
@@ -55,7 +53,7 @@ class WDRC(Wearable):
         limit_spl: float = 110.0,
         linked: bool = False,
     ) -> None:
-        super().__init__(audiogram, sample_rate, full_scale_spl, linked)
+        super().__init__(sample_rate, full_scale_spl, linked)
         check_number("attack", attack, 0.0, 1.0)
         check_number("release", release, 0.01, 2.0)
         check_number("limit_spl", limit_spl, 60.0, 140.0)
@@ -70,7 +68,7 @@ class WDRC(Wearable):
         Args:
             waveform: Input of the aid.
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform; by default those of the constructor.
+                leading dimensions of the waveform. It is required; None raises an error.
 
         Shape: (..., time) -> (..., time).
 
@@ -78,7 +76,7 @@ class WDRC(Wearable):
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes
                 do not fit.
         """
-        return self._process_signals(waveform, audiogram, ())
+        return self._process(waveform, audiogram, ())
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State

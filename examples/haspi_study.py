@@ -22,7 +22,8 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
-from hlsim.report.recordings import write_report
+from hlsim.report.recordings_page import write_report
+from hlsim.report.verdict import verdict
 
 SPL = 65.0
 SECONDS = 3.0
@@ -91,11 +92,12 @@ def main() -> None:
         audiograms=audiograms,
         measures=("haspi", "stoi"),
         store=out / "report" / "scores.jsonl",
+        listen=3,
         jobs=1,
         progress=lambda done, total: print(f"\r{done} of {total} values", end="", file=sys.stderr),
     )
     assert report.headline is not None
-    print(report.headline.verdict())
+    print(verdict(report.headline))
     print(write_report(report, out / "report"))
 
 

@@ -66,7 +66,7 @@ from hlsim.data.augment import mix
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.data.clips import Clips
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.aids import AtLevelOf, EqualiserLike, Unaided
+from hlsim.evaluation.conditions import AtLevelOf, EqualiserLike, Unaided
 from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study

@@ -46,7 +46,7 @@ def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
         target = folder / path.relative_to(speech_dir)
         target.parent.mkdir(parents=True, exist_ok=True)
         soundfile.write(target, samples[rate // 2 : rate // 2 + rate], rate)
-    with patch("hlsim.cli.demo_study.SPEECH", folder):
+    with patch("hlsim.data.bundled.SPEECH", folder):
         return run_demo(folder / "out", Audiogram.standard("N4"), steps=steps, jobs=1)
 
 

@@ -16,7 +16,7 @@ def test_simulators_are_compared_without_pesq(
     for module in ("joblib", "matplotlib", "pandas", "pystoi"):
         pytest.importorskip(module)
     from hlsim.evaluation.simulators import agreement, evaluate_simulators
-    from hlsim.report.simulators import simulators_page
+    from hlsim.report.simulators_page import simulators_page
 
     monkeypatch.setitem(sys.modules, "pesq", None)
     ears = write_ears(tmp_path / "ears.csv", "N3")

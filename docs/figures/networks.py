@@ -34,7 +34,7 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
-from hlsim.evaluation.aids import AtLevelOf
+from hlsim.evaluation.conditions import AtLevelOf
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.study import Measure, run_study
 from hlsim.losses.waveform import noise_to_signal_db

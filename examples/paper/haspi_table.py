@@ -20,10 +20,11 @@ from compensators import load_compensator
 from hlsim.audio import write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE
+from hlsim.cli.progress import show_progress
 from hlsim.data.layouts import find_corpus
 from hlsim.evaluation import haspi_report
-from hlsim.progress import show_progress
-from hlsim.report.recordings import write_report
+from hlsim.report.recordings_page import write_report
+from hlsim.report.verdict import verdict
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -75,8 +76,8 @@ def main(arguments: list[str] | None = None) -> None:
         progress=show_progress("values"),
     )
     assert report.headline is not None
-    print(report.headline.verdict())
-    print(write_report(report, out / "report", listen=0))
+    print(verdict(report.headline))
+    print(write_report(report, out / "report"))
 
 
 def write_table(path: Path, rows: list[dict[str, str]]) -> None:

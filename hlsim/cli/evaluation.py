@@ -21,7 +21,7 @@ from hlsim.cli.options import (
     seed,
     sound_level,
 )
-from hlsim.progress import show_progress
+from hlsim.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from hlsim.evaluation.result import Evaluation
@@ -58,7 +58,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     check_extras("eval")
     from compensators import load_compensator
     from hlsim.evaluation.simulators import evaluate_simulators
-    from hlsim.report.simulators import simulators_page
+    from hlsim.report.simulators_page import simulators_page
     from hlsim.simulators import load_simulator
 
     simulators = {
@@ -95,7 +95,7 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     check_extras("eval")
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
-    from hlsim.report.compensators import compensators_page
+    from hlsim.report.compensators_page import compensators_page
 
     checkpoints = _read_labels(options.names)
     arguments = _arguments(options, evaluate_compensators)
@@ -139,7 +139,7 @@ def haspi_report(parser: Parser) -> None:
 def _haspi_report(options: argparse.Namespace) -> None:
     check_extras("eval")
     from hlsim.evaluation.recordings import haspi_report
-    from hlsim.report.recordings import report_page
+    from hlsim.report.recordings_page import report_page
 
     evaluation = haspi_report(**_arguments(options, haspi_report))
     _finish(evaluation, report_page(evaluation), options)
@@ -180,11 +180,10 @@ def clarity(parser: Parser) -> None:
 def _clarity(options: argparse.Namespace) -> None:
     check_extras("eval")
     from hlsim.evaluation.clarity import evaluate_scenes
-    from hlsim.report.recordings import scenes_page, write_scores
+    from hlsim.report.recordings_page import scenes_page
 
     arguments = _arguments(options, evaluate_scenes)
     evaluation = evaluate_scenes(_read_labels(options.names), **arguments)
-    write_scores(evaluation, options.out)
     _finish(evaluation, scenes_page(evaluation), options)
 
 
@@ -253,6 +252,7 @@ def _arguments(options: argparse.Namespace, evaluate: Callable[..., Evaluation])
         "audiogram": read_ears(options) if "audiogram" in options else None,
         "measures": [*getattr(options, "measures", []), *options.own_measures],
         "store": options.out / "scores.jsonl",
+        "listen": 3,
     }
     running = {"jobs": options.jobs, "dask": options.dask, "progress": show_progress("scores")}
     return {name: values[name] for name in parameters if name in values} | running
@@ -260,9 +260,9 @@ def _arguments(options: argparse.Namespace, evaluate: Callable[..., Evaluation])
 
 def _finish(evaluation: Evaluation, page: Page, options: argparse.Namespace) -> None:
     """Write the page of an evaluation, and print its verdict and its first table."""
-    from hlsim.report.page import write_page
+    from hlsim.report.writing import write_results
 
-    path = write_page(page, evaluation.to_dict(), options.out)
+    path = write_results(page, evaluation, options.out)
     tables = [table for section in page.sections for table in section.tables]
     print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path.as_uri()}")
     failed = len(evaluation.failures)

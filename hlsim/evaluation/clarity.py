@@ -27,8 +27,7 @@ from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
 from hlsim.checks import reject_duplicates
 from hlsim.evaluation.aid_properties import measure_look_ahead
-from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
-from hlsim.evaluation.conditions import NAL_R, UNAIDED
+from hlsim.evaluation.conditions import NAL_R, UNAIDED, Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.recorded_items import Recording
 from hlsim.evaluation.recordings import score_recordings
@@ -93,6 +92,7 @@ def evaluate_scenes(
     linked: bool = False,
     full_scale_spl: float = FULL_SCALE_SPL,
     seed: int = 0,
+    listen: int = 0,
     **running: Any,
 ) -> Evaluation:
     """Compare aids of both ears with no aid and NAL-R on binaural scenes, by HASPI and HASQI.
@@ -122,12 +122,14 @@ def evaluate_scenes(
         linked: Whether one level sets the gains of both ears, in compensators that support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI and HASQI add.
+        listen: Number of scenes with sounds for the players of a page, as an ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
 
     Returns:
-        The evaluation of all conditions, ``unaided`` first. Its ``details["look_ahead_ms"]`` has
+        The evaluation of all conditions, ``unaided`` first. The column ``combined`` of its table is
+        the mean of HASPI and HASQI. Its ``details["look_ahead_ms"]`` has
         the measured look-ahead by condition, and None for an aid that fails on the first pair.
 
     Raises:
@@ -157,10 +159,17 @@ def evaluate_scenes(
         names,
         better_ear=True,
         planned=[("haspi", NAL_R, c.name) for c in conditions if c.kind == "aid"],
+        listen=listen,
+        played=[UNAIDED, NAL_R, *(c.name for c in conditions if c.kind == "aid")],
         store=Path(out) / "scores.jsonl",
         **running,
     )
-    return replace(evaluation, details={"look_ahead_ms": look_ahead_ms})
+    combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
+    return replace(
+        evaluation,
+        table=evaluation.table.assign(combined=combined),
+        details={"look_ahead_ms": look_ahead_ms},
+    )
 
 
 def _read_pairs(

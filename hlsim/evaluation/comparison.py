@@ -1,4 +1,4 @@
-"""Comparisons of two conditions by one measure, over the items of a study, and in sentences."""
+"""Comparisons of two conditions by one measure, over the items of a study."""
 
 from __future__ import annotations
 
@@ -16,12 +16,6 @@ from hlsim.evaluation.statistics import PairedComparison, holm, paired_compariso
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-_ALPHA = 0.05
-"""p value below which a change is called significant."""
-
-_LEVEL_TOLERANCE_DB = 1.0
-"""Change of the level in dB that is too small to explain a change of a score."""
 
 PlannedComparison = tuple[str, str, str]
 """A comparison that was planned before the scores were known: measure and both conditions."""
@@ -53,8 +47,8 @@ class Comparison:
     >>> import pandas
     >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
     >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
-    >>> compare(table, ["haspi"])[0].verdict()[:52]
-    'b cannot be distinguished from a: HASPI 0.400 agains'
+    >>> round(compare(table, ["haspi"])[0].overall.delta, 3)
+    0.1
     """
 
     measure: str
@@ -77,94 +71,9 @@ class Comparison:
         return column_title(self.measure)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes, and ``verdict`` and ``limits`` as text, for ``report.json``."""
+        """Return the attributes for ``report.json``."""
         level_change = None if math.isnan(self.level_change) else self.level_change
-        words = f"{self.verdict()} {self.limits()}"
-        return asdict(self) | {"level_change": level_change, "in_words": words}
-
-    def verdict(self, subject: str = "", rival: str = "") -> str:
-        """Return a sentence that says which condition is better, with scores and p values.
-
-        A higher score is called better only at equal level, because HASPI rewards gain.
-
-        Args:
-            subject: Other words for the condition ``after``, which begin the sentence.
-            rival: Other words for the condition ``before``.
-        """
-        c = self.overall
-        rises = c.delta > 0
-        significant = self._significant_tests()
-        if not any(significant):
-            verb = "cannot be distinguished from"
-        elif abs(self.level_change) < _LEVEL_TOLERANCE_DB:
-            verb = "is" if all(significant) else "may be"
-            verb += " better than" if rises else " worse than"
-        else:
-            verb = "scores" if all(significant) else "may score"
-            verb += " higher than" if rises else " lower than"
-        text = f"{subject or self.after} {verb} {rival or self.before}"
-        if abs(self.level_change) >= _LEVEL_TOLERANCE_DB:
-            direction = "softer" if self.level_change > 0 else "louder"
-            text += f", which is {abs(self.level_change):.1f} dB {direction}"
-        facts = f"{_count_items(c.n)}, change {c.delta:+.3f}"
-        if c.ci_low is not None:
-            facts += f", 95 % interval {c.ci_low:+.3f} to {c.ci_high:+.3f}"
-        means = f"{self.title} {c.after_mean:.3f} against {c.before_mean:.3f}"
-        return f"{text}: {means} ({facts}; {self._describe_tests()})."
-
-    def limits(self) -> str:
-        """Return sentences on output levels, dependent items and other limits of the verdict."""
-        sentences = []
-        change, delta = self.level_change, self.overall.delta
-        if not math.isnan(change):
-            sentences.append(f"The mean level changed by {change:+.1f} dB.")
-        may_be_gain = change * delta > 0 and abs(change) >= _LEVEL_TOLERANCE_DB
-        if self.measure == "haspi" and may_be_gain and any(self._significant_tests()):
-            sentences.append("HASPI rewards gain, which alone may explain the change.")
-        sentences.append(self._describe_units())
-        if self.left_out:
-            sentences.append(f"{_count_items(self.left_out)} without both scores are left out.")
-        sentences.append(
-            f"{self.title} is the prediction of a model: no listener was asked, and other speech "
-            "and other ears may give other results."
-        )
-        return " ".join(sentences)
-
-    def _describe_tests(self) -> str:
-        """State the p values, which are the same wherever the comparison appears."""
-        tests = {"t-test": self.p_t, "Wilcoxon": self.p_w}
-        stated = [f"{name} {format_p(p)}" for name, p in tests.items() if p is not None]
-        if not stated:
-            return "neither test is defined"
-        if self.planned:
-            stated.append("planned comparison, not adjusted")
-        elif self.family > 1:
-            stated.append(f"adjusted by Holm for {self.family} comparisons")
-        return ", ".join(stated)
-
-    def _significant_tests(self) -> list[bool]:
-        """Return for each test that can decide whether its p value is below ``_ALPHA``.
-
-        With few items, Wilcoxon's p exceeds ``_ALPHA`` even if all pairs change alike.
-        """
-        decisions = [] if self.p_t is None else [self.p_t < _ALPHA]
-        lowest_p = self.family * 2.0 ** (1 - (self.overall.n - self.overall.zeros))
-        if self.p_w is not None and (self.p_w < _ALPHA or lowest_p < _ALPHA):
-            decisions.append(self.p_w < _ALPHA)
-        return decisions
-
-    def _describe_units(self) -> str:
-        means = self.unit_means
-        if means is None:
-            return (
-                "The tests treat items as independent. If several share a talker or a listener, p "
-                "is too small and the interval too narrow."
-            )
-        result = "is not defined" if means.p_t is None else f"gives {format_p(means.p_t)}"
-        return (
-            "The interval and the tests treat items as independent, although several share one "
-            f"{self.unit}; the t-test over the means of the {means.n} {self.unit}s {result}."
-        )
+        return asdict(self) | {"level_change": level_change}
 
 
 def compare(
@@ -184,7 +93,7 @@ def compare(
             condition with every earlier one.
         planned: Comparisons that were planned before the scores were known. The p values of all
             other comparisons by the same measure are adjusted by Holm.
-        unit: Column that several items share, such as ``"listener"``; their means are compared too.
+        unit: Column that groups items, such as ``"listener"``. The group means are tested as well.
 
     Returns:
         The comparisons of each measure in turn. A pair is left out if no item has both scores.
@@ -269,16 +178,3 @@ def _compare_units(
         return None
     means = [[scores[units == name].mean() for name in names] for scores in (first, second)]
     return paired_comparison(*means)
-
-
-def format_p(p: float) -> str:
-    """Return a p value as reports state it: with five decimals, or as ``p < 0.00001``.
-
-    >>> format_p(0.0125)
-    'p = 0.01250'
-    """
-    return "p < 0.00001" if p < 1e-5 else f"p = {p:.5f}"
-
-
-def _count_items(count: int) -> str:
-    return "1 item" if count == 1 else f"{count} items"

@@ -21,12 +21,21 @@ from hlsim.evaluation.aid_properties import (
     measure_steady_tones,
     measure_wearability,
 )
-from hlsim.evaluation.aids import AtLevelOf, Enhanced, EqualiserLike, Unaided, load_enhancers
 from hlsim.evaluation.comparison import compare
-from hlsim.evaluation.conditions import COMPRESSION, NAL_R, UNAIDED
+from hlsim.evaluation.conditions import (
+    COMPRESSION,
+    NAL_R,
+    UNAIDED,
+    AtLevelOf,
+    Enhanced,
+    EqualiserLike,
+    Unaided,
+    load_enhancers,
+)
 from hlsim.evaluation.items import INPUT_LEVELS, draw_aid_items, ear_name, read_ears
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.sounds import perceive_items
 from hlsim.evaluation.study import Condition
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
@@ -54,6 +63,7 @@ def evaluate_compensators(
     levels: Sequence[float] = INPUT_LEVELS,
     gain_ears: Sequence[str] = ("N3", "S2"),
     seed: int = 0,
+    listen: int = 0,
     **running: Any,
 ) -> Evaluation:
     """Compare compensators with no aid, NAL-R and WDRC, and with two rivals at their output level.
@@ -85,6 +95,7 @@ def evaluate_compensators(
         levels: Levels of the clean speech in dB SPL, in turn.
         gain_ears: Names of the standard ears for gain curves and steady tones.
         seed: Seed of all random draws.
+        listen: Number of items with sounds for the players of a page, as the ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
@@ -154,7 +165,11 @@ def evaluate_compensators(
     table = evaluation.table
     relative_loss = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0)
     evaluation = replace(evaluation, table=table.assign(gap=relative_loss - 1.0), details=details)
-    return replace(evaluation, groups=_make_groups(evaluation))
+    groups = _make_groups(evaluation)
+    same_level = next(c.name for c in conditions if c.kind == "same level")
+    first_group = next(group for name, group in groups.items() if name != "hard")
+    sounds = perceive_items(first_group, listen, [UNAIDED, same_level, *evaluation.aids])
+    return replace(evaluation, groups=groups, sounds=sounds)
 
 
 def _make_conditions(

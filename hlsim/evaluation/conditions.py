@@ -1,16 +1,239 @@
-"""Names of the conditions that several studies and their pages share."""
+"""Conditions: no aid, an equaliser, an aid at another's level, your own, and their names.
+
+A hearing aid is a function or module ``(waveform, ear) -> waveform``.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.signal import firwin2
+from torch import Tensor, nn
+
+from hlsim.audio import read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.data.bundled import EXAMPLE_FILE
+from hlsim.dsp.fir import filter_without_delay
+from hlsim.evaluation.aid_properties import measure_gain_curve
+from hlsim.metrics.band_levels import band_centres
+from hlsim.plugins import WaveformPlugin
 
 UNAIDED = "unaided"
-"""No aid: the output is the input."""
+"""Name of the condition without an aid."""
 
 NAL_R = "NAL-R"
-"""The linear prescription NAL-R."""
+"""Name of the linear prescription NAL-R."""
 
 COMPRESSION = "WDRC"
-"""The wide dynamic range compressor."""
+"""Name of wide dynamic range compression with its default settings."""
 
 BEFORE, AFTER = "before", "after"
-"""Recorded speech before and after a treatment."""
+"""Names of recorded speech before and after a treatment."""
 
 NAL_R_AT_LEVEL, TRAINED = "NAL-R, same level", "trained aid"
-"""NAL-R at the output level of the aid that the demo trains, and this aid."""
+"""Names of NAL-R at the output level of the aid that the demo trains, and of this aid."""
+
+_EQUALISER_TAPS = 513
+"""Number of taps of an equaliser, which gives it a resolution of 31 Hz at 16 kHz."""
+
+_LOWEST_GAIN_DB = -100.0
+"""Lowest gain of an equaliser in dB."""
+
+_GAINS: dict[tuple[str, Audiogram], list[float]] = {}
+"""Gains in dB that equalisers have measured in this process, by equaliser and ear.
+
+Processes receive copies of an equaliser with each item, so that a copy cannot store its gains.
+"""
+
+
+class Unaided(nn.Module):
+    """Condition without a hearing aid: the output is the input.
+
+    >>> Unaided()(torch.ones(2), Audiogram.standard("N3"))
+    tensor([1., 1.])
+    """
+
+    def forward(self, waveform: Tensor, ear: Any) -> Tensor:
+        """Return the waveform as it is."""
+        return waveform
+
+
+class AtLevelOf(nn.Module):
+    """Hearing aid whose output is scaled to the RMS level of another aid's output.
+
+    Both aids process the same input. HASPI rewards any gain, so that aids are compared at equal
+    level.
+
+    Args:
+        aid: The aid whose output is returned.
+        other: The aid whose level the output gets.
+
+    >>> AtLevelOf(Unaided(), Unaided())(torch.ones(2), Audiogram.standard("N3"))
+    tensor([1., 1.])
+    """
+
+    def __init__(self, aid: nn.Module, other: nn.Module) -> None:
+        super().__init__()
+        self.aid, self.other = aid, other
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        """Return the output of ``aid`` at the RMS level of the output of ``other``.
+
+        Samples after the end of the waveform do not count, because a study does not score them.
+        """
+        time = waveform.shape[-1]
+        level = level_spl(self.other(waveform, audiogram)[..., :time])
+        return set_level(self.aid(waveform, audiogram)[..., :time], level)
+
+
+class EqualiserLike(nn.Module):
+    """Linear filter with the mean gain that a hearing aid has for speech, measured for each ear.
+
+    The filter is used as a condition: if the aid has a higher score, the reason is not its mean
+    gain.
+
+    Args:
+        aid: The aid whose gain is measured.
+        utterances: Speech at 16 kHz with which the gain is measured. Shape: (utterances, time).
+        levels: Levels of the speech in dB SPL, over which the gain in dB is averaged.
+
+    >>> equaliser = EqualiserLike(Unaided(), torch.randn(1, 16000), (65.0,))
+    >>> max(equaliser.gains_db(Audiogram.standard("N3")))
+    0.0
+    """
+
+    utterances: Tensor
+
+    def __init__(self, aid: nn.Module, utterances: Tensor, levels: Sequence[float]) -> None:
+        super().__init__()
+        self.aid, self.levels = aid, tuple(levels)
+        self.register_buffer("utterances", utterances, persistent=False)
+        self._identifier = uuid.uuid4().hex  # the same in every process that receives a copy
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        """Filter a waveform at 16 kHz with the aid's mean gain for an ear.
+
+        The gains of an ear are measured once per process.
+        """
+        key = self._identifier, audiogram
+        if key not in _GAINS:
+            _GAINS[key] = self.gains_db(audiogram)
+        return _equalise_bands(waveform, _GAINS[key])
+
+    def gains_db(self, audiogram: Audiogram) -> list[float]:
+        """Measure the aid's mean gain for an ear, in dB, rounded to 0.1 dB, in 24 bands.
+
+        The bands are those of ``measure_gain_curve``. The lowest gain is -100 dB.
+        """
+        curve = measure_gain_curve(self.aid, audiogram, self.utterances, self.levels)
+        mean = np.mean(curve["gain_db"], 0).clip(_LOWEST_GAIN_DB, None)
+        return [round(gain, 1) for gain in mean.tolist()]
+
+
+def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
+    """Filter a waveform at 16 kHz with linear phase and without delay.
+
+    Args:
+        waveform: Signals with shape (..., time).
+        gains_db: Gains in dB at the 24 frequencies of ``band_centres``.
+    """
+    hertz = np.linspace(0.0, NEURO_RATE / 2.0, _EQUALISER_TAPS)
+    gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
+    taps = firwin2(_EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
+    return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
+
+
+class PluginAid(nn.Module):
+    """Hearing aid for two ears that a user has written as a function, which is loaded by its name.
+
+    Args:
+        name: ``package.module:name`` or ``path/to/file.py:name`` of a function ``(waveform,
+            listener, sample_rate) -> waveform``.
+        sample_rate: Sample rate in Hz with which the function is called.
+
+    >>> PluginAid("builtins:max", 16000)
+    PluginAid()
+    """
+
+    def __init__(self, name: str, sample_rate: int) -> None:
+        super().__init__()
+        self.plugin = WaveformPlugin(name, "aid")
+        self.sample_rate = sample_rate
+
+    def forward(self, waveform: Tensor, listener: Any) -> Tensor:
+        """Call the user's function.
+
+        Args:
+            waveform: Signals at the left and the right ear. Shape: (2, time).
+            listener: Audiograms of both ears, an ``hlsim.Listener``.
+
+        Returns:
+            Outputs for both ears. Shape: (2, time), where ``time`` may differ from the input's.
+        """
+        return self.plugin(waveform, listener, self.sample_rate)
+
+
+class Enhanced(nn.Module):
+    """Hearing aid behind an enhancer, which reduces the noise of the aid's input.
+
+    Args:
+        enhancer: Function ``(waveform, sample_rate) -> waveform`` for signals in pascals.
+        aid: The aid.
+        sample_rate: Sample rate of all signals in Hz.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0 in the inputs and outputs.
+
+    >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
+    >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
+    tensor([16000., 16000.])
+    """
+
+    def __init__(
+        self,
+        enhancer: WaveformPlugin,
+        aid: nn.Module,
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
+    ) -> None:
+        super().__init__()
+        self.enhancer, self.aid, self.sample_rate = enhancer, aid, sample_rate
+        self.gain = gain_to_pascals(full_scale_spl)
+
+    def forward(self, waveform: Tensor, ear: Any) -> Tensor:
+        """Enhance the waveform, and return the aid's output for the result, (..., time)."""
+        enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
+        aided: Tensor = self.aid(enhanced, ear)
+        return aided
+
+
+def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
+    """Load functions ``(waveform, sample_rate) -> waveform`` that reduce noise for hearing aids.
+
+    They process signals in pascals with shape (..., time), and are tried on two seconds of speech.
+
+    Args:
+        names: ``package.module:name`` or ``path/to/file.py:name`` of each function.
+
+    Returns:
+        The enhancers, each under the name of its function, the part of its name after the colon, or
+        under its whole name if another function has this name.
+
+    Raises:
+        ValueError: An enhancer cannot be loaded, or its output for speech is not a waveform or not
+            time-aligned.
+
+    >>> load_enhancers([])
+    {}
+    """
+    speech = set_level(read_audio(EXAMPLE_FILE)[0][0, : 2 * NEURO_RATE], 65.0)
+    enhancers: dict[str, WaveformPlugin] = {}
+    for name in names:
+        enhancer = WaveformPlugin(name, "enhancer")
+        enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
+        label = name.rpartition(":")[2]
+        enhancers[name if label in enhancers else label] = enhancer
+    return enhancers

@@ -29,7 +29,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, EARS
-from hlsim.audiogram.table import read_audiograms, read_listeners, read_rows
+from hlsim.audiogram.table import read_audiograms, read_listeners, read_rows, text_in
 from hlsim.audiogram.value import convert_at, ears_in_row
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.running.fingerprint import value_hash
@@ -266,19 +266,19 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
     >>> read_named_ears("standard")[0]
     ('N1', '', Audiogram('N1'))
     """
-    if str(audiograms).lower().endswith(".json"):
+    is_file = isinstance(audiograms, str | Path)
+    if is_file and str(audiograms).lower().endswith(".json"):
         listeners = read_listeners(audiograms).items()
         return [(name, side, ear) for name, both in listeners for side, ear in both.ears().items()]
     ears = []
     for number, (row, audiogram) in enumerate(read_audiograms(audiograms), start=1):
-        columns = {column.lower(): text for column, text in row.items()}
-        side = EAR_NAMES.get(columns.get("ear", "").lower(), "")
-        ears.append((columns.get("listener") or f"row {number}", side, audiogram))
+        side = EAR_NAMES.get(text_in(row, "ear").lower(), "")
+        ears.append((text_in(row, "listener") or f"row {number}", side, audiogram))
     names = [(listener, side) for listener, side, _ in ears]
     for listener, side in names:
         if names.count((listener, side)) > 1:
             raise ValueError(
-                f"{audiograms}: expected one row for each ear, got several of listener "
+                f"{audiograms if is_file else 'the table'}: expected one row for each ear, got several of listener "
                 f"{listener!r}, ear {side!r}; name the listener and the ear of each row"
             )
     return ears

@@ -21,6 +21,7 @@ from hlsim.evaluation.recorded_items import (
     read_named_ears,
 )
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.sounds import perceive_items
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
 
@@ -51,6 +52,7 @@ def haspi_report(
     full_scale_spl: float = 94.0,
     spl: float | None = None,
     seed: int = 0,
+    listen: int = 0,
     **running: Any,
 ) -> Evaluation:
     """Score recorded speech by HASPI v2 and other measures, and compare its conditions.
@@ -83,6 +85,7 @@ def haspi_report(
         spl: Level of every clean file in dB SPL over all its channels, which have one gain; it
             replaces ``full_scale_spl``.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
+        listen: Number of items with sounds for the players of a page, as the ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
@@ -128,6 +131,7 @@ def haspi_report(
         baseline=baseline,
         better_ear=better_ear,
         store=store,
+        listen=listen,
         **running,
     )
 
@@ -177,6 +181,8 @@ def score_recordings(
     baseline: str | None = None,
     better_ear: bool = False,
     planned: Sequence[PlannedComparison] = (),
+    listen: int = 0,
+    played: Sequence[str] = (),
     **running: Any,
 ) -> Evaluation:
     """Score recordings and compare their conditions.
@@ -189,6 +195,8 @@ def score_recordings(
         better_ear: Whether to use the better ear's score of each utterance.
         planned: Planned comparisons; by default that of the first with the last condition by the
             first measure.
+        listen: Number of items with sounds.
+        played: Names of the conditions with sounds, by default all.
         running: Argument ``store``, a file of scores or None, and the arguments ``jobs``, ``dask``
             and ``progress`` of ``run_study``.
 
@@ -219,7 +227,8 @@ def score_recordings(
         evaluation.check_scores()
     planned = planned or [(scores[0], evaluation.names[0], evaluation.names[-1])]
     comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
-    return replace(evaluation, comparisons=comparisons)
+    evaluation = replace(evaluation, comparisons=comparisons)
+    return replace(evaluation, sounds=perceive_items(evaluation, listen, played))
 
 
 def _pair_ears(recordings: Sequence[Recording]) -> list[int]:

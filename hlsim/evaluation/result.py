@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
+from hlsim.audiogram import Audiogram
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Measure, Source, run_measures
@@ -19,6 +21,38 @@ from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+
+@dataclass(frozen=True)
+class ItemSounds:
+    """Sounds of one item, in pascals.
+
+    Attributes:
+        name: Name of the item.
+        ear: The audiogram.
+        sample_rate: Sample rate in Hz.
+        groups: Signals by label, for each group by its heading, which may be empty. Shape of each
+            signal: (time,).
+        failures: Reason for each label without a sound.
+        facts: Columns of the table that describe the item.
+        change: Change of the score between the two conditions of the headline comparison; None if
+            items are not ranked by it.
+        rank: Place of the item in the order of the changes, from 1, and the number of items.
+
+    >>> import torch
+    >>> signals = {"tone": torch.ones(8)}
+    >>> ItemSounds("s01", Audiogram.standard("N3"), 16000, {"": signals}).failures
+    {}
+    """
+
+    name: str
+    ear: Audiogram
+    sample_rate: int
+    groups: Mapping[str, Mapping[str, Tensor]]
+    failures: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    change: float | None = None
+    rank: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -38,6 +72,7 @@ class Evaluation:
             its name.
         groups: The same evaluation for a part of the items, such as noisy speech, by the name of
             the part.
+        sounds: Sounds of some items, for the players of a page.
 
     >>> import pandas
     >>> table = pandas.DataFrame({"item": [0], "condition": ["aid"], "haspi": [0.5]})
@@ -54,6 +89,7 @@ class Evaluation:
     notes: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
     groups: Mapping[str, Evaluation] = field(default_factory=dict)
+    sounds: Sequence[ItemSounds] = ()
 
     @classmethod
     def run(

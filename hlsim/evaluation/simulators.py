@@ -22,8 +22,9 @@ from hlsim.checks import loud_outputs
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
 from hlsim.evaluation.measures import load_measure
-from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.evaluation.running.fingerprint import fingerprint
+from hlsim.evaluation.sounds import try_conditions
 from hlsim.evaluation.study import Condition, Item, Measure, Values
 from hlsim.extras import is_installed
 from hlsim.metrics import fidelity
@@ -48,6 +49,7 @@ def evaluate_simulators(
     inputs: Sequence[str] = ("as-is",),
     compensator: nn.Module | None = None,
     seed: int = 0,
+    listen: int = 0,
     **running: Any,
 ) -> Evaluation:
     """Compare simulators with a teacher, whose output they should match: the exact MSBG by default.
@@ -74,6 +76,7 @@ def evaluate_simulators(
             ``"compensated"`` (by ``compensator``).
         compensator: Module of the treatment ``"compensated"``.
         seed: Seed of all random draws.
+        listen: Whether (1) or not (0) an item has sounds for the player of a page.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
@@ -117,7 +120,8 @@ def evaluate_simulators(
         part = evaluation.table[evaluation.table["treatment"] == treatment]
         comparisons = compare(part, ["snr"], baseline=evaluation.names[0])
         groups[treatment] = replace(evaluation, table=part, comparisons=comparisons)
-    return replace(evaluation, groups=groups)
+    evaluation = replace(evaluation, groups=groups)
+    return replace(evaluation, sounds=[_example_sounds(evaluation)] if listen else [])
 
 
 def _teacher_output(teacher: nn.Module, item: Item) -> Tensor:
@@ -189,26 +193,17 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
     }
 
 
-def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
-    """Return an item to be played on the page, and the teacher's output for it.
+def _example_sounds(evaluation: Evaluation) -> ItemSounds:
+    """Return the sounds of an item: input, and outputs of the teacher and of the simulators.
 
     The item has the first treatment and, of the items with this treatment, the highest level.
-
-    Args:
-        evaluation: Evaluation of ``evaluate_simulators``.
-
-    Returns: The item, and the output with shape (time,) at 16 kHz.
-
-    >>> from hlsim import MSBG
-    >>> from hlsim.data.bundled import EXAMPLE_FILE
-    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
-    >>> evaluation = evaluate_simulators(
-    ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
-    ... )
-    >>> item, expected = example_item(evaluation)
-    >>> item.name, expected.shape
-    ('item 0', torch.Size([16000]))
     """
     rows = next(iter(evaluation.groups.values())).table.dropna(subset="snr")
     item = evaluation.items[rows["item"][rows["input_level"].idxmax()]].load()
-    return item, _teacher_output(load_simulator(evaluation.settings["teacher"]), item)
+    expected = _teacher_output(load_simulator(evaluation.settings["teacher"]), item)
+    outputs, failures = try_conditions(evaluation.conditions, lambda c: c.output(item))
+    signals = {"input": item.signal, "teacher": expected, **outputs}
+    # A short clip is filled up with silence.
+    end = int(item.signal.nonzero().max()) + item.sample_rate // 10
+    groups = {"": {name: signal[:end] for name, signal in signals.items()}}
+    return ItemSounds(item.name, item.ear, item.sample_rate, groups, failures, item.facts)

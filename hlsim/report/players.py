@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from hlsim.audio import encode_flac
-from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl
-from hlsim.evaluation.measures import NORMAL, perceive
-from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.running.parallel import describe_error
+from hlsim.calibration import PASCAL_SPL, level_spl
+from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.extras import require
 from hlsim.report.page import (
     SPECTROGRAM_COLOURS,
@@ -23,12 +21,6 @@ from hlsim.report.page import (
     Section,
     Sound,
 )
-
-_LONGEST_SECONDS = 8.0
-"""Length in seconds after which an item is cut on a page."""
-
-NORMAL_EAR = "normal ear (the goal)"
-"""Label of clean speech as a normal ear perceives it."""
 
 _PEAK = 0.9  # largest sample of the sounds of a group
 _HIGHEST_HZ = 8000.0  # at which MSBG and HASPI end
@@ -39,80 +31,37 @@ _EXPLANATION = (
 )
 
 
-def listening_sections(
-    evaluation: Evaluation, count: int, conditions: Sequence[str] = ()
-) -> list[Section]:
-    """Return the section "Listen" of a page, with one player per item.
-
-    Items are ranked by how much their score changes between the two conditions of the evaluation's
-    headline comparison, largest gain first. The items of the section are evenly spaced in this
-    ranking. A player has what a normal ear perceives of the clean speech, and what the impaired ear
-    perceives under each condition.
+def listening_sections(evaluation: Evaluation) -> list[Section]:
+    """Return the section "Listen" of a page, with one player per item that has sounds.
 
     Args:
         evaluation: The evaluation of the page.
-        count: Number of items in the section.
-        conditions: Names of the conditions to be played; all of them if empty.
 
-    Returns: The section, or an empty list if there is no comparison or ``count`` is 0.
+    Returns: The section, or an empty list if no item has sounds.
 
-    >>> import pandas
     >>> from hlsim import Audiogram
-    >>> from hlsim.evaluation import Condition, Item, compare
-    >>> speech = torch.randn(8000, generator=torch.Generator().manual_seed(0))
-    >>> item = Item("s01", speech, speech, Audiogram.standard("N3"))
-    >>> conditions = [Condition(name, lambda signal, ear: signal) for name in "ab"]
-    >>> rows = [(0, "s01", "a", 0.2), (0, "s01", "b", 0.4)]
-    >>> table = pandas.DataFrame(rows, columns=["item", "name", "condition", "haspi"])
-    >>> evaluation = Evaluation([item], conditions, [], table, compare(table, ["haspi"]))
-    >>> (section,) = listening_sections(evaluation, count=1)
+    >>> from hlsim.evaluation.result import ItemSounds
+    >>> signals = {"a": torch.randn(8000, generator=torch.Generator().manual_seed(0))}
+    >>> sounds = ItemSounds("s01", Audiogram.standard("N3"), 16000, {"": signals})
+    >>> (section,) = listening_sections(Evaluation([], [], [], None, sounds=[sounds]))
     >>> [sound.label for sound in section.sections[0].player.sounds]
-    ['normal ear (the goal)', 'a', 'b']
+    ['a']
     """
-    headline = evaluation.headline
-    if headline is None or not count:
-        return []
-    scores = evaluation.wide(headline.measure)
-    changes = (scores[headline.after] - scores[headline.before]).dropna()
-    changes = changes.sort_values(ascending=False, kind="stable")
-    places = np.linspace(0, len(changes) - 1, min(count, len(changes))).round().astype(int)
-    rows = evaluation.table.drop_duplicates("item").set_index("item")
-    names = conditions or evaluation.names
-    sections = []
-    for place in places.tolist():
-        row, change = rows.loc[changes.index[place]], changes.iloc[place]
-        rank = f"change {change:+.3f}, rank {place + 1} of {len(changes)}"
-        title = f"{row['name']} ({headline.title}: {rank})"
-        try:
-            number = int(row.get("source", row.name))
-            sections.append(_item_section(evaluation, number, title, names))
-        except Exception as error:  # A sound that cannot be played must not cost the page.
-            sections.append(Section(title, [f"It cannot be played: {describe_error(error)}"]))
-    return [Section("Listen", [_EXPLANATION], sections=sections)]
+    sections = [_item_section(evaluation.headline, sounds) for sounds in evaluation.sounds]
+    return [Section("Listen", [_EXPLANATION], sections=sections)] if sections else []
 
 
-def _item_section(
-    evaluation: Evaluation, number: int, title: str, conditions: Sequence[str]
-) -> Section:
-    """Return the player of an item, see ``listening_sections``.
-
-    Args:
-        evaluation: The evaluation of the page.
-        number: Number of the item.
-        title: Heading of the section.
-        conditions: Names of the conditions to be played.
-    """
-    item = evaluation.items[number].load()
-    gain, end = gain_to_pascals(item.full_scale_spl), int(_LONGEST_SECONDS * item.sample_rate)
-    signals = {NORMAL_EAR: perceive(item.clean[:end].float() * gain, NORMAL, item.sample_rate)}
-    for condition in evaluation.conditions:
-        if condition.name in conditions:
-            with torch.no_grad():
-                output = condition.output(item)[:end].float() * gain
-            signals[condition.name] = perceive(output, item.ear, item.sample_rate)
-    thresholds = ", ".join(f"{level:g}" for level in item.ear.thresholds)
-    about = f"{item.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."
-    return Section(title, [about], player=make_player({"": signals}, item.sample_rate))
+def _item_section(headline: Comparison | None, sounds: ItemSounds) -> Section:
+    """Return the player of an item, with its rank by the headline comparison."""
+    title = sounds.name
+    if headline is not None and sounds.change is not None:
+        place, count = sounds.rank
+        rank = f"change {sounds.change:+.3f}, rank {place} of {count}"
+        title += f" ({headline.title}: {rank})"
+    thresholds = ", ".join(f"{level:g}" for level in sounds.ear.thresholds)
+    texts = [f"{sounds.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."]
+    texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
+    return Section(title, texts, player=make_player(sounds.groups, sounds.sample_rate))
 
 
 def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) -> Player:

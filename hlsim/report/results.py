@@ -8,11 +8,12 @@ from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.comparison import Comparison, format_p
+from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.report.page import Section, Table
+from hlsim.report.verdict import format_p
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from hlsim.cli.demo_study import SPEECH, DurationEstimate
+from hlsim.cli.demo_study import DurationEstimate
+from hlsim.data.bundled import SPEECH
 from tests.helpers import run_short_demo
 
 pytest.importorskip("lightning")
@@ -41,6 +42,19 @@ def test_demo_writes_a_page_that_agrees_with_the_table(
     [comparison] = report["comparisons"]
     assert comparison["planned"]
     assert (comparison["before"], comparison["after"]) == (names[2], "trained aid")
+    # ten utterances have three voices, whose means are compared
+    assert comparison["overall"]["n"] == 3
+    assert "(3 voices, " in text
+    assert comparison["overall"]["before_mean"] == pytest.approx(
+        fmean(
+            fmean(
+                row["haspi"]
+                for row in rows
+                if row["condition"] == names[2] and row["voice"] == voice
+            )
+            for voice in {row["voice"] for row in rows}
+        )
+    )
     page = (out / "report.html").read_text()
     assert text.startswith("\nThe trained aid ")
     assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 10

@@ -21,7 +21,7 @@ from hlsim.evaluation.aid_properties import (
     measure_steady_tones,
     measure_wearability,
 )
-from hlsim.evaluation.aids import EqualiserLike, Unaided, _equalise_bands
+from hlsim.evaluation.conditions import EqualiserLike, Unaided, _equalise_bands
 from hlsim.evaluation.measures import NORMAL
 from hlsim.metrics.band_levels import band_edges
 
@@ -122,7 +122,7 @@ def test_an_equaliser_has_the_mean_gain_of_its_aid() -> None:
     np.testing.assert_allclose(measured[0], gains, atol=1.0)
     equaliser = EqualiserLike(Filter(), noise, (50.0, 80.0))
     assert equaliser.gains_db(N3) == pytest.approx(measured[0], abs=0.06)
-    limited = MappingCompensator(config=MappingConfig(limit_spl=80.0)).eval()
+    limited = MappingCompensator(MappingConfig(limit_spl=80.0)).eval()
     soft, loud = measure_gain_curve(limited, N3, noise, (50.0, 80.0))["gain_db"]
     assert np.mean(loud) < np.mean(soft) - 6.0
 

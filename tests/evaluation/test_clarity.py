@@ -22,7 +22,7 @@ from hlsim.cli.main import main
 from hlsim.data import bundled
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import evaluate_scenes
-from hlsim.report.recordings import _conditions_table
+from hlsim.report.recordings_page import _conditions_table
 
 RATE = 44100
 LOW_RATE = 16000

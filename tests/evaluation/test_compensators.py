@@ -14,10 +14,10 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
 from hlsim.evaluation import Item, aid_properties
-from hlsim.evaluation.aids import Unaided, load_enhancers
 from hlsim.evaluation.compensators import evaluate_compensators
+from hlsim.evaluation.conditions import Unaided, load_enhancers
 from hlsim.evaluation.measures import NORMAL, PERCEPTION, _band_error_db, network_loss
-from hlsim.report.compensators import compensators_page
+from hlsim.report.compensators_page import compensators_page
 
 for module in ("matplotlib", "joblib", "pandas"):
     pytest.importorskip(module)
@@ -85,7 +85,7 @@ def test_conditions_groups_and_page(
     Path("my_enhancer.py").write_text(ENHANCERS)
     enhancers = ["my_enhancer:half"]
     study = evaluate_compensators(
-        {"mine": Gain()}, **options, audiogram=N3, items=4, enhancers=enhancers
+        {"mine": Gain()}, **options, audiogram=N3, items=4, enhancers=enhancers, listen=1
     )
     names = ["unaided", "NAL-R", "half + NAL-R", "WDRC", "half + WDRC"]
     names += ["NAL-R at mine's level", "equaliser at mine's level", "half + mine", "mine"]
@@ -102,7 +102,7 @@ def test_conditions_groups_and_page(
     for group in study.groups.values():
         (planned,) = (c for c in group.comparisons if c.planned)
         assert (planned.measure, planned.before, planned.after) == ("haspi", names[5], "mine")
-    page = compensators_page(study, listen=1)
+    page = compensators_page(study)
     assert page.verdict.startswith("On clean speech, mine ")
     assert [section.title for section in page.sections][:2] == ["Scores", "Listen"]
     (example,) = page.sections[1].sections
@@ -124,7 +124,7 @@ def test_an_item_counts_only_if_every_condition_has_its_values(
     failures = study.failures
     assert set(failures.ear) == {"S1"} and failures.failure.str.contains("no such ear").all()
     assert set(study.groups["clean"].table.ear) == {"N2", "N3", "N4", "N5", "N6", "S2"}
-    assert "no such ear" in compensators_page(study, listen=0).markdown()
+    assert "no such ear" in compensators_page(study).markdown()
 
 
 def test_only_a_further_compensator_is_evaluated(tmp_path: Path, options: dict[str, Any]) -> None:
@@ -144,7 +144,7 @@ def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
     options["noise"] = None
     study = evaluate_compensators({"mine": Gain(0.0)}, **options, audiogram=NORMAL, items=2)
     assert study.table.loss_msbg[study.table.condition == "unaided"].eq(0.0).all()
-    text = compensators_page(study, listen=0).markdown()
+    text = compensators_page(study).markdown()
     assert "nan" not in text.replace("pronan", "") and "n/a" in text
 
 
@@ -165,7 +165,7 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
 def test_command(
     options: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = MappingCompensator(config=MappingConfig(channels=8, blocks=1))
+    model = MappingCompensator(MappingConfig(channels=8, blocks=1))
     about = {"audiogram": Audiogram.standard("N4").to_dict()}
     save_checkpoint(tmp_path / "n4", "mapping-compensator", model, model.config.to_dict(), about)
     command = ["evaluate-compensator", f"mine={tmp_path / 'n4'}", "--speech", options["speech"]]

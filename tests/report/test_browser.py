@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from hlsim import example_speech, listen
-from hlsim.report.page import write_page
-from hlsim.report.recordings import report_page
+from hlsim.report.recordings_page import report_page
+from hlsim.report.writing import write_results
 from tests.helpers import run_short_demo
 from tests.report.test_recordings import evaluation
 
@@ -40,8 +40,8 @@ STATE = """
 def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report of three conditions with made-up scores."""
     root = tmp_path_factory.mktemp("report")
-    study = evaluation(root)
-    return write_page(report_page(study, listen=2), study.to_dict(), root / "out")
+    study = evaluation(root, listen=2)
+    return write_results(report_page(study), study, root / "out")
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,10 @@ from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Condition, Evaluation, compare
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.recorded_items import Recording
-from hlsim.report.page import write_page
-from hlsim.report.recordings import report_page
+from hlsim.evaluation.sounds import perceive_items
+from hlsim.report.recordings_page import report_page
+from hlsim.report.verdict import verdict
+from hlsim.report.writing import write_results
 
 pandas = pytest.importorskip("pandas")
 pytest.importorskip("matplotlib")
@@ -21,7 +24,7 @@ pytest.importorskip("matplotlib")
 NAMES = ("unaided", "NAL-R", "<my> aid")
 
 
-def evaluation(folder: Path) -> Evaluation:
+def evaluation(folder: Path, listen: int = 0) -> Evaluation:
     """A report of made-up scores of twelve items; all conditions are the same second of noise."""
     path = folder / "noise.wav"
     write_audio(path, 0.02 * torch.randn(1, 16000), 16000)
@@ -39,7 +42,7 @@ def evaluation(folder: Path) -> Evaluation:
             rows.append({**facts, **scores, **about, "failure": None})
     rows[-1] |= {"haspi": math.nan, "failure": "the file is silent"}
     table = pandas.DataFrame(rows)
-    return Evaluation(
+    study = Evaluation(
         items=items,
         conditions=[Condition(name, kind="recorded") for name in NAMES],
         measures=[MEASURES["haspi"]],
@@ -47,18 +50,21 @@ def evaluation(folder: Path) -> Evaluation:
         comparisons=compare(table, ["haspi"], planned=[("haspi", NAMES[0], NAMES[-1])]),
         settings={"seed": 0},
     )
+    return replace(study, sounds=perceive_items(study, listen))
 
 
 def test_a_comparison_has_one_p_wherever_it_appears(tmp_path: Path) -> None:
     study = evaluation(tmp_path)
-    page, planned = report_page(study, listen=0), study.headline
-    assert planned is not None and page.verdict == planned.verdict()
+    page, planned = report_page(study), study.headline
+    assert planned is not None
+    assert page.verdict == verdict(planned)
     assert page.markdown().count(f"p = {planned.overall.p_t:.5f}") >= 3
     assert "Planned before the scores were known" in page.markdown()
 
 
 def test_verdict_and_scores_come_first_and_details_are_folded(tmp_path: Path) -> None:
-    page = report_page(evaluation(tmp_path), listen=2)
+    study = evaluation(tmp_path, listen=2)
+    page = report_page(study)
     titles = [section.title for section in page.sections]
     assert titles == ["Scores", "Listen", "Details"] and page.sections[-1].folded
     details = [section.title for section in page.sections[-1].sections]
@@ -66,9 +72,47 @@ def test_verdict_and_scores_come_first_and_details_are_folded(tmp_path: Path) ->
     listen = page.sections[1].sections
     labels = [[sound.label for sound in section.player.sounds] for section in listen]
     assert labels == [["normal ear (the goal)", *NAMES]] * 2
-    path = write_page(page, evaluation(tmp_path).to_dict(), tmp_path / "out")
+    path = write_results(page, study, tmp_path / "out")
     html = path.read_text(encoding="utf-8")
     assert html.count("<audio") == 8 and "<my>" not in html and "the file is silent" in html
     data = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     assert data["rows"][-1]["haspi"] is None and len(data["rows"]) == 36
     assert {c["name"] for c in data["conditions"]} == set(NAMES)
+    assert len(data["comparisons"]) == 3
+    assert data["comparisons"][0]["in_words"].startswith(verdict(study.comparisons[0]))
+    scores = pandas.read_csv(path.with_name("scores.csv"))
+    assert len(scores) == 36
+    assert scores.haspi.to_numpy() == pytest.approx(study.table.haspi, abs=1e-6, nan_ok=True)
+    assert scores.hl_250[0] == study.table.audiogram[0][0]
+
+
+def test_sounds_of_a_condition_that_fails_are_named(tmp_path: Path) -> None:
+    study = evaluation(tmp_path)
+    (tmp_path / "noise.wav").rename(tmp_path / "clean.wav")
+    items = [replace(item, clean=tmp_path / "clean.wav") for item in study.items]
+    study = replace(study, items=items)
+    page = report_page(replace(study, sounds=perceive_items(study, 1)))
+    (player,) = page.sections[1].sections
+    assert [sound.label for sound in player.player.sounds] == ["normal ear (the goal)"]
+    assert "unaided cannot be played: " in player.paragraphs[1]
+
+
+def test_conditions_without_a_common_item_are_named(tmp_path: Path) -> None:
+    study = evaluation(tmp_path)
+    table = study.table[(study.table.condition == "unaided") == (study.table.item < 6)]
+    unpaired = table[table.condition != "aid"]
+    comparisons = compare(unpaired, ["haspi"])
+    page = report_page(replace(study, table=unpaired, comparisons=comparisons))
+    text = (
+        f"Not compared, because no item has both scores: unaided and NAL-R, unaided and {NAMES[2]}."
+    )
+    assert text in page.sections[0].paragraphs[0]
+    alone = unpaired[unpaired.condition != NAMES[2]]
+    page = report_page(replace(study, table=alone, comparisons=[], conditions=study.conditions[:2]))
+    means = alone.groupby("condition").haspi.mean()
+    assert (
+        f"of the condition unaided is {means['unaided']:.3f} on average (6 items, at"
+        in page.verdict
+    )
+    assert f"of the condition NAL-R is {means['NAL-R']:.3f} on average (6 items, at" in page.verdict
+    assert "no item has two scores, so that nothing can be compared" in page.verdict

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
-import torch
-
-from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.simulators import agreement, example_item
+from hlsim.evaluation.result import Evaluation, ItemSounds
+from hlsim.evaluation.simulators import agreement
 from hlsim.extras import install_command, is_installed
 from hlsim.report.page import Page, Section
 from hlsim.report.players import make_player
@@ -63,12 +60,11 @@ _FACTS = {
 """Titles of the tables for each fact of the items."""
 
 
-def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
+def simulators_page(evaluation: Evaluation) -> Page:
     """Return the page about simulators: verdict, side by side, sounds, details.
 
     Args:
         evaluation: Evaluation of ``evaluate_simulators``.
-        listen: Whether (1) or not (0) an item has a player.
 
     >>> from hlsim import MSBG
     >>> from hlsim.evaluation.simulators import evaluate_simulators
@@ -77,7 +73,7 @@ def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
     >>> evaluation = evaluate_simulators(
     ...     {"exact": MSBG()}, speech=speech, audiograms="standard", **settings
     ... )
-    >>> simulators_page(evaluation, listen=0).verdict[:48]
+    >>> simulators_page(evaluation).verdict[:48]
     'Speech as it is: exact has a median SNR of 200.0'
     """
     sections, details = [], []
@@ -95,8 +91,7 @@ def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
             if group.table[fact].nunique() > 1
         ]
         details.append(Section(title, tables=fact_tables))
-    if listen:
-        sections.append(_listening_section(evaluation))
+    sections += [_listening_section(sounds) for sounds in evaluation.sounds]
     sections.append(detail_section(evaluation, details, [_about(evaluation)]))
     return Page("Simulators", _verdict(evaluation), sections)
 
@@ -139,21 +134,15 @@ def _about(evaluation: Evaluation) -> str:
     return text
 
 
-def _listening_section(evaluation: Evaluation) -> Section:
-    """Return the player of an item: input, and outputs of the teacher and of the simulators."""
-    item, expected = example_item(evaluation)
-    signals = {"input": item.signal, "teacher": expected}
-    for condition in evaluation.conditions:
-        with suppress(Exception), torch.no_grad():  # A failure is in the table.
-            output = condition.output(item)
-            if output.isfinite().all():
-                signals[condition.name] = output
-    # A short clip is filled up with silence.
-    end = int(item.signal.nonzero().max()) + item.sample_rate // 10
-    player = make_player({"": {n: signal[:end] for n, signal in signals.items()}}, item.sample_rate)
-    facts = item.facts
-    text = (
+def _listening_section(sounds: ItemSounds) -> Section:
+    """Return the section "Listen" with a player of one item.
+
+    Its sounds are the input, and the outputs of the teacher and of each simulator.
+    """
+    facts = sounds.facts
+    texts = [
         f"{_TREATMENTS[facts['treatment']]}, {facts['speech']}, {facts['input_level']:g} dB SPL, "
         f"degree of loss: {facts['severity']}."
-    )
-    return Section("Listen", [text], player=player)
+    ]
+    texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
+    return Section("Listen", texts, player=make_player(sounds.groups, sounds.sample_rate))

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from hlsim import NALR, Audiogram
 from hlsim.calibration import level_spl
 from hlsim.evaluation import Condition, Item, run_study
-from hlsim.evaluation.aids import AtLevelOf
+from hlsim.evaluation.conditions import AtLevelOf
 from hlsim.evaluation.measures import LEVELS
 from hlsim.shortcuts import example_speech
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
 from hlsim.evaluation.compensators import HARD, UTTERANCES
-from hlsim.evaluation.conditions import COMPRESSION, NAL_R, UNAIDED
+from hlsim.evaluation.conditions import COMPRESSION, NAL_R
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
 from hlsim.report.players import listening_sections
@@ -28,6 +29,7 @@ from hlsim.report.results import (
     statistic,
     summary_table,
 )
+from hlsim.report.verdict import verdict
 
 _GROUPS = {
     "clean": "Clean speech",
@@ -90,33 +92,30 @@ _WEARING = (
 )
 
 
-def compensators_page(evaluation: Evaluation, listen: int = 3) -> Page:
+def compensators_page(evaluation: Evaluation) -> Page:
     """Return the page about compensators: verdicts, scores, sounds, gains, details.
 
     Args:
         evaluation: Evaluation of ``evaluate_compensators``.
-        listen: Number of items with a player.
     """
     main = {name: group for name, group in evaluation.groups.items() if name != "hard"}
-    verdict, *further_verdicts = [
-        f"On {_GROUPS[name].lower()}, {c.verdict(c.after, 'NAL-R at the same level')}"
+    first_verdict, *further_verdicts = [
+        f"On {_GROUPS[name].lower()}, {verdict(c, c.after, 'NAL-R at the same level')}"
         for name, group in main.items()
         for c in group.comparisons
         if c.planned
     ]
     names = evaluation.aids
-    same_level = [c.name for c in evaluation.conditions if c.kind == "same level"]
     tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in main.items()]
     about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE]
-    played = [UNAIDED, same_level[0], *names]
     sections = [
         Section("Scores", about, tables),
-        *listening_sections(next(iter(main.values())), listen, played),
+        *listening_sections(replace(evaluation, comparisons=next(iter(main.values())).comparisons)),
         Section("Gain", [_GAINS], pictures=_gain_pictures(evaluation)),
         Section("Could it be worn?", [_WEARING], [_wearing_table(evaluation)]),
         _details(evaluation),
     ]
-    return Page(f"Hearing aids compared: {', '.join(names)}", verdict, sections)
+    return Page(f"Hearing aids compared: {', '.join(names)}", first_verdict, sections)
 
 
 def _about(evaluation: Evaluation) -> str:

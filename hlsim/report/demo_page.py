@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-from torch import Tensor
-
-from compensators import MappingConfig
-from hlsim.audiogram import Audiogram
-from hlsim.evaluation.aid_properties import mean_band_levels
+from hlsim.evaluation.conditions import NAL_R, NAL_R_AT_LEVEL, TRAINED
 from hlsim.evaluation.result import Evaluation, predict_words
+from hlsim.evaluation.sounds import NORMAL_EAR
 from hlsim.report.page import Card, Page, Picture, Section, Table
-from hlsim.report.players import NORMAL_EAR, make_player
+from hlsim.report.players import make_player
 from hlsim.report.plots import (
     INK,
     Curve,
@@ -20,14 +15,14 @@ from hlsim.report.plots import (
     gain_picture,
 )
 from hlsim.report.results import Columns, score_details, split_rows, statistic, summary_table
-
-UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED = "unaided", "NAL-R", "NAL-R, same level", "trained aid"
-"""Names of the demo's conditions."""
+from hlsim.report.verdict import verdict
 
 _COMPARISON = (
     "HASPI rewards any gain. The trained aid is therefore compared with NAL-R, the prescription "
     "that clinics know, amplified to the same output level. This comparison was planned before "
-    "the scores were known."
+    "the scores were known. The {utterances} utterances are those of {voices} voices. Utterances "
+    "of one voice are not independent, so that the test compares the means of the voices, and "
+    "{voices} voices are few: other voices may give other results."
 )
 _LISTEN = (
     "One utterance of a voice that the aid was not trained on. Its words: My father fixed the "
@@ -42,50 +37,39 @@ _ABOUT_PICTURES = (
 )
 
 
-def demo_page(
-    evaluation: Evaluation,
-    ear_name: str,
-    outputs: Mapping[str, Sequence[Tensor]],
-    perceived: Mapping[str, Sequence[Tensor]],
-) -> Page:
+def demo_page(evaluation: Evaluation) -> Page:
     """Return the page of ``hlsim demo``: verdict, sounds, pictures, details and three numbers.
 
     The numbers are HASPI, the share of words understood and the error of loudness.
 
     Args:
-        evaluation: Study of the demo's conditions. Its ``details`` hold the gains of the aids under
-            ``gain_curves``, its ``settings`` the number of ``training_steps``.
-        ear_name: Name of the ear, for the title.
-        outputs: Outputs for all items in pascals under the name of each condition. Shape of each:
-            (time,).
-        perceived: Perceived signals for all items in pascals: first, under the name ``NORMAL_EAR``,
-            what a normal ear perceives of clean speech; then, under the name of each condition,
-            what this ear perceives of ``outputs``. Shape of each: (time,).
+        evaluation: Evaluation of ``evaluate_trained_aid``.
     """
+    settings, (sounds,) = evaluation.settings, evaluation.sounds
     headline = evaluation.headline
     assert headline is not None
-    items = [source.load() for source in evaluation.items]
-    rate = items[0].sample_rate
-    pictures = _draw_pictures(evaluation, items[0].ear, outputs, perceived)
-    last_perceived = {name: signals[-1] for name, signals in perceived.items()}
-    last_outputs = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
-    groups = {
-        "Perceived by this ear, beside a normal ear": last_perceived,
-        "Output of the aids": {"original speech": items[-1].clean, **last_outputs},
-    }
-    player = make_player(groups, rate)
     about_pictures = _ABOUT_PICTURES.format(
-        steps=evaluation.settings["training_steps"], limit=MappingConfig().limit_spl
+        steps=settings["training_steps"], limit=settings["limit_spl"]
     )
+    voices = evaluation.table["voice"].nunique()
+    comparison = _COMPARISON.format(utterances=len(evaluation.items), voices=voices)
     sections = [
-        Section("Listen", [_LISTEN], player=player),
-        Section("What training changed", [about_pictures], pictures=pictures),
-        Section("Scores", [_COMPARISON], [result_table(evaluation)]),
+        Section("Listen", [_LISTEN], player=make_player(sounds.groups, sounds.sample_rate)),
+        Section("What training changed", [about_pictures], pictures=_draw_pictures(evaluation)),
+        Section("Scores", [_loudness(evaluation), comparison], [result_table(evaluation)]),
         score_details(evaluation),
     ]
-    verdict = headline.verdict("The trained aid", "NAL-R at the same level")
-    return Page(
-        f"A hearing aid trained for one ear: {ear_name}", verdict, sections, _cards(evaluation)
+    title = f"A hearing aid trained for one ear: {settings['ear']}"
+    first_sentence = verdict(headline, "The trained aid", "NAL-R at the same level", "voice")
+    return Page(title, first_sentence, sections, _cards(evaluation))
+
+
+def _loudness(evaluation: Evaluation) -> str:
+    """Return a sentence about the loudness errors of the aid and of NAL-R at the same level."""
+    errors = evaluation.table.groupby("condition")["loudness_error"].mean()
+    return (
+        f"The loudness error of the trained aid is {_decibels(errors[TRAINED])}, that of NAL-R at "
+        f"the same level {_decibels(errors[NAL_R_AT_LEVEL])}."
     )
 
 
@@ -149,33 +133,22 @@ def _decibels(value: float) -> str:
     return f"{value:+.1f} dB".replace("-", "\N{MINUS SIGN}")
 
 
-def _draw_pictures(
-    evaluation: Evaluation,
-    ear: Audiogram,
-    outputs: Mapping[str, Sequence[Tensor]],
-    perceived: Mapping[str, Sequence[Tensor]],
-) -> list[Picture]:
-    """Draw the levels that the ear perceives, those of speech over its thresholds, and the gain.
-
-    Args:
-        evaluation: Study of the demo's conditions.
-        ear: The audiogram.
-        outputs: Outputs of the aid for each item, by condition.
-        perceived: Outputs as the ear perceives them, and speech as a normal ear perceives it.
-    """
+def _draw_pictures(evaluation: Evaluation) -> list[Picture]:
+    """Draw the levels that the ear perceives, those of speech over its thresholds, and the gain."""
+    details = evaluation.details
+    ear = evaluation.sounds[0].ear
     colours = condition_colours(evaluation.conditions)
-    gains = evaluation.details["gain_curves"]
-    frequencies = gains[0]["frequencies"]
+    frequencies = details["gain_curves"][0]["frequencies"]
     styles = {name: {"color": colour} for name, colour in colours.items()}
     styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
     perceived_curves = {
-        name: (frequencies, mean_band_levels(perceived[name]), style)
+        name: (frequencies, details["perceived_levels"][name], style)
         for name, style in styles.items()
     }
-    curves: dict[str, Curve] = {}
-    for name in (UNAIDED, TRAINED):
-        levels = mean_band_levels(outputs[name], hearing_level=True)
-        curves[f"speech, {name}"] = (frequencies, levels, {"color": colours[name]})
+    curves: dict[str, Curve] = {
+        f"speech, {name}": (frequencies, levels, {"color": colours[name]})
+        for name, levels in details["speech_levels_hl"].items()
+    }
     style = {"color": INK, "marker": "o"}
     curves["threshold of this ear"] = (ear.frequencies, ear.levels, style)
     return [
@@ -194,5 +167,5 @@ def _draw_pictures(
             note=f"Speech at {evaluation.table['clean_level'].iloc[0]:g} dB SPL, mean level in "
             "each band. Where it lies above the line of the threshold, it is inaudible on average.",
         ),
-        gain_picture("Gain by input level", gains, colours),
+        gain_picture("Gain by input level", details["gain_curves"], colours),
     ]

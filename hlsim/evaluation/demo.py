@@ -1,0 +1,162 @@
+"""The study of the command ``demo``: an aid that was trained for one ear, beside NAL-R."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from compensators import NALR, MappingConfig
+from hlsim.audio import find_audio, read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import NEURO_RATE, set_level
+from hlsim.data import bundled
+from hlsim.dsp.resample import resample
+from hlsim.evaluation.aid_properties import mean_band_levels, measure_aids, measure_gain_curve
+from hlsim.evaluation.comparison import Comparison, compare
+from hlsim.evaluation.conditions import (
+    NAL_R,
+    NAL_R_AT_LEVEL,
+    TRAINED,
+    UNAIDED,
+    AtLevelOf,
+    Unaided,
+)
+from hlsim.evaluation.items import INPUT_LEVELS
+from hlsim.evaluation.measures import LEVELS, MEASURES, NORMAL, PERCEPTION, perceive
+from hlsim.evaluation.result import Evaluation, ItemSounds
+from hlsim.evaluation.sounds import NORMAL_EAR
+from hlsim.evaluation.study import Condition, Item
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_SPEECH_LEVEL = 65.0
+"""Level of the utterances in dB SPL, without an aid and as input of the aids."""
+
+_MAX_SECONDS = 5.0  # of an utterance that is scored, so that HASPI takes half as long
+
+_Signals = Mapping[str, Sequence[Tensor]]
+"""One signal per item in pascals, each with shape (time,), by the name of a condition."""
+
+
+def evaluate_trained_aid(
+    aid: nn.Module, audiogram: Audiogram, *, ear_name: str, training_steps: int, **running: Any
+) -> Evaluation:
+    """Compare an aid that was trained for one ear with no aid and NAL-R, on bundled speech.
+
+    The comparison with NAL-R at the aid's level by HASPI is planned. It is that of the means of the
+    voices, because utterances of one voice are not independent.
+
+    Args:
+        aid: The aid, which is called with a waveform and an ear.
+        audiogram: The ear.
+        ear_name: Name of the ear, for the page.
+        training_steps: Number of training steps, for the page.
+        running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+
+    Returns:
+        The evaluation. Its ``details`` have the gains of the aids, and the levels per band that the
+        ear perceives and that speech has, its ``sounds`` the last utterance.
+    """
+    nal_r = NALR()
+    conditions = [
+        Condition(UNAIDED, Unaided(), "unaided"),
+        Condition(NAL_R, nal_r, "prescription"),
+        Condition(NAL_R_AT_LEVEL, AtLevelOf(nal_r, aid), "same level", TRAINED),
+        Condition(TRAINED, aid),
+    ]
+    items = _read_items(audiogram)
+    evaluation = Evaluation.run(
+        items,
+        conditions,
+        [MEASURES["haspi"], LEVELS, PERCEPTION],
+        store=None,
+        settings={
+            "seed": 0,
+            "ear": ear_name,
+            "training_steps": training_steps,
+            "limit_spl": MappingConfig().limit_spl,
+        },
+        **running,
+    )
+    outputs, perceived = _process(items, conditions, audiogram)
+    details = {
+        "gain_curves": _measure_gains(items, {NAL_R: nal_r, TRAINED: aid}, audiogram, ear_name),
+        "perceived_levels": {
+            name: mean_band_levels(signals) for name, signals in perceived.items()
+        },
+        "speech_levels_hl": {
+            name: mean_band_levels(outputs[name], hearing_level=True) for name in (UNAIDED, TRAINED)
+        },
+    }
+    return replace(
+        evaluation,
+        comparisons=_compare_voices(evaluation.table),
+        details=details,
+        sounds=[_last_sounds(items, outputs, perceived)],
+    )
+
+
+def _read_items(audiogram: Audiogram) -> list[Item]:
+    """Read the utterances to score, each with a seed of its own."""
+    items = []
+    for number, path in enumerate(find_audio(bundled.SPEECH / "valid")):
+        waveform, rate = read_audio(path)
+        clip = resample(waveform[0], rate, NEURO_RATE)[: round(_MAX_SECONDS * NEURO_RATE)]
+        clean = set_level(clip, _SPEECH_LEVEL)
+        facts = {"voice": path.stem.rpartition("-")[0], "severity": audiogram.severity}
+        items.append(Item(path.stem, clean, clean, audiogram, seed=number, facts=facts))
+    return items
+
+
+def _process(
+    items: Sequence[Item], conditions: Sequence[Condition], audiogram: Audiogram
+) -> tuple[_Signals, _Signals]:
+    """Return the outputs of all conditions, and what the ear perceives of them.
+
+    The perceived signals begin with those of a normal ear for clean speech.
+    """
+    perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
+    outputs = {}
+    with torch.no_grad():
+        for condition in conditions:
+            signals = [condition.output(item) for item in items]
+            outputs[condition.name] = signals
+            perceived[condition.name] = [
+                perceive(signal, audiogram, NEURO_RATE) for signal in signals
+            ]
+    return outputs, perceived
+
+
+def _measure_gains(
+    items: Sequence[Item], aids: Mapping[str, nn.Module], audiogram: Audiogram, ear_name: str
+) -> list[dict[str, Any]]:
+    """Return the gain curves of the aids for the beginnings of the utterances."""
+    shortest = min(len(item.clean) for item in items)
+    utterances = torch.stack([item.clean[:shortest] for item in items])
+    return measure_aids(aids, {ear_name: audiogram}, measure_gain_curve, utterances, INPUT_LEVELS)
+
+
+def _compare_voices(table: DataFrame) -> list[Comparison]:
+    """Compare the aid with NAL-R at its level by the mean scores of each voice."""
+    means = table.groupby(["voice", "condition"], sort=False)[["haspi", "level"]].mean()
+    rows = means.reset_index().rename(columns={"voice": "item"})
+    planned = [("haspi", NAL_R_AT_LEVEL, TRAINED)]
+    return [c for c in compare(rows, ["haspi"], planned=planned) if c.planned]
+
+
+def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) -> ItemSounds:
+    """Return the sounds of the last utterance: perceived by the ear, and output of the aids."""
+    item = items[-1]
+    aided = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
+    groups = {
+        "Perceived by this ear, beside a normal ear": {
+            name: signals[-1] for name, signals in perceived.items()
+        },
+        "Output of the aids": {"original speech": item.clean, **aided},
+    }
+    return ItemSounds(item.name, item.ear, item.sample_rate, groups)

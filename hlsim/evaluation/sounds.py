@@ -1,0 +1,127 @@
+"""Sounds of a study that a page plays: items of several conditions as an ear perceives them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hlsim.calibration import gain_to_pascals
+from hlsim.evaluation.measures import NORMAL, perceive
+from hlsim.evaluation.result import Evaluation, ItemSounds
+from hlsim.evaluation.running.parallel import describe_error
+from hlsim.evaluation.study import Condition, Item
+
+NORMAL_EAR = "normal ear (the goal)"
+"""Label of clean speech as a normal ear perceives it."""
+
+_LONGEST_SECONDS = 8.0
+"""Length in seconds after which the sounds of an item are cut."""
+
+
+def perceive_items(
+    evaluation: Evaluation, count: int, conditions: Sequence[str] = ()
+) -> list[ItemSounds]:
+    """Return the sounds of some items as their ear perceives them, by the exact MSBG.
+
+    Items are ranked by how much their score changes between the two conditions of the evaluation's
+    headline comparison, largest gain first. The items are evenly spaced in this ranking. Their
+    sounds are what a normal ear perceives of the clean speech, and what the impaired ear perceives
+    under each condition.
+
+    Args:
+        evaluation: The evaluation.
+        count: Number of items.
+        conditions: Names of the conditions with sounds; all of them if empty.
+
+    Returns: The sounds, or an empty list if there is no comparison.
+
+    >>> import pandas
+    >>> from hlsim import Audiogram
+    >>> from hlsim.evaluation import compare
+    >>> speech = torch.randn(8000, generator=torch.Generator().manual_seed(0))
+    >>> item = Item("s01", speech, speech, Audiogram.standard("N3"))
+    >>> conditions = [Condition(name, lambda signal, ear: signal) for name in "ab"]
+    >>> rows = [(0, "s01", "a", 0.2), (0, "s01", "b", 0.4)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "name", "condition", "haspi"])
+    >>> evaluation = Evaluation([item], conditions, [], table, compare(table, ["haspi"]))
+    >>> (sounds,) = perceive_items(evaluation, count=1)
+    >>> list(sounds.groups[""])
+    ['normal ear (the goal)', 'a', 'b']
+    """
+    headline = evaluation.headline
+    if headline is None or not count:
+        return []
+    scores = evaluation.wide(headline.measure)
+    changes = (scores[headline.after] - scores[headline.before]).dropna()
+    changes = changes.sort_values(ascending=False, kind="stable")
+    places = np.linspace(0, len(changes) - 1, min(count, len(changes))).round().astype(int)
+    rows = evaluation.table.drop_duplicates("item").set_index("item")
+    names = conditions or evaluation.names
+    chosen = [condition for condition in evaluation.conditions if condition.name in names]
+    sounds = []
+    for place in places.tolist():
+        row = rows.loc[changes.index[place]]
+        item = evaluation.items[int(row.get("source", row.name))].load()
+        signals, failures = _perceive(item, chosen)
+        sounds.append(
+            ItemSounds(
+                row["name"],
+                item.ear,
+                item.sample_rate,
+                {"": signals},
+                failures,
+                change=float(changes.iloc[place]),
+                rank=(place + 1, len(changes)),
+            )
+        )
+    return sounds
+
+
+def _perceive(
+    item: Item, conditions: Sequence[Condition]
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return the perceived signals of an item by label, and the reasons of failures.
+
+    Shape of each signal: (time,), at most 8 s.
+    """
+    gain, end = gain_to_pascals(item.full_scale_spl), int(_LONGEST_SECONDS * item.sample_rate)
+    clean = item.clean[:end].float() * gain
+    signals = {NORMAL_EAR: perceive(clean, NORMAL, item.sample_rate)}
+
+    def process(condition: Condition) -> Tensor:
+        output = condition.output(item)[:end].float() * gain
+        return perceive(output, item.ear, item.sample_rate)
+
+    outputs, failures = try_conditions(conditions, process)
+    return signals | outputs, failures
+
+
+def try_conditions(
+    conditions: Sequence[Condition], process: Callable[[Condition], Tensor]
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Compute a sound under each condition, without gradients.
+
+    Args:
+        conditions: The conditions.
+        process: Function that returns the sound of a condition. Shape: (time,).
+
+    Returns:
+        The sounds, and for conditions without one the reason, each by the name of the condition.
+
+    >>> try_conditions([Condition("a")], lambda condition: torch.ones(2))[0]
+    {'a': tensor([1., 1.])}
+    """
+    signals, failures = {}, {}
+    for condition in conditions:
+        try:
+            with torch.no_grad():
+                signal = process(condition)
+            if not signal.isfinite().all():
+                raise ValueError("some samples are NaN or infinite")
+            signals[condition.name] = signal
+        except Exception as error:  # The study has scored the item: one sound may be missing.
+            failures[condition.name] = describe_error(error)
+    return signals, failures

@@ -1,0 +1,198 @@
+"""Sentences about comparisons: which condition is better, and what limits the verdict."""
+
+from __future__ import annotations
+
+import math
+
+from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.measures import column_title
+from hlsim.evaluation.result import Evaluation
+
+_ALPHA = 0.05
+"""p value below which a change is called significant."""
+
+_LEVEL_TOLERANCE_DB = 1.0
+"""Change of the level in dB that is too small to explain a change of a score."""
+
+
+def verdict(c: Comparison, subject: str = "", rival: str = "", noun: str = "item") -> str:
+    """Return a sentence that says which condition is better, with scores and p values.
+
+    A higher score is called better only at equal level, because HASPI rewards gain.
+
+    Args:
+        c: The comparison.
+        subject: Other words for the condition ``after``, which begin the sentence.
+        rival: Other words for the condition ``before``.
+        noun: Singular noun for what is counted.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import compare
+    >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
+    >>> verdict(compare(table, ["haspi"])[0])[:52]
+    'b cannot be distinguished from a: HASPI 0.400 agains'
+    """
+    rises = c.overall.delta > 0
+    significant = _significant_tests(c)
+    if not any(significant):
+        verb = "cannot be distinguished from"
+    elif abs(c.level_change) < _LEVEL_TOLERANCE_DB:
+        verb = "is" if all(significant) else "may be"
+        verb += " better than" if rises else " worse than"
+    else:
+        verb = "scores" if all(significant) else "may score"
+        verb += " higher than" if rises else " lower than"
+    text = f"{subject or c.after} {verb} {rival or c.before}"
+    if abs(c.level_change) >= _LEVEL_TOLERANCE_DB:
+        direction = "softer" if c.level_change > 0 else "louder"
+        text += f", which is {abs(c.level_change):.1f} dB {direction}"
+    facts = f"{count_items(c.overall.n, noun)}, change {c.overall.delta:+.3f}"
+    if c.overall.ci_low is not None:
+        facts += f", 95 % interval {c.overall.ci_low:+.3f} to {c.overall.ci_high:+.3f}"
+    means = f"{c.title} {c.overall.after_mean:.3f} against {c.overall.before_mean:.3f}"
+    return f"{text}: {means} ({facts}; {_describe_tests(c)})."
+
+
+def limits(c: Comparison) -> str:
+    """Return the caveats of a verdict as text.
+
+    These are the change in level, items that are not independent, and items that are left out.
+
+    Args:
+        c: The comparison.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import compare
+    >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
+    >>> limits(compare(table, ["haspi"])[0])[:38]
+    'The tests treat items as independent. '
+    """
+    sentences = []
+    change, delta = c.level_change, c.overall.delta
+    if not math.isnan(change):
+        sentences.append(f"The mean level changed by {change:+.1f} dB.")
+    may_be_gain = change * delta > 0 and abs(change) >= _LEVEL_TOLERANCE_DB
+    if c.measure == "haspi" and may_be_gain and any(_significant_tests(c)):
+        sentences.append("HASPI rewards gain, which alone may explain the change.")
+    sentences.append(_describe_units(c))
+    if c.left_out:
+        sentences.append(f"{count_items(c.left_out)} without both scores are left out.")
+    sentences.append(
+        f"{c.title} is the prediction of a model: no listener was asked, and other speech and "
+        "other ears may give other results."
+    )
+    return " ".join(sentences)
+
+
+def describe_means(evaluation: Evaluation) -> str:
+    """Return a sentence with the mean score of each condition, where none could be compared.
+
+    Args:
+        evaluation: Evaluation without comparisons.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import MEASURES, Condition
+    >>> table = pandas.DataFrame({"item": [0], "condition": ["a"], "haspi": [0.5], "level": [65.0]})
+    >>> describe_means(Evaluation([], [Condition("a")], [MEASURES["haspi"]], table))
+    'HASPI of the condition a is 0.500 on average (1 item, at 65.0 dB SPL).'
+    """
+    measure = evaluation.scores[0]
+    means = []
+    for name in evaluation.names:
+        rows = evaluation.table[evaluation.table["condition"] == name].dropna(subset=[measure])
+        if rows.empty:
+            means.append(f"of {name} is not known")
+            continue
+        means.append(
+            f"of the condition {name} is {rows[measure].mean():.3f} on average "
+            f"({count_items(len(rows))}, at {rows['level'].mean():.1f} dB SPL)"
+        )
+    end = "" if len(means) == 1 else "; no item has two scores, so that nothing can be compared"
+    return f"{column_title(measure)} {', '.join(means)}{end}."
+
+
+def describe_missing_pairs(evaluation: Evaluation) -> list[str]:
+    """Return a sentence about conditions that could not be compared, or none.
+
+    Args:
+        evaluation: Evaluation with comparisons.
+
+    >>> describe_missing_pairs(Evaluation([], [], [], None))
+    []
+    """
+    if not evaluation.comparisons:
+        return []
+    compared = {name for c in evaluation.comparisons for name in (c.before, c.after)}
+    pairs = {(c.before, c.after) for c in evaluation.comparisons}
+    baseline = evaluation.settings.get("baseline")
+    first_names = [baseline] if baseline else evaluation.names
+    missing = []
+    for place, first in enumerate(first_names):
+        for second in evaluation.names[place + 1 :]:
+            if (first, second) not in pairs:
+                missing.append(f"{first} and {second}")
+    if not missing:
+        return []
+    return [
+        f"Not compared, because no item has both scores: {', '.join(missing)}."
+        + ("" if len(compared) == len(evaluation.names) else " Check the names of the conditions.")
+    ]
+
+
+def format_p(p: float) -> str:
+    """Return a p value as reports state it: with five decimals, or as ``p < 0.00001``.
+
+    >>> format_p(0.0125)
+    'p = 0.01250'
+    """
+    return "p < 0.00001" if p < 1e-5 else f"p = {p:.5f}"
+
+
+def count_items(count: int, noun: str = "item") -> str:
+    """Return a number with its noun, in the plural unless it is 1.
+
+    >>> count_items(1), count_items(3, "voice")
+    ('1 item', '3 voices')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _describe_tests(c: Comparison) -> str:
+    """State the p values, which are the same wherever the comparison appears."""
+    tests = {"t-test": c.p_t, "Wilcoxon": c.p_w}
+    stated = [f"{name} {format_p(p)}" for name, p in tests.items() if p is not None]
+    if not stated:
+        return "neither test is defined"
+    if c.planned:
+        stated.append("planned comparison, not adjusted")
+    elif c.family > 1:
+        stated.append(f"adjusted by Holm for {c.family} comparisons")
+    return ", ".join(stated)
+
+
+def _significant_tests(c: Comparison) -> list[bool]:
+    """Return for each test that can decide whether its p value is below ``_ALPHA``.
+
+    With few items, Wilcoxon's p exceeds ``_ALPHA`` even if all pairs change alike.
+    """
+    decisions = [] if c.p_t is None else [c.p_t < _ALPHA]
+    lowest_p = c.family * 2.0 ** (1 - (c.overall.n - c.overall.zeros))
+    if c.p_w is not None and (c.p_w < _ALPHA or lowest_p < _ALPHA):
+        decisions.append(c.p_w < _ALPHA)
+    return decisions
+
+
+def _describe_units(c: Comparison) -> str:
+    means = c.unit_means
+    if means is None:
+        return (
+            "The tests treat items as independent. If several share a talker or a listener, p is "
+            "too small and the interval too narrow."
+        )
+    result = "is not defined" if means.p_t is None else f"gives {format_p(means.p_t)}"
+    return (
+        "The interval and the tests treat items as independent, although several share one "
+        f"{c.unit}; the t-test over the means of the {means.n} {c.unit}s {result}."
+    )
