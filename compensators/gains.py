@@ -1,8 +1,10 @@
-"""Insertion gains of an aid, measured with noise that has the spectrum of average speech.
+"""Base class of all aids: an ear of their own, and insertion gains.
 
 The insertion gain is the level of an aid's output minus that of its input in dB, in a third of an
-octave around a frequency.
+octave around a frequency. It is measured with noise that has the spectrum of average speech.
 """
+
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,32 +12,67 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from compensators.filter_bank import RATE, SPEECH_SPL, speech_density
-from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
+from hlsim.audiogram import FREQUENCIES, HIGHEST_SIMULATED
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    as_thresholds,
+    has_listeners,
+    store_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
 from hlsim.dsp.fft import power
 from hlsim.torchtools import constant
 
 
-class MeasuredAid(nn.Module):
-    """Base class of aids with a method ``gains``, which measures how much they amplify a noise.
+class Aid(nn.Module):
+    """Base class of aids, which may store an ear, and measure how much they amplify a noise.
 
     Subclasses implement ``_amplify``.
 
+    Attributes:
+        thresholds: Thresholds in dB HL of the ears that calls without an audiogram use, (..., 8);
+            None if there are none.
+
     >>> from compensators import WDRC
-    >>> isinstance(WDRC(), MeasuredAid)
+    >>> isinstance(WDRC(), Aid)
     True
     """
 
+    thresholds: Tensor | None
+    _two_ears: bool
+
+    def store_ears(
+        self, audiogram: AudiogramLike | None, highest: float = HIGHEST_SIMULATED
+    ) -> None:
+        """Store the ears that calls without an audiogram use.
+
+        Args:
+            audiogram: One or more ears, or None.
+            highest: Highest level allowed, in dB HL.
+
+        Raises:
+            ValueError: An ear is not valid.
+        """
+        thresholds = store_thresholds(audiogram, highest=highest)
+        self.register_buffer("thresholds", thresholds, persistent=False)
+        self._two_ears = has_listeners(audiogram)
+
+    def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> Any:
+        """Raise ValueError, because only ``WDRC`` and ``HearingAid`` process a signal in chunks."""
+        raise ValueError(
+            f"{type(self).__name__} processes whole signals only; load wdrc or hearing-aid for a "
+            "signal that arrives in chunks"
+        )
+
     @torch.no_grad()
-    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
+    def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Measure the insertion gains for noise with the spectrum of average speech.
 
         Noise reduction is off, and the limit of the output is not applied.
 
         Args:
-            audiogram: One or more ears.
+            audiogram: One or more ears, by default those of the constructor.
             level: Presentation level in dB SPL, 0 to 120.
 
         Returns:
@@ -50,7 +87,7 @@ class MeasuredAid(nn.Module):
         """
         check_number("level", level, 0.0, 120.0)
         weight = next(self.parameters(), torch.empty(0))
-        thresholds = as_thresholds(audiogram).to(weight)
+        thresholds = self.find_thresholds(audiogram).to(weight)
         ears = thresholds.reshape(-1, len(FREQUENCIES))
         noise = _speech_noise(like=ears) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
         # The first second, in which gains settle, is left out.
@@ -60,6 +97,27 @@ class MeasuredAid(nn.Module):
             power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
         )
         return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
+
+    def find_thresholds(
+        self, audiogram: AudiogramLike | None, highest: float = HIGHEST_SIMULATED
+    ) -> Tensor:
+        """Return the thresholds of the ears of a call, (..., 8), or else the stored ones.
+
+        Args:
+            audiogram: Ears that were passed with the call, or None.
+            highest: Highest level allowed, in dB HL.
+
+        Raises:
+            ValueError: There are no ears, or an ear is not valid.
+        """
+        if audiogram is None and self.thresholds is not None:
+            return self.thresholds
+        if audiogram is None:
+            raise ValueError(
+                "expected an audiogram, got None; pass one, or build the aid with one, as in "
+                "WDRC('N3')"
+            )
+        return as_thresholds(audiogram, highest=highest)
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Return the output for signals in pascals at 16 kHz, without noise reduction and limit.

@@ -66,6 +66,7 @@ class HearingAid(Wearable):
     peak of the output is softly limited at ``config.limit_spl`` dB SPL.
 
     Args:
+        audiogram: One or more ears, which are used by all calls that pass none.
         config: Sizes of the networks, and limits of the gains; by default ``HearingAidConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
@@ -87,13 +88,14 @@ class HearingAid(Wearable):
     @built_in_float32
     def __init__(
         self,
+        audiogram: AudiogramLike | None = None,
         config: HearingAidConfig | None = None,
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
         linked: bool = False,
     ) -> None:
-        super().__init__(sample_rate, full_scale_spl, linked)
+        super().__init__(audiogram, sample_rate, full_scale_spl, linked)
         self.config = config = config or HearingAidConfig()
         self.bands = config.bands
         self.limit_spl = config.limit_spl
@@ -120,6 +122,11 @@ class HearingAid(Wearable):
         nn.init.zeros_(corrections.bias)
         nn.init.constant_(self.leave.bias, INITIAL_REDUCTION_LOGIT)
 
+    @property
+    def noise_reduction_network(self) -> nn.ModuleList:
+        """Modules that compute the attenuation of noise. ``correct`` computes the amplification."""
+        return nn.ModuleList([self.enter, self.recur, self.leave])
+
     def train(self, mode: bool = True) -> Self:
         """Set the mode of all modules except the LSTM, which stays in training mode.
 
@@ -142,7 +149,7 @@ class HearingAid(Wearable):
         Args:
             waveform: Input of the aid.
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform.
+                leading dimensions of the waveform; by default those of the constructor.
             noise_reduction: Share of the attenuation of noise that is applied, 0 to 1: one number,
                 or one value per item.
             amplification: Share of the amplification that is applied, 0 to 1: one number, or one
@@ -154,7 +161,7 @@ class HearingAid(Wearable):
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, a slider is
                 outside 0 to 1, or shapes do not fit.
         """
-        return self._process(waveform, audiogram, (noise_reduction, amplification))
+        return self._process_signals(waveform, audiogram, (noise_reduction, amplification))
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State

@@ -38,8 +38,8 @@ def build_compensator(config: MappingConfig | HearingAidConfig, **levels: Any) -
     12
     """
     if isinstance(config, HearingAidConfig):
-        return HearingAid(config, **levels)
-    return MappingCompensator(config, **levels)
+        return HearingAid(config=config, **levels)
+    return MappingCompensator(config=config, **levels)
 
 
 def load_compensator(

@@ -9,10 +9,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators.config import MappingConfig
-from compensators.gains import MeasuredAid
+from compensators.gains import Aid
 from compensators.limiter import soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.audiogram.thresholds import AudiogramLike, check_two_channels
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
@@ -30,7 +31,7 @@ LOWEST_CENTRE = 100.0
 """Centre of the lowest band of the correction in Hz."""
 
 
-class MappingCompensator(MeasuredAid, EarNetwork):
+class MappingCompensator(Aid, EarNetwork):
     """A trainable aid for whole signals: a network that amplifies each point of the spectrogram.
 
     In dB, the gain at a time and a frequency is that of the prescription NAL-R plus a correction by
@@ -45,6 +46,7 @@ class MappingCompensator(MeasuredAid, EarNetwork):
     softly limited at ``config.limit_spl``.
 
     Args:
+        audiogram: One or more ears, which are used by all calls that pass none.
         config: Sizes and choices, by default ``MappingConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Outputs contain the
             frequencies below 8 kHz only.
@@ -57,8 +59,8 @@ class MappingCompensator(MeasuredAid, EarNetwork):
         ValueError: A rate or level is out of range.
 
     >>> import hlsim
-    >>> model = MappingCompensator(MappingConfig(channels=8, blocks=1))
-    >>> model(hlsim.example_speech(), "N3").shape
+    >>> model = MappingCompensator("N3", MappingConfig(channels=8, blocks=1))
+    >>> model(hlsim.example_speech()).shape
     torch.Size([64320])
     """
 
@@ -69,12 +71,14 @@ class MappingCompensator(MeasuredAid, EarNetwork):
     @built_in_float32
     def __init__(
         self,
+        audiogram: AudiogramLike | None = None,
         config: MappingConfig | None = None,
         *,
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
+        self.store_ears(audiogram)
         self.config = config = config or MappingConfig()
         self.stft = config.stft
         sizes = config.channels, config.dense_depth, config.stride
@@ -89,6 +93,24 @@ class MappingCompensator(MeasuredAid, EarNetwork):
             self.phase_decoder = Decoder(*sizes, outputs=2, normalise=False)
         # The gains are averaged over one point of the feature maps.
         self._additional_field = config.step - config.hop
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+        """Return the output for whole signals, time-aligned with the input.
+
+        Args:
+            waveform: Input of the aid.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the waveform; by default those of the constructor.
+
+        Shape: (..., time) -> (..., time).
+
+        Raises:
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
+                not fit, or the waveform is on another device than the weights.
+        """
+        if audiogram is None and self._two_ears:
+            check_two_channels(waveform)
+        return super().forward(waveform, self.thresholds if audiogram is None else audiogram)
 
     def _finish(self, result: Tensor) -> Tensor:
         # The limit is the last step, because resampling can overshoot.

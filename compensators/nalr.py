@@ -4,17 +4,12 @@ import numpy as np
 import scipy
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
+from compensators.gains import Aid
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.prescription import nalr_gains_db
-from hlsim.audiogram.thresholds import (
-    AudiogramLike,
-    as_thresholds,
-    has_listeners,
-    resolve_thresholds,
-    store_thresholds,
-)
+from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
@@ -25,7 +20,7 @@ ORDER = 220
 """Order of the filter, which has one more tap."""
 
 
-class NALR(nn.Module):
+class NALR(Aid):
     """The simplest aid: a filter with the gains that NAL-R prescribes for an audiogram.
 
     NAL-R is the revised prescription of the National Acoustic Laboratories: Byrne and Dillon 1986,
@@ -52,9 +47,6 @@ class NALR(nn.Module):
     tensor(78.)
     """
 
-    thresholds: Tensor | None
-    _two_ears: bool
-
     def __init__(
         self,
         audiogram: AudiogramLike | None = None,
@@ -65,9 +57,7 @@ class NALR(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        thresholds = store_thresholds(audiogram, highest=HIGHEST_LEVEL)
-        self.register_buffer("thresholds", thresholds, persistent=False)
-        self._two_ears = has_listeners(audiogram)
+        self.store_ears(audiogram, highest=HIGHEST_LEVEL)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the amplified waveform, time-aligned with the input.
@@ -97,11 +87,11 @@ class NALR(nn.Module):
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
             return output.to(waveform.dtype)
 
-    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
+    def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Compute the insertion gains: the output level minus the input level at each frequency.
 
         Args:
-            audiogram: One or more ears.
+            audiogram: One or more ears, by default those of the constructor.
             level: Presentation level in dB SPL, which changes nothing here. All aids accept it.
 
         Returns:
@@ -113,7 +103,7 @@ class NALR(nn.Module):
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
         """
-        return nalr_gains_db(as_thresholds(audiogram, highest=HIGHEST_LEVEL))
+        return nalr_gains_db(self.find_thresholds(audiogram, highest=HIGHEST_LEVEL))
 
     def _taps(self, thresholds: Tensor) -> Tensor:
         """Return the taps of the filter for ears, symmetric around the middle one.

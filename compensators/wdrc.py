@@ -24,6 +24,7 @@ class WDRC(Wearable):
     and is 3 at most. The delay is 4 ms.
 
     Args:
+        audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
@@ -37,7 +38,7 @@ class WDRC(Wearable):
         ValueError: A value is out of range.
 
     >>> import hlsim
-    >>> WDRC()(hlsim.example_speech(), "N3").shape
+    >>> WDRC("N3")(hlsim.example_speech()).shape
     torch.Size([64320])
     """
 
@@ -45,6 +46,7 @@ class WDRC(Wearable):
 
     def __init__(
         self,
+        audiogram: AudiogramLike | None = None,
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
@@ -53,7 +55,7 @@ class WDRC(Wearable):
         limit_spl: float = 110.0,
         linked: bool = False,
     ) -> None:
-        super().__init__(sample_rate, full_scale_spl, linked)
+        super().__init__(audiogram, sample_rate, full_scale_spl, linked)
         check_number("attack", attack, 0.0, 1.0)
         check_number("release", release, 0.01, 2.0)
         check_number("limit_spl", limit_spl, 60.0, 140.0)
@@ -68,7 +70,7 @@ class WDRC(Wearable):
         Args:
             waveform: Input of the aid.
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform. It is required; None raises an error.
+                leading dimensions of the waveform; by default those of the constructor.
 
         Shape: (..., time) -> (..., time).
 
@@ -76,7 +78,7 @@ class WDRC(Wearable):
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes
                 do not fit.
         """
-        return self._process(waveform, audiogram, ())
+        return self._process_signals(waveform, audiogram, ())
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State

@@ -30,13 +30,12 @@ from compensators.filter_bank import (
     frame_power,
     gain_at_rate,
 )
-from compensators.gains import MeasuredAid
+from compensators.gains import Aid
 from compensators.limiter import soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
-    as_thresholds,
     check_two_channels,
     resolve_thresholds,
 )
@@ -59,7 +58,7 @@ BLOCK_SAMPLES = 320_000
 """Samples of all items that are processed together, which limits memory and changes no output."""
 
 
-class Wearable(MeasuredAid):
+class Wearable(Aid):
     """Base class of hearing aids that amplify bands with a delay of 4 ms.
 
     The signal is divided into bands, which are multiplied by their gains and added up again. This
@@ -71,6 +70,7 @@ class Wearable(MeasuredAid):
     sliders, ``SLIDERS``; and if their gains depend on the past, ``state_shapes``.
 
     Args:
+        audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
             kHz; components above get the gain of the highest band. A ``Stream`` accepts only 16000
             Hz. Whole signals at other rates are resampled, which adds 8.5 ms of look-ahead.
@@ -101,13 +101,20 @@ class Wearable(MeasuredAid):
     limit_spl: float
     state_shapes: Mapping[str, tuple[int, ...]]
 
-    def __init__(self, sample_rate: int, full_scale_spl: float, linked: bool = False) -> None:
+    def __init__(
+        self,
+        audiogram: AudiogramLike | None,
+        sample_rate: int,
+        full_scale_spl: float,
+        linked: bool,
+    ) -> None:
         super().__init__()
+        self.store_ears(audiogram)
         self.linked = linked
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
 
-    def stream(self, audiogram: AudiogramLike, **sliders: Slider) -> Stream:
+    def stream(self, audiogram: AudiogramLike | None = None, **sliders: Slider) -> Stream:
         """Return a function that processes a signal in chunks of any size, as it arrives.
 
         The output is that for the whole signal, ``latency`` samples late. The method ``set`` of the
@@ -115,7 +122,7 @@ class Wearable(MeasuredAid):
 
         Args:
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the chunks.
+                leading dimensions of the chunks; by default those of the constructor.
             sliders: Value from 0 to 1 under each slider's name, such as ``noise_reduction``, one
                 number or one value per item; by default those of ``SLIDERS``.
 
@@ -200,10 +207,13 @@ class Wearable(MeasuredAid):
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         sliders = signals.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
+        ears_per_gain = 2 if self.linked else 1  # the two ears of a pair get the same noise
+        signals, ears = (rows.repeat_interleave(ears_per_gain, 0) for rows in (signals, ears))
         sliders = sliders.expand(len(signals), -1)
-        return self.process_hops(signals, self.fit(ears), sliders, self.initial_state(sliders))[0]
+        output = self.process_hops(signals, self.fit(ears), sliders, self.initial_state(sliders))[0]
+        return output[::ears_per_gain]
 
-    def _process(
+    def _process_signals(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
     ) -> Tensor:
         """Return the time-aligned output for whole signals.
@@ -258,7 +268,9 @@ class Wearable(MeasuredAid):
         Raises:
             ValueError: An ear is not valid, or shapes do not fit.
         """
-        thresholds = resolve_thresholds(None, audiogram, waveform)
+        thresholds = resolve_thresholds(
+            self.thresholds, audiogram, waveform, two_ears=self._two_ears
+        )
         if self.linked:
             check_two_channels(waveform)
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
@@ -331,13 +343,13 @@ class Stream:
     torch.Size([100])
     """
 
-    def __init__(self, aid: Wearable, audiogram: AudiogramLike, **sliders: Slider) -> None:
+    def __init__(self, aid: Wearable, audiogram: AudiogramLike | None, **sliders: Slider) -> None:
         if aid.sample_rate != RATE:
             raise ValueError(
                 f"expected an aid with sample_rate={RATE} for a stream, got {aid.sample_rate}; "
                 f"use such an aid, and resample the signal to {RATE} Hz"
             )
-        as_thresholds(audiogram)  # the first chunk may come later
+        aid.find_thresholds(audiogram)  # validates it now, because the first chunk may come later
         self._aid = aid
         self._audiogram = audiogram
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
@@ -375,7 +387,7 @@ class Stream:
                 count = HOP - self._partial_hop.shape[-1]
                 if count == HOP <= samples.shape[-1]:
                     count = samples.shape[-1] // HOP * HOP
-                outputs.append(self._process(samples[:, :count]))
+                outputs.append(self._process_piece(samples[:, :count]))
                 samples = samples[:, count:]
             output = soft_limit(torch.cat(outputs, -1), self._aid.limit_spl) / gain
             output = output.reshape(*self._batch, -1).to(waveform.dtype)
@@ -409,7 +421,7 @@ class Stream:
             self._state = self._aid.initial_state(self._sliders)
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
 
-    def _process(self, samples: Tensor) -> Tensor:
+    def _process_piece(self, samples: Tensor) -> Tensor:
         """Process either whole hops, or a piece that ends within the current hop.
 
         Shape: (items, time) -> (items, time).

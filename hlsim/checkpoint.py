@@ -1,9 +1,11 @@
 """Checkpoints: folders in which trained models are saved, and from which they are loaded.
 
 A folder has three files: the weights (``model.safetensors``), the settings of the model with hashes
-(``config.json``) and a model card (``README.md``). No pickles are read or written, so that loading
-runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or ``hearing-aid``,
-says which class of model it holds.
+(``config.json``) and a model card (``README.md``). A fourth file, ``model.older.safetensors``,
+exists while a model replaces an older one. The weights are those whose hash is in ``config.json``,
+so that one of the two models can be loaded at any time. No pickles are read or written, so that
+loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or
+``hearing-aid``, says which class of model it holds.
 """
 
 import hashlib
@@ -24,6 +26,7 @@ Config = TypeVar("Config")
 Settings = Mapping[str, Any]
 
 WEIGHTS = "model.safetensors"
+OLDER_WEIGHTS = "model.older.safetensors"
 CONFIG = "config.json"
 CARD = "README.md"
 
@@ -81,21 +84,9 @@ def read_checkpoint(
             f"{folder}: expected a checkpoint of kind {' or '.join(kinds)}, got {kind}; load it "
             f"with {_loader_name(kind)}"
         )
-    try:
-        weights = (folder / WEIGHTS).read_bytes()
-    except OSError as error:
-        raise ValueError(f"{folder}: cannot read {WEIGHTS}: {error}") from error
+    weights = read_weights(folder)
     settings: Any = record.get("config")
-    digests = {
-        WEIGHTS: (hashlib.sha256(weights).hexdigest(), record.get("sha256")),
-        CONFIG: (_digest(settings), record.get("config_sha256")),
-    }
-    for file, (digest, recorded) in digests.items():
-        if digest != recorded:
-            raise ValueError(
-                f"{folder / file}: the file is damaged or was changed after saving, because its "
-                f"SHA-256 is not that in {CONFIG}; download or save the checkpoint again"
-            )
+    _check_hash(folder / CONFIG, _digest(settings), record.get("config_sha256"))
     try:
         # Gradients may flow through the model later, hence no inference mode. Initialisation must
         # not advance the caller's random numbers.
@@ -110,6 +101,40 @@ def read_checkpoint(
         return model
     with torch.inference_mode(False):
         return model.to(device)
+
+
+def read_weights(folder: str | Path) -> bytes:
+    """Read the weights of a checkpoint in safetensors' format.
+
+    Args:
+        folder: Folder of the checkpoint.
+
+    Raises:
+        ValueError: There is no checkpoint, the weights cannot be read, or they are not those that
+            were saved with ``config.json``.
+
+    >>> len(read_weights(checkpoints_folder() / "hearing-aid")) > 100_000
+    True
+    """
+    recorded = read_record(folder).get("sha256")
+    file, older_file = Path(folder) / WEIGHTS, Path(folder) / OLDER_WEIGHTS
+    try:
+        weights = file.read_bytes()
+        if older_file.is_file() and hashlib.sha256(weights).hexdigest() != recorded:
+            weights = older_file.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot read {WEIGHTS}: {error}") from error
+    _check_hash(file, hashlib.sha256(weights).hexdigest(), recorded)
+    return weights
+
+
+def _check_hash(file: Path, digest: str, recorded: Any) -> None:
+    """Raise ValueError if the hash of a file is not the recorded one."""
+    if digest != recorded:
+        raise ValueError(
+            f"{file}: the file is damaged or was changed after saving, because its SHA-256 is not "
+            f"that in {CONFIG}; download or save the checkpoint again"
+        )
 
 
 def read_record(name: str | Path) -> dict[str, Any]:
@@ -169,8 +194,9 @@ def save_checkpoint(
 ) -> None:
     """Save a model as a checkpoint, in place of an older one in the same folder.
 
-    If writing fails, an older checkpoint stays as it was. Its other files always stay, and so does
-    a card that somebody wrote; otherwise, a card is written that lists ``about``.
+    If writing fails, or the process is killed, the older checkpoint or the new one can be loaded.
+    Other files in the folder always stay, and so does a card that somebody wrote; otherwise, a card
+    is written that lists ``about``.
 
     Args:
         folder: Folder to write.
@@ -195,9 +221,17 @@ def save_checkpoint(
     hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(config)}
     record = {"kind": kind, "config": config, **hashes, "about": about}
     target = Path(folder)
-    with atomic_path(target / WEIGHTS) as new_weights, atomic_path(target / CONFIG) as new_config:
+    try:
+        older_weights = read_weights(target)
+    except ValueError:  # There is no older checkpoint, or it is damaged.
+        older_weights = None
+    # The weights are replaced first, then the configuration with their hash.
+    with atomic_path(target / CONFIG) as new_config, atomic_path(target / WEIGHTS) as new_weights:
         new_weights.write_bytes(weights)
         new_config.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        if older_weights is not None:
+            write_atomically(target / OLDER_WEIGHTS, older_weights)
+    (target / OLDER_WEIGHTS).unlink(missing_ok=True)
     _write_card(target, kind, about)
 
 

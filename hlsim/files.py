@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import codecs
 import csv
+import errno
 import hashlib
 import io
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+_LOCK = ".lock"
+"""Name of the file by which processes keep each other out of a folder."""
 
 
 @contextmanager
@@ -44,6 +55,53 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             os.replace(temporary, target)
     except OSError as error:
         raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def lock_folder(folder: str | Path) -> Iterator[None]:
+    """Keep other processes out of a folder, as long as they call this function as well.
+
+    The operating system releases the lock when the ``with`` block or the process ends, even if the
+    process is killed.
+
+    Args:
+        folder: Folder, which is made if there is none.
+
+    Raises:
+        ValueError: Another process has locked the folder, or the folder cannot be written.
+
+    >>> with tempfile.TemporaryDirectory() as folder, lock_folder(folder):
+    ...     pass
+    """
+    path = Path(folder) / _LOCK
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a+")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with file:
+        try:
+            _lock(file)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
+                file.seek(0)
+                raise ValueError(
+                    f"{folder}: process {file.read()} is writing to this folder; wait until it "
+                    "ends, or choose another folder"
+                ) from error
+            # Some file systems of clusters have no locks.
+        file.truncate(0)
+        print(os.getpid(), end="", file=file, flush=True)
+        yield
+
+
+def _lock(file: TextIO) -> None:
+    """Lock an open file, or raise OSError if another process has locked it."""
+    if sys.platform == "win32":
+        file.seek(2**20)  # Locked bytes cannot be read by other processes.
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def write_atomically(path: str | Path, data: str | bytes) -> None:

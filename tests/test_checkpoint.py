@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -14,6 +16,7 @@ from hlsim import NeuroMSBG, list_pretrained, load_pretrained
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig
 
+FILES = {"model.safetensors", "config.json", "README.md"}
 SMALL = NeuroConfig(channels=4, blocks=1)
 
 
@@ -84,8 +87,44 @@ def test_saving_again_writes_two_files_and_keeps_all_others(
         patch.setattr(Path, "write_text", Mock(side_effect=OSError("disk full")))
         save(folder, NeuroMSBG(NeuroConfig(channels=8, blocks=1)))
     load_pretrained(folder)
-    names = {path.name for path in folder.iterdir()}
-    assert names == {"model.safetensors", "config.json", "README.md"}
+    assert {path.name for path in folder.iterdir()} == FILES
+
+
+@pytest.mark.parametrize("error", [OSError("locked"), KeyboardInterrupt()])
+@pytest.mark.parametrize("failing", range(5))
+def test_a_checkpoint_can_be_loaded_after_a_save_that_stopped_at_any_point(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, failing: int, error: BaseException
+) -> None:
+    """Both of two saves stop at the same point; the process ends there without cleaning up."""
+    operations = {"replace": os.replace, "unlink": os.unlink}
+    calls: list[str] = []
+
+    def stop(name: str) -> Any:
+        def operation(*arguments: Any, **options: Any) -> None:
+            if ".hlsim-" in str(arguments[-1]) or options.get("dir_fd"):
+                return operations[name](*arguments, **options)  # cleans up a temporary folder
+            calls.append(name)
+            if len(calls) == failing + 1:
+                raise error
+            operations[name](*arguments, **options)
+
+        return operation
+
+    old, models = load_pretrained(folder), [NeuroMSBG(SMALL) for _ in range(2)]
+    for model in models:
+        calls.clear()
+        with monkeypatch.context() as patch, suppress(ValueError, KeyboardInterrupt, OSError):
+            for name in operations:
+                patch.setattr(os, name, stop(name))
+            save(folder, model)
+        # three replacements, the removal of the older weights, and the card
+        assert len(calls) == min(failing + 1, 5)
+        weights = load_pretrained(folder).state_dict()
+        candidates = [candidate.state_dict() for candidate in (old, *models)]
+        equal = [all(torch.equal(weights[n], c[n]) for n in c) for c in candidates]
+        assert any(equal)
+    save(folder, models[0])
+    assert {path.name for path in folder.iterdir()} == FILES
 
 
 def test_changed_weights_are_rejected(folder: Path) -> None:

@@ -20,9 +20,9 @@ from compensators import load_compensator
 from hlsim.audio import write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE
-from hlsim.cli.progress import show_progress
 from hlsim.data.layouts import find_corpus
 from hlsim.evaluation import haspi_report
+from hlsim.progress import show_progress
 from hlsim.report.recordings_page import write_report
 from hlsim.report.verdict import verdict
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hlsim.cli.inputs import check_extras
 from hlsim.cli.options import Parser, count
-from hlsim.cli.progress import show_progress
+from hlsim.progress import show_progress
 
 
 def demo(parser: Parser) -> None:

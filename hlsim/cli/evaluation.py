@@ -21,7 +21,7 @@ from hlsim.cli.options import (
     seed,
     sound_level,
 )
-from hlsim.cli.progress import show_progress
+from hlsim.progress import show_progress
 
 if TYPE_CHECKING:
     from hlsim.evaluation.result import Evaluation

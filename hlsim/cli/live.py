@@ -68,10 +68,6 @@ def _live(options: argparse.Namespace) -> None:
     else:
         warn_of_other_ears({options.compensator: options.compensator}, ears)
         aid = load_compensator(options, NEURO_RATE)
-        if not hasattr(aid, "stream"):
-            raise ValueError(
-                f"{options.compensator} cannot process blocks; choose wdrc or a hearing aid"
-            )
         stream = aid.stream(ears, **sliders)
         block = latency = aid.latency
     play(

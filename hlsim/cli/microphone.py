@@ -21,9 +21,9 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import Listener
 from hlsim.calibration import NEURO_RATE, level_spl
-from hlsim.cli.progress import show_line
 from hlsim.extras import require
 from hlsim.neuro import NeuroMSBG
+from hlsim.progress import show_line
 
 KEYS = {"noise_reduction": ("n", "N"), "amplification": ("a", "A")}
 """Keys that lower and raise each slider."""

@@ -62,7 +62,7 @@ class EarNetwork(nn.Module):
         # receptive field in samples at 16 kHz of what a subclass adds to the layers of ``config``
         self._additional_field = 0
 
-    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
         """Process waveforms for ears.
 
         Shape: (..., time) -> (..., time).

@@ -295,6 +295,14 @@ class BatchData(L.LightningDataModule):
         self.teacher = teacher
         self.workers = workers
 
+    def setup(self, stage: str) -> None:
+        trainer: Any = self.trainer
+        if trainer.accumulate_grad_batches != 1:
+            raise ValueError(
+                "accumulate_grad_batches is not supported, because each step has the batch of its "
+                "number; raise batch in the recipe instead"
+            )
+
     def train_dataloader(self) -> DataLoader[Any]:
         trainer: Any = self.trainer
         first = MAX_DEVICES * trainer.global_step + trainer.global_rank

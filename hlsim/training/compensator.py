@@ -12,11 +12,10 @@ from torch import Tensor, nn
 from compensators.hearing_aid import HearingAid
 from compensators.loading import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
-from hlsim.checkpoint import read_record
 from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.training.batches import Batch, TrainingData, compensator_data
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
-from hlsim.training.module import TrainingModule, initial_network
+from hlsim.training.module import TrainingModule, describe_simulator, initial_network
 from hlsim.training.recipes import CompensatorRecipe
 from hlsim.training.trainer import train_network
 
@@ -57,8 +56,7 @@ class CompensatorTraining(TrainingModule):
         if not self.trains_amplification:
             network.correct.requires_grad_(False)
         elif isinstance(network, HearingAid) and not (self.denoising or self.intelligibility):
-            for part in (network.enter, network.recur, network.leave):
-                part.requires_grad_(False)
+            network.noise_reduction_network.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
@@ -118,16 +116,11 @@ def train_compensator(
     ...     ear = Audiogram.standard("N4")
     ...     return load_compensator(train_compensator(data, recipe, out=out, audiogram=ear))
     """
-    about: dict[str, Any] = {
+    about = {
         "data": data.identity(),
         "audiogram": audiogram.to_dict() if audiogram else None,
-        "simulator": str(simulator),
+        **describe_simulator("simulator", simulator),
     }
-    if isinstance(simulator, nn.Module):
-        about["simulator"] = type(simulator).__name__
-    elif str(simulator) != "msbg":
-        # The folder may contain another simulator when the training resumes.
-        about["simulator_sha256"] = read_record(simulator)["sha256"]
     return train_network(
         CompensatorTraining(recipe, simulator=simulator),
         compensator_data(data, recipe, audiogram),

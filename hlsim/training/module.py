@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import lightning as L
+import safetensors.torch
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from hlsim.checkpoint import read_record
+from hlsim.simulators import EXACT, PluginSimulator, load_simulator
 from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
 
@@ -162,3 +167,33 @@ def initial_network(
             "'model' of the recipe; choose another start, or leave 'model' out"
         )
     return start.train().requires_grad_(True)
+
+
+def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str, str]:
+    """Describe a simulator in the record of a training, which resumes only with the same one.
+
+    Args:
+        role: Name of the entry, ``"simulator"`` or ``"teacher"``.
+        simulator: Name, folder or module, see ``load_simulator``.
+
+    Returns:
+        The name of the simulator, or its class, under ``role``. For a network, a hash of its
+        weights follows under ``role`` with ``_sha256``, because a folder may contain another
+        network when the training resumes.
+
+    Raises:
+        ValueError: There is no such simulator.
+
+    >>> describe_simulator("teacher", "msbg")
+    {'teacher': 'msbg'}
+    """
+    loaded = load_simulator(simulator)
+    if isinstance(loaded, PluginSimulator):
+        return {role: str(loaded)}
+    if isinstance(simulator, nn.Module):
+        state = {name: tensor.cpu().contiguous() for name, tensor in loaded.state_dict().items()}
+        digest = hashlib.sha256(safetensors.torch.save(state)).hexdigest()
+        return {role: type(simulator).__name__, f"{role}_sha256": digest}
+    if str(simulator) == EXACT:
+        return {role: EXACT}
+    return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}

@@ -15,9 +15,9 @@ from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
-from hlsim.simulators import EXACT, PluginSimulator, load_simulator
+from hlsim.simulators import load_simulator
 from hlsim.training.batches import Batch, TrainingData, simulator_data
-from hlsim.training.module import TrainingModule, initial_network
+from hlsim.training.module import TrainingModule, describe_simulator, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.trainer import train_network
 
@@ -111,16 +111,12 @@ def train_simulator(
     ...     recipe = SimulatorRecipe(steps=1000)
     ...     return load_pretrained(train_simulator(TrainingData(Path(speech)), recipe, out=out))
     """
-    simulator = load_simulator(teacher)
-    about = {"data": data.identity()}
-    if teacher != EXACT:
-        about["teacher"] = str(simulator) if isinstance(simulator, PluginSimulator) else teacher
     return train_network(
         SimulatorTraining(recipe),
-        simulator_data(data, recipe, simulator),
+        simulator_data(data, recipe, load_simulator(teacher)),
         SIMULATOR,
         out=out,
-        about=about,
+        about={"data": data.identity(), **describe_simulator("teacher", teacher)},
         callbacks=[EMAWeightAveraging(use_buffers=False, decay=recipe.average)],
         **options,
     )

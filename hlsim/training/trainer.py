@@ -7,7 +7,8 @@ import logging
 import math
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import timedelta
 from pathlib import Path
@@ -20,7 +21,9 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
-from hlsim.checkpoint import read_record, save_checkpoint
+from hlsim.checkpoint import read_record, read_weights, save_checkpoint
+from hlsim.files import lock_folder
+from hlsim.progress import clear_line, show_progress
 from hlsim.training.batches import BatchData
 from hlsim.training.module import TrainingModule
 from hlsim.version import __version__
@@ -101,6 +104,36 @@ class BestCheckpoint(L.Callback):
             save_checkpoint(self.folder, self.kind, network, network.config.to_dict(), record)
 
 
+class StepProgress(L.Callback):
+    """Callback that shows steps, remaining time, loss and scores on stderr, see ``show_progress``.
+
+    >>> StepProgress().show is None  # until the training starts
+    True
+    """
+
+    def __init__(self) -> None:
+        self.show: Callable[..., None] | None = None
+
+    def _report(self, trainer: L.Trainer, module: Any) -> None:
+        if not trainer.is_global_zero:
+            return
+        self.show = self.show or show_progress("steps")
+        metrics = trainer.callback_metrics
+        values = [f"{name} {metrics[name]:.3f}" for name in ("loss", "score") if name in metrics]
+        self.show(
+            trainer.global_step, module.recipe.steps, "".join(f"; {value}" for value in values)
+        )
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
+        self._report(trainer, module)
+
+    def on_validation_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
+        self._report(trainer, module)
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
+        clear_line(sys.stderr)  # The module prints the scores.
+
+
 def train_network(
     module: TrainingModule,
     data: BatchData,
@@ -127,14 +160,16 @@ def train_network(
             reaches it ends before the recipe's last step. By default, there is no limit.
         options: Options of Lightning's ``Trainer``, such as ``accelerator="cpu"`` and
             ``devices=2``. Each device draws a batch of its own at every step, so that N devices
-            train with N batches per step. By default, only a terminal shows a progress bar.
+            train with N batches per step. ``enable_progress_bar=True`` shows Lightning's progress
+            bar instead of the steps and the remaining time.
 
     Returns:
         The folder ``checkpoint`` below ``out``.
 
     Raises:
-        ValueError: The folder contains another training or a broken state, there is no such device,
-            or the loss is not finite.
+        ValueError: The folder contains another training or a broken state, or another process is
+            writing to it; there is no such device; gradients would be accumulated; or the loss is
+            not finite.
         KeyboardInterrupt: The training was interrupted. It resumes from its last validation.
     """
     recipe = module.recipe
@@ -142,9 +177,6 @@ def train_network(
     start = {"start_sha256": read_record(recipe.start)["sha256"]} if recipe.start else {}
     record = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about}
     state = folder / "last.ckpt"
-    is_resumption = state.exists()
-    if is_resumption:
-        _check_state(state, record)
     duration = None if max_minutes is None else timedelta(minutes=max_minutes)
     last = ModelCheckpoint(
         dirpath=folder,
@@ -153,44 +185,66 @@ def train_network(
         enable_version_counter=False,
     )
     best = BestCheckpoint(folder / "checkpoint", kind, record)
-    options.setdefault("enable_progress_bar", sys.stdout.isatty())
+    callbacks = [Timer(duration, verbose=False), *callbacks, best, last]
+    if not options.setdefault("enable_progress_bar", False):
+        callbacks.append(StepProgress())
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), ExitStack() as locks:
         warnings.filterwarnings("ignore", f".*({_EXPECTED_WARNINGS})")
         try:
             trainer = L.Trainer(
                 use_distributed_sampler=False,  # Each process draws its own batches.
                 max_epochs=-1,
                 max_steps=recipe.steps,
-                limit_train_batches=recipe.steps,  # which the progress bar shows
+                limit_train_batches=recipe.steps,
                 val_check_interval=recipe.validate_every,
                 check_val_every_n_epoch=None,  # The interval may be longer than the training.
                 num_sanity_val_steps=-1,  # A training begins with a validation.
                 gradient_clip_val=1.0,
-                callbacks=[Timer(duration, verbose=False), *callbacks, best, last],
+                callbacks=callbacks,
                 enable_model_summary=False,
                 logger=TensorBoardLogger(str(folder), name="", version="events"),
                 **options,
             )
         except MisconfigurationException as error:
             raise ValueError(f"cannot train with {options}: {error}") from error
+        if trainer.is_global_zero:
+            locks.enter_context(lock_folder(folder))
+        is_resumption = state.exists()
+        if is_resumption:
+            step = _check_state(state, record, best.folder)
+            if step >= recipe.steps:
+                trainer.print(f"the training has finished: all {step} steps were taken")
+                return best.folder
+            trainer.print(f"the training continues after step {step} of {recipe.steps}")
         try:
             ckpt_path = state if is_resumption else None
             trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
         except SystemExit as error:  # Lightning exits after Ctrl-C.
             raise KeyboardInterrupt from error
+        finally:
+            clear_line(sys.stderr)
     return best.folder
 
 
-def _check_state(path: Path, record: Mapping[str, Any]) -> None:
-    """Raise ValueError unless a file is the state of the training that should resume.
+def _check_state(path: Path, record: Mapping[str, Any], best_folder: Path) -> int:
+    """Validate that a file is the state of the training that should resume.
 
     Args:
         path: File of the state.
         record: Description of the training that should resume.
+        best_folder: Folder of the best network of the training.
+
+    Returns:
+        The number of steps taken.
+
+    Raises:
+        ValueError: The state is damaged or belongs to another training, or the best network is
+            missing or damaged.
     """
     try:
-        actual = torch.load(path, map_location="cpu", weights_only=True)["record"]
+        contents = torch.load(path, map_location="cpu", weights_only=True)
+        actual, steps = contents["record"], int(contents["global_step"])
     except Exception as error:  # torch, zipfile and pickle raise various exceptions.
         raise ValueError(
             f"{path}: cannot be read as the state of a training; delete it to start from the "
@@ -205,3 +259,11 @@ def _check_state(path: Path, record: Mapping[str, Any]) -> None:
             f"{path}: the state belongs to a training that differs in {', '.join(differences)}; "
             "choose another output folder"
         )
+    try:
+        read_weights(best_folder)
+    except ValueError as error:
+        raise ValueError(
+            f"the training cannot continue, because its best network is lost ({error}); restore "
+            f"{best_folder}, or delete {path} to start from the beginning"
+        ) from error
+    return steps

@@ -232,7 +232,7 @@ def test_simulated_blocks_equal_the_whole_signal() -> None:
         ("--listener nosuch.csv", "nosuch.csv"),
         ("--audiogram N3 --input 7", "No input device matching 7"),
         ("--audiogram N3 --output Phones", "Invalid sample rate [PaErrorCode -9997]; choose two"),
-        ("--audiogram N3 --compensator nalr", "nalr cannot process blocks"),
+        ("--audiogram N3 --compensator nalr", "NALR processes whole signals only"),
         ("--audiogram N3 --simulate --amplification 1", "no effect with --simulate"),
         ("--audiogram N3 --compensator wdrc --amplification 1", "no effect with wdrc"),
         ("--audiogram N7", "100"),

@@ -199,7 +199,7 @@ def test_both_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:
 def test_a_compensator_for_another_ear_warns_once(
     tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], ear: str, warnings: int
 ) -> None:
-    model = MappingCompensator(MappingConfig(channels=8, blocks=1))
+    model = MappingCompensator(config=MappingConfig(channels=8, blocks=1))
     about = {"audiogram": Audiogram.standard("N4").to_dict()}
     save_checkpoint(tmp_path / "mine", "mapping-compensator", model, model.config.to_dict(), about)
     options = ("--audiogram", ear, "--compensator", tmp_path / "mine")

@@ -26,7 +26,7 @@ def varied_hearing_aid(**options: Any) -> HearingAid:
 def varied_mapping(config: MappingConfig = SMALL, **options: Any) -> MappingCompensator:
     """Build a network whose correction is about 5 dB."""
     torch.manual_seed(5)
-    model = MappingCompensator(config, **options)
+    model = MappingCompensator(config=config, **options)
     for decoder in (model.magnitude_decoder, model.phase_decoder):
         if decoder is not None:
             torch.nn.init.normal_(decoder.leave.weight, std=0.1)

@@ -11,6 +11,7 @@ from torch import Tensor
 from compensators import (
     NALR,
     WDRC,
+    HearingAid,
     HearingAidConfig,
     MappingCompensator,
     MappingConfig,
@@ -18,7 +19,7 @@ from compensators import (
     save_compensator,
 )
 from compensators.limiter import soft_limit
-from hlsim import Audiogram
+from hlsim import Audiogram, Listener
 from hlsim.calibration import set_level
 from tests.compensators.aids import (
     EAR,
@@ -65,6 +66,34 @@ def test_scale_and_precision_are_those_of_the_caller(
     assert build()(signal.half(), EAR).dtype == torch.float16
 
 
+@pytest.mark.parametrize("kind", [NALR, WDRC, HearingAid, MappingCompensator])
+def test_an_aid_may_have_an_ear_of_its_own(kind: Callable[..., Any], utterance: Tensor) -> None:
+    settings = {"config": SMALL} if kind is MappingCompensator else {}
+    torch.manual_seed(5)
+    aid = kind("N3", **settings)
+    torch.manual_seed(5)
+    without_ear = kind(**settings)
+    signal, pair = utterance[:4000], Listener("N3", "S2")
+    assert torch.equal(aid(signal), without_ear(signal, "N3"))
+    assert torch.equal(aid(signal, "S2"), without_ear(signal, "S2"))
+    assert torch.equal(aid.gains(), without_ear.gains("N3"))
+    assert aid.state_dict().keys() == without_ear.state_dict().keys()
+    of_listener = kind(pair, **settings)
+    of_listener.load_state_dict(aid.state_dict())
+    assert torch.equal(of_listener(signal.expand(2, -1)), without_ear(signal.expand(2, -1), pair))
+    with pytest.raises(ValueError, match="for two ears"):
+        of_listener(signal)
+    for call in (without_ear, lambda _: without_ear.gains()):
+        with pytest.raises(ValueError, match="expected an audiogram"):
+            call(signal)
+
+
+@pytest.mark.parametrize("name", ["nalr", "compensator-general"])
+def test_an_aid_for_whole_signals_says_that_it_has_no_stream(name: str) -> None:
+    with pytest.raises(ValueError, match="whole signals only; load wdrc or hearing-aid"):
+        load_compensator(name).stream("N3")
+
+
 @every_aid
 def test_silence_stays_silent_with_finite_gradients(build: Callable[..., Any]) -> None:
     for samples in (1, 37, 4001):
@@ -106,7 +135,7 @@ SAVED: dict[str, Any] = {
 @pytest.mark.parametrize("name", SAVED)
 def test_a_saved_aid_is_the_same_when_loaded(name: str, tmp_path: Path, utterance: Tensor) -> None:
     aid = SAVED[name]()
-    save_compensator(MappingCompensator(SMALL), tmp_path / "mine")
+    save_compensator(MappingCompensator(config=SMALL), tmp_path / "mine")
     save_compensator(aid, tmp_path / "mine")  # replaces the other one
     loaded: Any = load_compensator(tmp_path / "mine")
     assert type(loaded) is type(aid) and loaded.config == aid.config and not loaded.training

@@ -43,6 +43,14 @@ def test_gains_are_those_of_the_output_for_other_noise(name: str, level: float) 
     assert float((aid.gains("N3", level) - gains).abs().max()) < 1.0
 
 
+@pytest.mark.parametrize("name", ["wdrc", "hearing-aid"])
+def test_linked_gains_of_any_number_of_ears(name: str) -> None:
+    """Both ears of a pair get the same noise, so that linking changes nothing."""
+    linked, alone = load_compensator(name, linked=True), load_compensator(name)
+    for ears in ("N3", ["N2", "N3", "S2"], [Listener("N2", "N4")]):
+        torch.testing.assert_close(linked.gains(ears), alone.gains(ears))
+
+
 def test_gains_have_the_shape_of_the_ears_and_need_valid_ones() -> None:
     listener = Listener("N2", "N4")
     for aid in (NALR(), WDRC(), load_compensator("hearing-aid")):
@@ -50,6 +58,6 @@ def test_gains_have_the_shape_of_the_ears_and_need_valid_ones() -> None:
         assert both.shape == (2, 2, 8)
         torch.testing.assert_close(both[0, 1], aid.gains("N4"))
         with pytest.raises(ValueError):
-            aid.gains(None)  # type: ignore[arg-type]
+            aid.gains(None)
     with pytest.raises(ValueError):
         WDRC().gains("N3", 121.0)

@@ -27,7 +27,7 @@ def test_aids_without_training_have_names() -> None:
 
 
 def test_a_checkpoint_names_the_ear_that_it_was_trained_for(tmp_path: Path) -> None:
-    model = MappingCompensator(SMALL)
+    model = MappingCompensator(config=SMALL)
     records = {"one": {"audiogram": EAR.to_dict()}, "all": {"audiogram": None}, "old": {}}
     for name, record in records.items():
         settings = model.config.to_dict()

@@ -68,6 +68,14 @@ def test_chunks_of_any_size_equal_the_whole_signal(
 
 
 @both_aids
+def test_a_stream_uses_the_ear_of_the_aid(name: str, noise: Tensor) -> None:
+    aid = build_wearable(name, audiogram=EAR)
+    assert torch.equal(aid.stream()(noise), aid.stream(EAR)(noise))
+    with pytest.raises(ValueError, match="expected an audiogram"):
+        build_wearable(name).stream()
+
+
+@both_aids
 def test_a_stream_of_arrays_returns_arrays(name: str, noise: Tensor) -> None:
     """An audio library hands over arrays, which may be read-only and not contiguous."""
     aid = build_wearable(name)

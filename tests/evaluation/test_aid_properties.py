@@ -122,7 +122,7 @@ def test_an_equaliser_has_the_mean_gain_of_its_aid() -> None:
     np.testing.assert_allclose(measured[0], gains, atol=1.0)
     equaliser = EqualiserLike(Filter(), noise, (50.0, 80.0))
     assert equaliser.gains_db(N3) == pytest.approx(measured[0], abs=0.06)
-    limited = MappingCompensator(MappingConfig(limit_spl=80.0)).eval()
+    limited = MappingCompensator(config=MappingConfig(limit_spl=80.0)).eval()
     soft, loud = measure_gain_curve(limited, N3, noise, (50.0, 80.0))["gain_db"]
     assert np.mean(loud) < np.mean(soft) - 6.0
 

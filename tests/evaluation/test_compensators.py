@@ -165,7 +165,7 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
 def test_command(
     options: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = MappingCompensator(MappingConfig(channels=8, blocks=1))
+    model = MappingCompensator(config=MappingConfig(channels=8, blocks=1))
     about = {"audiogram": Audiogram.standard("N4").to_dict()}
     save_checkpoint(tmp_path / "n4", "mapping-compensator", model, model.config.to_dict(), about)
     command = ["evaluate-compensator", f"mine={tmp_path / 'n4'}", "--speech", options["speech"]]

@@ -72,7 +72,9 @@ def test_checkpoints(tmp_path: Path, kind: str, file: str) -> None:
         config = NeuroConfig(channels=4, blocks=1)
         save_checkpoint(tmp_path / "c", "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
     else:
-        save_compensator(HearingAid(HearingAidConfig(bands=4, bins=0, width=4)), tmp_path / "c")
+        save_compensator(
+            HearingAid(config=HearingAidConfig(bands=4, bins=0, width=4)), tmp_path / "c"
+        )
     path, record = tmp_path / "c" / file, json.loads((tmp_path / "c" / "config.json").read_text())
     data = path.read_bytes()
     for seed in range(TRIALS):

@@ -70,6 +70,16 @@ def test_another_simulator_needs_another_folder(data: TrainingData, tmp_path: Pa
     save_checkpoint(simulator, "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
     with pytest.raises(ValueError, match="differs in simulator_sha256;"):
         train(data, SMALL, tmp_path / "out", simulator=simulator)
+    train(data, SMALL, tmp_path / "module", simulator=NeuroMSBG(config))
+    other = NeuroMSBG(config)
+    torch.nn.init.ones_(next(other.parameters()))
+    with pytest.raises(ValueError, match="differs in simulator_sha256;"):
+        train(data, SMALL, tmp_path / "module", simulator=other)
+
+
+def test_a_simulator_of_your_own_is_named_in_the_record(data: TrainingData, tmp_path: Path) -> None:
+    about = train(data, SMALL, tmp_path, simulator="hlsim:MSBG")
+    assert about["simulator"] == "hlsim:MSBG"
 
 
 def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from hlsim.training.denoising import attenuation_error, missing_intelligibility
 
 
 def test_no_attenuation_is_right_without_noise_and_wrong_in_noise() -> None:
-    aid = HearingAid(HearingAidConfig(width=8, hidden=8))
+    aid = HearingAid(config=HearingAidConfig(width=8, hidden=8))
     with torch.no_grad():
         aid.leave.bias.fill_(-60.0)
         aid.leave.weight.zero_()
@@ -30,7 +30,10 @@ def test_no_attenuation_is_right_without_noise_and_wrong_in_noise() -> None:
 def test_intelligibility_is_haspi_at_the_level_of_amplified_clean_speech(
     speech: list[tuple[torch.Tensor, int]],
 ) -> None:
-    aid, ears = HearingAid(HearingAidConfig(width=8, hidden=8)).eval(), torch.full((2, 8), 50.0)
+    aid, ears = (
+        HearingAid(config=HearingAidConfig(width=8, hidden=8)).eval(),
+        torch.full((2, 8), 50.0),
+    )
     clean = set_level(resample(*speech[0], 16000)[:, :16000], 65.0).expand(2, -1)
     signal = clean + set_level(torch.randn(2, 16000), 60.0)
     missing = missing_intelligibility(aid, signal, clean, ears)

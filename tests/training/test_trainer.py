@@ -1,6 +1,8 @@
 """A training takes its steps, resumes, saves the best network, and rejects other settings."""
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -107,13 +109,16 @@ def test_takes_the_recipes_steps_and_validates_after_the_last(
     module = VectorTraining()
     assert run(module, tmp_path / "new" / "out") == tmp_path / "new" / "out" / "checkpoint"
     assert module.steps_taken == list(range(9))
-    lines = capsys.readouterr().out.splitlines()
+    output = capsys.readouterr()
+    lines = output.out.splitlines()
     assert [line.split(":")[0] for line in lines] == [f"step {i} of 9" for i in (0, 2, 4, 6, 8, 9)]
     assert "valid_sum" in lines[0]
+    assert output.err.startswith("0 of 9 steps\n") and "9 of 9 steps; loss " in output.err
     assert list((tmp_path / "new" / "out" / "events").glob("events.out.tfevents.*"))
     again = VectorTraining()
     run(again, tmp_path / "new" / "out")
     assert again.steps_taken == []
+    assert capsys.readouterr().out == "the training has finished: all 9 steps were taken\n"
 
 
 @pytest.mark.parametrize(
@@ -140,6 +145,54 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(
     assert not torch.equal(
         whole["state_dict"]["network.values"], whole["current_model_state"]["network.values"]
     )
+
+
+def test_a_resumed_training_shows_its_total(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(VectorTraining(interrupt="stopped"), tmp_path)
+    capsys.readouterr()
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    run(VectorTraining(), tmp_path)
+    output = capsys.readouterr()
+    assert output.out.startswith("the training continues after step 5 of 9\n")
+    lines = [line.strip() for line in output.err.split("\r") if line.strip()]
+    assert lines[0].startswith("6 of 9 steps")
+    assert any(line.startswith("7 of 9 steps, 0.0 min left") for line in lines)
+    assert all(len(line) < 80 for line in lines)
+
+
+def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    code = (
+        "import os, signal; from hlsim.files import lock_folder\n"
+        f"with lock_folder({str(tmp_path)!r}):\n"
+        "    print(os.getpid(), flush=True); signal.pause()"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        process = int(other.stdout.readline())
+        try:
+            with pytest.raises(ValueError, match=f"process {process} is writing to this folder"):
+                run(VectorTraining(), tmp_path)
+        finally:
+            other.kill()
+    run(VectorTraining(steps=1), tmp_path)
+
+
+@pytest.mark.parametrize("file", ["checkpoint", "checkpoint/model.safetensors"])
+def test_a_training_without_its_best_network_does_not_continue(tmp_path: Path, file: str) -> None:
+    for interrupt in ("stopped", ""):
+        run(VectorTraining(interrupt=interrupt), tmp_path)
+        lost = (tmp_path / file).rename(tmp_path / "lost")
+        with pytest.raises(ValueError, match=f"its best network is lost .* {tmp_path}/checkpoint"):
+            run(VectorTraining(), tmp_path)
+        lost.rename(tmp_path / file)
+
+
+def test_gradients_are_not_accumulated(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="raise batch in the recipe"):
+        run(VectorTraining(), tmp_path, accumulate_grad_batches=2)
 
 
 def test_time_only_stops(tmp_path: Path) -> None:
