@@ -201,7 +201,11 @@ def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
 
 @constant
 def threshold_in_quiet() -> NDArray[np.float64]:
-    """Return the softest level that a normal ear hears in each band in dB SPL, (24,).
+    """Return the softest level that a normal ear hears at the centre of each of the 24 bands.
+
+    The centre is the geometric mean of a band's edges.
+
+    Returns: Levels in dB SPL, (24,).
 
     Source: Terhardt (1979), Equation 1.
 

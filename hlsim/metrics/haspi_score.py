@@ -34,6 +34,7 @@ from torch import Tensor
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
+from hlsim.metrics.ear import alignment
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
@@ -176,7 +177,7 @@ class HaspiReference(Reference):
         frames = envelopes.smooth_frames(levels, delays, extent)
         return _Channels(
             channels,
-            ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
+            alignment.lag_spectrum(cochlea.power.sqrt(), extent),
             delays,
             envelopes.mean_amplitude(frames),
             envelopes.cepstrum(frames, channels),
@@ -234,8 +235,9 @@ class _Channels(NamedTuple):
 
     Attributes:
         channels: The channels.
-        spectrum: Spectrum of the envelopes, with which the channels of outputs are aligned.
-        delays: Delays that make up for different group delays. Shape: (items, channels).
+        spectrum: ``lag_spectrum`` of the envelopes, for the alignment of the channels of outputs.
+            Shape: (items, channels, frequencies).
+        delays: Delays in samples that make up for different group delays. Shape: (items, channels).
         amplitude: Contribution to the mean amplitude of each frame. Shape: (items, frames).
         cepstrum: Contribution to the cepstrum of each frame. Shape: (items, 5, frames).
     """
@@ -248,11 +250,21 @@ class _Channels(NamedTuple):
 
 
 def _cepstrum(clean: _Channels, output: Tensor, ear: HairCells, extent: Extent) -> Tensor:
-    """Return the contribution of some channels to the cepstrum of the output's frames."""
+    """Return the contribution of some channels to the cepstrum of the output's frames.
+
+    Args:
+        clean: Features of clean speech in these channels.
+        output: Aligned outputs behind the middle ear. Shape: (items, padded).
+        ear: Hair cells of the impaired ears. Shape: (items, 32).
+        extent: Number of samples of each item before padding.
+
+    Returns:
+        Contributions in dB over threshold. Shape: (items, 5, frames).
+    """
     channels = clean.channels
     power = ear_model.simulate_cochlea(output, ear, channels, extent).power
     envelope = power.detach().sqrt()
-    power = ear_model.align_channels(power, envelope, clean.spectrum, extent)
+    power = alignment.align_channels(power, envelope, clean.spectrum, extent)
     levels = ear_model.nerve_levels(power, ear.inner[:, channels])
     frames = envelopes.smooth_frames(levels, clean.delays, extent)
     return envelopes.cepstrum(frames, channels)
@@ -304,7 +316,9 @@ def _skip_normal_numbers(random: np.random.RandomState, count: int) -> None:
 
 
 def _intelligibility(features: Tensor) -> Tensor:
-    """Compute HASPI from its features, by the mean of ten small networks, scaled to end at 1.
+    """Compute HASPI as the mean of ten small networks, divided by its largest possible value.
+
+    The best score is therefore 1. The features are the ten correlations of ``correlation``.
 
     Shape: (..., 10) -> (...,).
     """

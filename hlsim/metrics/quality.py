@@ -22,7 +22,7 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_number
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.metrics.ear import fine_structure
+from hlsim.metrics.ear import alignment, fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
@@ -220,8 +220,8 @@ class QualityReference(Reference):
         levels, motion = self._adapt(cochlea.power, cochlea.motion, inner, delays, extent)
         return _Channels(
             channels=channels,
-            envelope=ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
-            motion=ear_model.lag_spectrum(cochlea.motion, extent),
+            envelope=alignment.lag_spectrum(cochlea.power.sqrt(), extent),
+            motion=alignment.lag_spectrum(cochlea.motion, extent),
             delays=delays,
             smooth_levels=levels,
             adapted_motion=motion,
@@ -276,8 +276,8 @@ class QualityReference(Reference):
         cochlea = ear_model.simulate_cochlea(output, cells, channels, extent, motion=True)
         power, motion = cochlea.power, cochlea.motion
         envelope = power.detach().sqrt()
-        power = ear_model.align_channels(power, envelope, clean.envelope, extent)
-        motion = ear_model.align_channels(motion, motion.detach(), clean.motion, extent)
+        power = alignment.align_channels(power, envelope, clean.envelope, extent)
+        motion = alignment.align_channels(motion, motion.detach(), clean.motion, extent)
         levels, motion = self._adapt(power, motion, inner, clean.delays, extent)
         clean_noise, noise = noises
         segments = self._segment_spectra(motion, clean.delays, channels, noise, extent)
@@ -318,11 +318,12 @@ class _Channels:
 
     Attributes:
         channels: The channels.
-        envelope, motion: Spectra with which envelope and motion of an output are aligned.
-        delays: Delays that make up for different group delays. Shape: (items, channels).
+        envelope, motion: ``lag_spectrum`` of both, for the alignment of an output's envelope and
+            motion. Shape: (items, channels, frequencies).
+        delays: Delays in samples that make up for different group delays. Shape: (items, channels).
         smooth_levels: Smoothed levels. Shape: (items, channels, segments).
         adapted_motion: Motion after adaptation. Shape: (items, channels, padded).
-        segments: ``segment_spectra`` of that motion.
+        segments: Spectra and mean squares of segments of that motion by ``segment_spectra``.
         level: Long-term level in dB over threshold. Shape: (items, channels).
     """
 
@@ -338,14 +339,14 @@ class _Channels:
 
 def _delay(signal: Tensor, delays: Tensor, extent: Extent) -> Tensor:
     """Delay channels. Shape: (items, channels, padded) -> (items, channels, longest)."""
-    return ear_model.shift(signal, delays, extent.ends, extent.ends, extent.longest)
+    return alignment.shift(signal, delays, extent.ends, extent.ends, extent.longest)
 
 
 def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
-    """Give the motion of the basilar membrane the level at the auditory nerve as its envelope.
+    """Rescale the motion so that its envelope equals the level in dB at the auditory nerve.
 
-    Envelope and motion are aligned separately. Where the shift of the envelope leaves nothing,
-    pyclarity keeps the motion in the unit of the signals, and so does this function.
+    Envelope and motion are aligned separately. Where the aligned envelope is zero, the motion is
+    only converted to the scale of the input, as in pyclarity.
 
     Args:
         motion: Motion of the basilar membrane.

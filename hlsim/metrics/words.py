@@ -158,9 +158,12 @@ def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
 def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> list[Array]:
     """Simulate the proportion of words that listeners understand with each of several aids.
 
+    The same 4000 listeners, whose random numbers are fixed, are simulated with every aid, so the
+    arrays can be subtracted.
+
     Args:
         curve: Parameters of the model.
-        aids: For each aid a pair: HASPI of each sentence with shape (items,), and their mean.
+        aids: One pair per aid: the HASPI of its sentences, (items,), and the aid's mean HASPI.
 
     Returns:
         Proportion of words for each simulated listener, with each aid. Shape: (4000,) each.

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from hlsim.metrics.ear import input as ear_input
+from hlsim.metrics.ear.alignment import shift
 from hlsim.metrics.ear.extent import Extent
-from hlsim.metrics.ear.model import shift
 from hlsim.metrics.ear.recursions import RATE, apply_filter, middle_ear
 
 LOWEST_REFERENCE_SPL = 20.0

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.fft import fft_length
+from hlsim.metrics.ear.alignment import shift
 from hlsim.metrics.ear.clean_speech import UnscorableError
 from hlsim.metrics.ear.extent import Extent
-from hlsim.metrics.ear.model import CHANNELS, shift
+from hlsim.metrics.ear.model import CHANNELS
 from hlsim.torchtools import constant
 
 STRIDE = 9
@@ -121,14 +122,15 @@ def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
     """Return the contribution of some channels to the five cepstral coefficients of each frame.
 
     The coefficients, the sums of the contributions of all channels, describe the shape of the
-    spectrum: they are its projections on five cosines over frequency.
+    spectrum. They are its projections on five cosines over the 32 channels, evenly spaced on the
+    ERB scale, with half a period to two and a half periods and a norm of 1.
 
     Args:
         levels: Frames of these channels in dB over threshold. Shape: (..., channels, frames).
         channels: Which of the 32 channels of the ear these are.
 
     Returns:
-        Contributions. Shape: (..., 5, frames).
+        Contributions in dB over threshold. Shape: (..., 5, frames).
 
     >>> cepstrum(torch.ones(32, 4)).shape
     torch.Size([5, 4])

@@ -2,7 +2,7 @@
 
 Signals are resampled to 24 kHz, silence before and after the clean signal is found, and the delay
 of the whole output of an aid relative to the clean signal is measured. (Later, each channel of the
-ear is aligned once more; see ``model.align_channels``.)
+ear is aligned once more; see ``alignment.align_channels``.)
 """
 
 from __future__ import annotations

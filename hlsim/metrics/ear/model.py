@@ -28,16 +28,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.dsp.fft import fft_length
 from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import (
@@ -74,9 +71,6 @@ WIDENING_SPL = 50.0
 
 CONTROL_LOSS = 100.0
 """Hearing loss in dB HL that gives the bandwidth of the control filters."""
-
-MAX_LAG = 2400
-"""Largest time in samples, 100 ms, by which a channel of an output is shifted to be aligned."""
 
 CPU_CHUNK, GPU_CHUNK = 2**19, 2**25
 """Samples of all items and channels that are computed at once.
@@ -223,7 +217,10 @@ def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recur
 
 @compute_once
 def _control_filters(start: int, stop: int, device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the control filters of the channels ``start`` to ``stop - 1``."""
+    """Return the wide filters that measure the level in the channels ``[start, stop)``.
+
+    The range is two numbers, because arguments of ``compute_once`` must be hashable.
+    """
     channels = slice(start, stop)
     return _gammatones(_control_bandwidth(device)[channels], channels, dtype)
 
@@ -393,143 +390,6 @@ def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
     loss = inner.to(power).unsqueeze(-1)
     level = torch.maximum(power, 10.0 ** (loss / 10.0)).log().mul_(10.0 / math.log(10.0))
     return apply_filter(adaptation, level.sub_(loss)).clamp_min(0.0)
-
-
-# -- alignment of channels -------------------------------------------------------------------------
-
-
-def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
-    """Return the spectrum of a clean signal's channels with which ``align_channels`` aligns others.
-
-    The result is the spectrum of the differences of neighbouring samples, from which follow the
-    steps of a correlation from lag to lag. Near its maximum, a correlation hardly changes: single
-    precision resolves the steps, but not the values.
-
-    Args:
-        reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).
-        extent: Number of samples of each item before padding.
-
-    Returns:
-        Spectrum. Shape: (items, channels, frequencies).
-
-    >>> lag_spectrum(torch.zeros(1, 2, 128), Extent((128,))).shape
-    torch.Size([1, 2, 1297])
-    """
-    points = _lag_points(extent)
-    step = _step_response(points, like=reference)
-    return torch.fft.rfft(extent.cut(reference), points) * step
-
-
-@constant
-def _step_response(points: int) -> NDArray[np.complex128]:
-    step: NDArray[np.complex128] = np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
-    return step
-
-
-def _lag_points(extent: Extent) -> int:
-    return fft_length(extent.longest + MAX_LAG, 2)
-
-
-def align_channels(
-    signal: Tensor, envelope: Tensor, reference_spectrum: Tensor, extent: Extent
-) -> Tensor:
-    """Shift each channel of an output to where it correlates best with the clean signal.
-
-    Channels are shifted by whole samples, from -2399 to 2400. The shifts are constants for the
-    gradient.
-
-    Args:
-        signal: Channels to shift. Shape: (items, channels, padded).
-        envelope: Envelope or motion of the same channels, from which the shifts are computed.
-            Shape: (items, channels, padded).
-        reference_spectrum: ``lag_spectrum`` of the clean signal's envelope or motion.
-        extent: Number of samples of each item before padding.
-
-    Returns:
-        Shifted channels. Shape: (items, channels, padded).
-
-    >>> clean, extent = torch.zeros(1, 1, 128), Extent((128,))
-    >>> clean[..., 50] = 1.0
-    >>> early = clean.roll(-7, -1)
-    >>> bool((align_channels(early, early, lag_spectrum(clean, extent), extent) == clean).all())
-    True
-    """
-    with torch.no_grad():
-        points, max_lag = _lag_points(extent), min(MAX_LAG, extent.longest)
-        spectrum = torch.fft.rfft(extent.cut(envelope), points)
-        steps = torch.fft.irfft(reference_spectrum * spectrum.conj(), points)
-        near = torch.cat((steps[..., points - max_lag + 1 :], steps[..., :max_lag]), -1)
-        correlation = functional.pad(near.double().cumsum(-1), (1, 0))
-        delays = correlation.argmax(-1) - (max_lag - 1)
-    return shift(signal, delays, extent.ends, extent.ends, extent.padded)
-
-
-def shift(
-    signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
-) -> Tensor:
-    """Delay each item, or each channel of it, by a whole number of samples.
-
-    Sample t of the output is sample ``t - delay`` of the signal. Samples from outside of an item
-    are 0.
-
-    Args:
-        signal: Signals. Shape: (items, time) or (items, channels, time).
-        delays: Delays in samples; negative ones advance the signal. Shape: (items,) or (items,
-            channels), int64.
-        ends: Number of samples of each item of ``signal``; later samples count as 0.
-        stops: Number of samples of each item of the output; later samples are 0.
-        size: Number of samples of the output.
-
-    Returns:
-        Delayed signals. Shape: (items, size) or (items, channels, size).
-
-    >>> signal = torch.tensor([[1.0, 2.0, 3.0]])
-    >>> shift(signal, torch.tensor([1]), ends=(3,), stops=(3,), size=4)
-    tensor([[0., 1., 2., 0.]])
-    """
-    delayed: Tensor = _Shift.apply(signal, delays, ends, stops, size)
-    return delayed
-
-
-class _Shift(torch.autograd.Function):
-    """Function of ``shift``, whose gradient is the opposite shift.
-
-    The gradient of an index would store the indices, which take twice the memory of the signals.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        signal: Tensor,
-        delays: Tensor,
-        ends: tuple[int, ...],
-        stops: tuple[int, ...],
-        size: int,
-    ) -> Tensor:
-        ctx.settings = -delays, stops, ends, signal.shape[-1]
-        if signal.device.type == "cpu":  # slices are nine times as fast as an index
-            delayed = signal.new_zeros((*signal.shape[:-1], size))
-            for item, (end, stop) in enumerate(zip(ends, stops, strict=True)):
-                rows, outputs = torch.atleast_2d(signal[item], delayed[item])
-                item_delays = delays[item].flatten().tolist()
-                for row, output, delay in zip(rows, outputs, item_delays, strict=True):
-                    start = max(delay, 0)
-                    last = max(start, min(end + delay, stop))
-                    output[start:last] = row[start - delay : last - delay]
-            return delayed
-        target = torch.arange(size, device=signal.device)
-        source = target - delays.unsqueeze(-1)
-        source_end, target_end = (
-            integers(limits, signal.device).view(-1, *[1] * (signal.ndim - 1))
-            for limits in (ends, stops)
-        )
-        is_inside = (source >= 0) & (source < source_end) & (target < target_end)
-        samples = signal.gather(-1, source.clamp(0, signal.shape[-1] - 1))
-        return torch.where(is_inside, samples, 0.0)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None, None]:
-        return shift(gradient, *ctx.settings), None, None, None, None
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
+from hlsim.metrics.ear import alignment
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import input as ear_input
 from hlsim.metrics.ear import model as ear_model
@@ -55,7 +56,7 @@ def test_rate_and_alignment_are_those_of_pyclarity(pair: tuple[Tensor, Tensor], 
     first, last = ear_input.audible_ends(clean)
     length = int(last - first) + 1
     for signal, moved, wanted in ((clean, -first, expected[0]), (late, delay - first, expected[1])):
-        part = ear_model.shift(signal, moved, extent.ends, (length,), length)
+        part = alignment.shift(signal, moved, extent.ends, (length,), length)
         np.testing.assert_allclose(part[0].numpy(), wanted, rtol=0, atol=1e-12)
 
 
@@ -147,13 +148,13 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
     for chosen in (slice(0, 3), slice(20, 22)):
         a = ear_model.simulate_cochlea(x, normal, chosen, extent, motion=True)
         b = ear_model.simulate_cochlea(y, ours, chosen, extent, motion=True)
-        spectrum = ear_model.lag_spectrum(a.power.sqrt(), extent)
-        power = ear_model.align_channels(b.power, b.power.sqrt(), spectrum, extent)
+        spectrum = alignment.lag_spectrum(a.power.sqrt(), extent)
+        power = alignment.align_channels(b.power, b.power.sqrt(), spectrum, extent)
         delays = longest_delay - ear_model.group_delays(a.bandwidth, chosen)
         pairs = ((a.power, normal, expected[0]), (power, ours, expected[2]))
         for output, cells, wanted in pairs:
             level = ear_model.nerve_levels(output, cells.inner[chosen])
-            level = ear_model.shift(level, delays, extent.ends, extent.ends, extent.longest)
+            level = alignment.shift(level, delays, extent.ends, extent.ends, extent.longest)
             np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
         for output, wanted in ((a, expected[4]), (b, expected[5])):
             np.testing.assert_allclose(output.level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
@@ -196,7 +197,7 @@ def test_shift_of_several_items_and_its_gradient() -> None:
     ends, stops = (50, 31), (40, 31)
 
     def shifted(values: Tensor) -> Tensor:
-        return ear_model.shift(values, delays, ends, stops, 45)
+        return alignment.shift(values, delays, ends, stops, 45)
 
     output = shifted(signal)
     for i, c in np.ndindex(2, 3):
