@@ -8,73 +8,63 @@ from typing import TYPE_CHECKING, Any
 from hlsim.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from compensators import (
-        NALR,
-        WDRC,
-        HearingAid,
-        MappingCompensator,
-        load_compensator,
-        save_compensator,
-    )
-    from hlsim.audiogram import Audiogram
-    from hlsim.audiogram.listener import Listener
-    from hlsim.audiogram.table import read_audiograms
-    from hlsim.checkpoint import list_pretrained
-    from hlsim.losses.hearing_loss import HASPILoss, HearingLossLoss
-    from hlsim.msbg import MSBG, estimate_delay
-    from hlsim.neuro import NeuroMSBG, load_pretrained
-    from hlsim.shortcuts import compensate, example_speech, info, listen, load_audio, simulate
-
-
-__all__ = [
-    "MSBG",
-    "NALR",
-    "WDRC",
-    "Audiogram",
-    "HASPILoss",
-    "HearingAid",
-    "HearingLossLoss",
-    "Listener",
-    "MappingCompensator",
-    "NeuroMSBG",
-    "compensate",
-    "estimate_delay",
-    "example_speech",
-    "info",
-    "list_pretrained",
-    "listen",
-    "load_audio",
-    "load_compensator",
-    "load_pretrained",
-    "read_audiograms",
-    "save_compensator",
-    "simulate",
-]
+    from compensators import NALR as NALR
+    from compensators import WDRC as WDRC
+    from compensators import HearingAid as HearingAid
+    from compensators import MappingCompensator as MappingCompensator
+    from compensators import load_compensator as load_compensator
+    from compensators import save_compensator as save_compensator
+    from hlsim.audiogram import Audiogram as Audiogram
+    from hlsim.audiogram.listener import Listener as Listener
+    from hlsim.audiogram.table import read_audiograms as read_audiograms
+    from hlsim.audiogram.table import read_listeners as read_listeners
+    from hlsim.checkpoint import list_pretrained as list_pretrained
+    from hlsim.losses.hearing_loss import HASPILoss as HASPILoss
+    from hlsim.losses.hearing_loss import HearingLossLoss as HearingLossLoss
+    from hlsim.msbg import MSBG as MSBG
+    from hlsim.msbg import estimate_delay as estimate_delay
+    from hlsim.neuro import NeuroMSBG as NeuroMSBG
+    from hlsim.neuro import load_pretrained as load_pretrained
+    from hlsim.shortcuts import compensate as compensate
+    from hlsim.shortcuts import example_speech as example_speech
+    from hlsim.shortcuts import info as info
+    from hlsim.shortcuts import listen as listen
+    from hlsim.shortcuts import load_audio as load_audio
+    from hlsim.shortcuts import simulate as simulate
 
 # A name is imported when it is first used, so that the command line's help does not wait for torch.
 _NAMES = {
-    "compensators": (
-        "NALR WDRC HearingAid MappingCompensator load_compensator save_compensator".split()
-    ),
-    "hlsim.audiogram": ["Audiogram"],
-    "hlsim.audiogram.listener": ["Listener"],
-    "hlsim.audiogram.table": ["read_audiograms"],
-    "hlsim.checkpoint": ["list_pretrained"],
-    "hlsim.losses.hearing_loss": ["HASPILoss", "HearingLossLoss"],
-    "hlsim.msbg": ["MSBG", "estimate_delay"],
-    "hlsim.neuro": ["NeuroMSBG", "load_pretrained"],
-    "hlsim.shortcuts": "compensate example_speech info listen load_audio simulate".split(),
+    "compensators": ("NALR WDRC HearingAid MappingCompensator load_compensator save_compensator"),
+    "hlsim.audiogram": "Audiogram",
+    "hlsim.audiogram.listener": "Listener",
+    "hlsim.audiogram.table": "read_audiograms read_listeners",
+    "hlsim.checkpoint": "list_pretrained",
+    "hlsim.losses.hearing_loss": "HASPILoss HearingLossLoss",
+    "hlsim.msbg": "MSBG estimate_delay",
+    "hlsim.neuro": "NeuroMSBG load_pretrained",
+    "hlsim.shortcuts": "compensate example_speech info listen load_audio simulate",
 }
 """Public names by the module that defines them."""
 
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+_MODULES = (
+    "audio audiogram calibration checkpoint data dsp evaluation export losses metrics msbg neuro "
+    "report simulators training"
+).split()
+"""Modules that need not be imported by a statement of their own."""
+
+__all__ = sorted(_MODULE_OF)
+
 
 def __getattr__(name: str) -> Any:
-    for module, names in _NAMES.items():
-        if name in names:
-            value = globals()[name] = getattr(import_module(module), name)
-            return value
+    if name in _MODULES:
+        return import_module(f"hlsim.{name}")
+    if name in _MODULE_OF:
+        value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
+        return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted([*__all__, *_MODULES, "__version__"])

@@ -5,6 +5,8 @@ Inside hlsim, a sample is a sound pressure in pascals, and an RMS of 1.0 is 94 d
 dB SPL of an RMS of 1.0.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,9 @@ PASCAL_SPL = 94.0
 
 NEURO_RATE = 16000
 """Sample rate in Hz at which the networks work, and default rate of every function."""
+
+LOWEST_SPL, HIGHEST_SPL = -20.0, 140.0
+"""Range of levels in dB SPL of recordings: from inaudible to a level that damages an ear at once."""
 
 POWER_FLOOR = 1e-20
 """Power of -106 dB SPL in Pa^2, to which lower powers are raised, so that all levels are finite."""
@@ -84,12 +89,13 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
     Args:
         waveform: Samples.
         spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
-            dimensions.
+            dimensions, from the level of silence (-106 at the default scale) to 140 dB SPL. A
+            tensor on a GPU is not validated, because that would make the CPU wait.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
         ValueError: The waveform is not a floating-point tensor with time last, or ``spl`` is not a
-            level or does not fit the items.
+            level, out of range, or does not fit the items.
 
     >>> level_spl(set_level(torch.randn(2, 16000), torch.tensor([65.0, 80.0]))).round()
     tensor([65., 80.])
@@ -101,7 +107,11 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
             f"got {describe(spl)}"
         )
     levels = level_spl(samples, full_scale_spl)
-    target_levels = torch.as_tensor(spl, device=waveform.device)
+    if isinstance(spl, Tensor):
+        target_levels = spl.to(waveform.device)
+    else:
+        target_levels = torch.tensor(spl, dtype=samples.dtype, device=waveform.device)
+    _check_levels(target_levels, full_scale_spl)
     try:
         gain_db = target_levels.expand_as(levels) - levels
     except RuntimeError as error:
@@ -131,6 +141,23 @@ def dbfs(waveform: Tensor) -> Tensor:
     tensor(-20.)
     """
     return level_spl(waveform, 0.0)
+
+
+def _check_levels(levels: Tensor, full_scale_spl: float) -> None:
+    """Raise ValueError unless levels are those of sounds or of silence.
+
+    A gain of thousands of dB would give zeros, NaN or infinity without an error.
+    """
+    if levels.device.type != "cpu" or torch.compiler.is_compiling():
+        return
+    silence = 10.0 * math.log10(POWER_FLOOR) + full_scale_spl
+    is_level = (levels >= silence - 1e-3) & (levels <= HIGHEST_SPL)
+    if not bool(is_level.all()):
+        wrong = float(levels.detach()[~is_level].flatten()[0])
+        raise ValueError(
+            f"expected spl from {silence:g}, the level of silence, to {HIGHEST_SPL:g} dB SPL, got "
+            f"{wrong:g}; speech has about 65 dB SPL"
+        )
 
 
 def _as_float32_or_wider(waveform: Tensor) -> Tensor:

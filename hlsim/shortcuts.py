@@ -14,8 +14,15 @@ from torch import Tensor
 from compensators import load_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals, set_level
-from hlsim.checks import check_rate
+from hlsim.calibration import (
+    HIGHEST_SPL,
+    LOWEST_SPL,
+    NEURO_RATE,
+    PASCAL_SPL,
+    gain_to_pascals,
+    set_level,
+)
+from hlsim.checks import check_number, check_rate
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.files import write_atomically
@@ -62,6 +69,7 @@ def load_audio(
         channels = resample(channels, rate, sample_rate)
         rate = sample_rate
     if spl is not None:
+        check_number("spl", spl, LOWEST_SPL, HIGHEST_SPL)
         channels = set_level(channels.flatten(), spl).reshape(channels.shape)
     if len(channels) == 1:
         channels = channels[0]

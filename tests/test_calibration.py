@@ -70,11 +70,12 @@ def test_level_and_gain_are_differentiable() -> None:
 
 
 NO_NUMBERS = [math.nan, math.inf, -math.inf, None, "a", "65", True, [65.0, 70.0], 94 + 0j]
+BAD_LEVELS = [-300.0, -1e9, 141.0, 1e9, *(torch.tensor(x) for x in (math.nan, math.inf, 141.0))]
 BAD_SHAPES = [torch.zeros(3, 1), torch.zeros(3), torch.zeros(2, 100)]
 NO_WAVEFORMS: list[Any] = [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]]
 BAD_CALLS: list[tuple[Callable[..., Any], Any]] = [
     *((check_full_scale, (value,)) for value in [*NO_NUMBERS, -0.1, 200.1]),
-    *((set_level, (torch.randn(2, 100), spl)) for spl in [*NO_NUMBERS, *BAD_SHAPES]),
+    *((set_level, (torch.randn(2, 100), spl)) for spl in [*NO_NUMBERS, *BAD_LEVELS, *BAD_SHAPES]),
     *((level_spl, (waveform,)) for waveform in NO_WAVEFORMS),
     *((set_level, (waveform, 65.0)) for waveform in NO_WAVEFORMS),
 ]
@@ -84,3 +85,15 @@ BAD_CALLS: list[tuple[Callable[..., Any], Any]] = [
 def test_bad_arguments_raise_value_error(function: Callable[..., Any], arguments: Any) -> None:
     with pytest.raises(ValueError):
         function(*arguments)
+
+
+def test_double_precision_reaches_levels_that_single_precision_rounds() -> None:
+    wave = torch.randn(1000, dtype=torch.float64)
+    assert float(level_spl(set_level(wave, 65.3))) == pytest.approx(65.3, abs=1e-12)
+
+
+def test_a_signal_may_be_given_the_level_of_silence() -> None:
+    wave, silence = torch.randn(2, 100), torch.zeros(2, 100)
+    for full_scale in (60.0, 94.0, 120.0):
+        quiet = set_level(wave, level_spl(silence, full_scale), full_scale)
+        assert float(quiet.abs().max()) < 1e-9

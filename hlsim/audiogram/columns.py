@@ -115,8 +115,8 @@ def _read_name(column: str) -> ThresholdColumn | None:
     is_frequency = is_explicit or bool(match["kilo"]) or hz in _USUAL_HZ
     if not (is_frequency and LOWEST_HZ <= hz <= HIGHEST_HZ):
         raise ValueError(
-            f"column {column!r}: expected a frequency from {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz, such "
-            "as 500, 1k or 1414 Hz; multiply kHz by 1000, or rename a column of other values"
+            f"column {column!r}: expected a frequency from {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz, "
+            "such as 500, 1k or 1414 Hz; multiply kHz by 1000, or rename a column of other values"
         )
     return ThresholdColumn(ear, hz)
 

@@ -50,6 +50,10 @@ class Listener:
         ears = zip(EARS, (self.left, self.right), strict=True)
         return {name: ear for name, ear in ears if ear is not None}
 
+    def to(self, *args: Any, **kwargs: Any) -> Listener:
+        """Return the listener itself, see ``Audiogram.to``."""
+        return self
+
     def plot(self, axes: Any = None) -> Any:
         """Draw the audiograms of both ears, the left one blue and the right one red.
 

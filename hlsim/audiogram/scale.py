@@ -34,6 +34,17 @@ SEVERITIES = ("none", "mild", "moderate", "severe")
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
 """Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""
 
+WHO_GRADES = {
+    "normal": 20.0,
+    "mild": 35.0,
+    "moderate": 50.0,
+    "moderately severe": 65.0,
+    "severe": 80.0,
+    "profound": 95.0,
+    "complete": float("inf"),
+}
+"""Pure-tone average in dB HL below which each of WHO's grades of hearing loss ends (2021)."""
+
 # Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609,
 # Tables 1 and 2, at the frequencies above. The tables end at 6 kHz; 8 kHz repeats that threshold.
 STANDARD = {

@@ -25,6 +25,7 @@ from hlsim.audiogram.scale import (
     SEVERITIES,
     SEVERITY_LIMITS,
     STANDARD,
+    WHO_GRADES,
     EarName,
 )
 from hlsim.extras import require
@@ -43,7 +44,7 @@ class Audiogram:
     frequencies. Simulators accept thresholds up to 100 dB HL.
 
     Checkpoints that hold audiograms, say as hyperparameters, are loaded with ``weights_only=True``
-    inside ``torch.serialization.safe_globals([Audiogram])``.
+    inside ``torch.serialization.safe_globals([Audiogram, Listener])``.
 
     Args:
         levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or
@@ -58,8 +59,8 @@ class Audiogram:
     Example:
         >>> from hlsim import Audiogram
         >>> ear = Audiogram([15, 20, 25, 30, 40, 35], [250, 500, 1000, 2000, 4000, 8000])
-        >>> ear.severity, ear.pta
-        ('mild', 28.75)
+        >>> ear.severity, ear.pta, ear.who_grade
+        ('mild', 28.75, 'mild')
     """
 
     levels: tuple[float, ...]
@@ -144,7 +145,7 @@ class Audiogram:
 
     @property
     def severity(self) -> str:
-        """Degree of hearing loss: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
+        """Degree of hearing loss in MSBG: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
 
         It follows from the mean of the levels that were measured from 2 to 8 kHz, and is none if
         there is no such level, as in pyclarity.
@@ -181,6 +182,24 @@ class Audiogram:
         if ear is not None:
             axes.legend()
         return axes
+
+    @property
+    def who_grade(self) -> str:
+        """Grade of hearing loss: ``"normal"``, ``"mild"`` to ``"profound"``, or ``"complete"``.
+
+        It follows from the pure-tone average, and differs from ``severity``, which MSBG needs.
+
+        Source: World Health Organization 2021, World report on hearing, Table 1.3.
+        """
+        average = round(self.pta, 4)
+        return next(grade for grade, limit in WHO_GRADES.items() if average < limit)
+
+    def to(self, *args: Any, **kwargs: Any) -> Audiogram:
+        """Return the audiogram itself, which is on no device.
+
+        Lightning calls this method of everything in a batch that it moves to a device.
+        """
+        return self
 
     def to_dict(self) -> dict[str, list[float]]:
         """Return a dictionary of ``levels`` and ``frequencies``, which can be written as JSON."""

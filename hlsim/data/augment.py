@@ -84,7 +84,8 @@ def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None =
         for item, waveform in enumerate(speech):
             if bool(waveform.any()):
                 level[item] = active_level_db(waveform, sample_rate)
-    return speech + set_level(noise, level - snr_db, full_scale_spl=0.0)
+    noise_level = (level - snr_db).clamp_min(-200.0)  # the level of silence
+    return speech + set_level(noise, noise_level, full_scale_spl=0.0)
 
 
 def equalise(

@@ -153,3 +153,41 @@ def test_errors_name_the_file_of_listeners(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text(BAD_FILES[name])
     with pytest.raises(ValueError, match=name):
         read_listeners(tmp_path / name)
+
+
+def test_ears_in_batches_pass_through_lightning(tmp_path: Path) -> None:
+    lightning = pytest.importorskip("lightning")
+
+    class Module(lightning.LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.gain, self.ears = torch.nn.Parameter(torch.ones(1)), []
+
+        def training_step(self, batch: Any, index: int) -> Tensor:
+            speech, *ears = batch
+            self.ears += ears
+            return (self.gain * speech).square().mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters())
+
+    batch = (torch.ones(2, 100), [LEFT, RIGHT], BOTH)
+    module = Module()
+    trainer = lightning.Trainer(fast_dev_run=True, accelerator="cpu", default_root_dir=tmp_path)
+    loader = torch.utils.data.DataLoader([batch], batch_size=None)
+    trainer.fit(module, loader)
+    assert module.ears == [[LEFT, RIGHT], BOTH]
+    fabric = lightning.Fabric(accelerator="cpu", devices=1)
+    assert next(iter(fabric.setup_dataloaders(loader)))[1:] == [[LEFT, RIGHT], BOTH]
+
+
+def test_bootstrap_takes_ears_as_tensors_and_refuses_lists(scene: Tensor) -> None:
+    """A list of audiograms would keep its order while the signals are drawn anew."""
+    wrappers = pytest.importorskip("torchmetrics.wrappers")
+    from hlsim.metrics.torchmetric import HASPI
+
+    metric = wrappers.BootStrapper(HASPI(), num_bootstraps=2)
+    metric.update(scene, scene, torch.tensor([LEFT.thresholds, RIGHT.thresholds]))
+    assert float(metric.compute()["mean"]) > 0.5
+    with pytest.raises(ValueError, match="frozen dataclass"):
+        metric.update(scene, scene, [LEFT, RIGHT])

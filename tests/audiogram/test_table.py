@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -178,7 +179,7 @@ def test_the_guide_reads_nhanes(monkeypatch: pytest.MonkeyPatch) -> None:
         [93705.0, 15.0, 10.0, 666.0, *([None] * 11), 888.0],
     ]
     monkeypatch.setattr(pandas, "read_sas", lambda path: pandas.DataFrame(rows, columns=columns))
-    names: dict[str, dict[str, Listener]] = {}
+    names: dict[str, Any] = {"hlsim": hlsim}
     exec(program, names)
     hz = (500, 1000, 2000, 3000, 4000, 6000, 8000)
     both = [Audiogram(tuple(5.0 * n for n in range(first, 14, 2)), hz) for first in (0, 1)]

@@ -158,3 +158,18 @@ def test_a_series_is_an_ear_by_position_frequency_or_column() -> None:
     assert as_audiogram(row) == as_audiogram({500: 35, 4000: 60})
     with pytest.raises(ValueError, match="DataFrame"):
         as_audiogram(pandas.DataFrame({"500 Hz": [20]}))
+
+
+def test_who_grade_changes_at_its_limits() -> None:
+    limits = {-10: "normal", 19.9: "normal", 20: "mild", 34.9: "mild", 35: "moderate"}
+    limits |= {
+        50: "moderately severe",
+        65: "severe",
+        80: "profound",
+        95: "complete",
+        120: "complete",
+    }
+    assert {level: Audiogram((level,) * 8).who_grade for level in limits} == limits
+    # 35.1 + 34.9 + 35.3 + 34.7 is 139.99999999999997 in some orders
+    assert Audiogram((0, 35.1, 34.9, 35.3, 0, 34.7, 0, 0)).who_grade == "moderate"
+    assert (as_audiogram("N3").who_grade, as_audiogram("N3").severity) == ("moderate", "severe")

@@ -26,6 +26,10 @@ for arguments, status in json.loads(sys.argv[1]):
 LAZY_NAMES = """
 import sys, hlsim
 assert "torch" not in sys.modules and {*hlsim.__all__, "__version__"} <= set(dir(hlsim))
+assert not [name for name in dir(hlsim) if name.startswith("_") and name != "__version__"]
+assert not {"Any", "TYPE_CHECKING", "annotations", "import_module"} & set(dir(hlsim))
+assert hlsim.metrics.haspi.__module__ == "hlsim.metrics.haspi_score"
+assert callable(hlsim.evaluation.haspi_report) and callable(hlsim.export.export_aid)
 assert hlsim.HearingLossLoss.__module__ == "hlsim.losses.hearing_loss"
 from hlsim import *
 assert Audiogram is hlsim.Audiogram and MSBG is hlsim.MSBG and load_pretrained("neuro-msbg")
