@@ -19,7 +19,7 @@ NEURO_RATE = 16000
 """Sample rate in Hz at which the networks work, and default rate of every function."""
 
 LOWEST_SPL, HIGHEST_SPL = -20.0, 140.0
-"""Range of levels in dB SPL of recordings: from inaudible to a level that damages an ear at once."""
+"""Range of levels in dB SPL of recordings: from inaudible to a level that damages ears at once."""
 
 POWER_FLOOR = 1e-20
 """Power of -106 dB SPL in Pa^2, to which lower powers are raised, so that all levels are finite."""
