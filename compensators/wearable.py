@@ -229,28 +229,53 @@ class Wearable(Aid):
         with torch.autocast(waveform.device.type, enabled=False):
             batch, fitted = self.prepare(waveform, audiogram)
             settings = self.stack_sliders(sliders, batch, fitted)
-            time = waveform.shape[-1]
             gain = gain_to_pascals(self.full_scale_spl)
             signals = flatten_items(waveform, batch, fitted.dtype) * gain
             low = resample(signals, self.sample_rate, RATE)
-            state = self.initial_state(settings)
-            outputs = []
-            highest_gains = [low.new_zeros(len(low), 1)]
             low_time = low.shape[-1]
             padded = nn.functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
-            block_samples = max(1, BLOCK_SAMPLES // (len(low) * HOP)) * HOP
-            for block in padded.split(block_samples, -1):
-                output, gains, state = self.process_hops(block, fitted, settings, state)
-                outputs.append(output)
-                highest_gains.append(gains)
-            aligned = torch.cat(outputs, -1)[:, DELAY : DELAY + low_time]
-            result = resample(aligned, RATE, self.sample_rate)
-            if self.sample_rate != RATE:
-                above_8_khz = signals - resample(low, RATE, self.sample_rate)[:, :time]
-                gains = gain_at_rate(torch.cat(highest_gains, -1), self.sample_rate, time)
-                result = result[:, :time] + (1.0 + gains) * above_8_khz
-            limited = soft_limit(result, self.limit_spl)
-            return (limited / gain).reshape(*batch, time).to(waveform.dtype)
+            state = self.initial_state(settings)
+            delayed, gains, _ = self.process_portions(padded, fitted, settings, state)
+            aligned = delayed[:, DELAY : DELAY + low_time]
+            output = self.combine(signals, low, aligned, gains)
+            return (output / gain).reshape(*batch, -1).to(waveform.dtype)
+
+    def process_portions(
+        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
+    ) -> tuple[Tensor, Tensor, State]:
+        """Compute what ``process_hops`` computes, in portions that limit the memory.
+
+        Returns:
+            The output and the state of ``process_hops``, and between them the gains, preceded by
+            the gain before the first hop, (items, hops + 1).
+        """
+        outputs = []
+        gains = [state["gains"][:, -1:, -1]]
+        portion = max(1, BLOCK_SAMPLES // (len(samples) * HOP)) * HOP
+        for block in samples.split(portion, -1):
+            output, block_gains, state = self.process_hops(block, fitted, sliders, state)
+            outputs.append(output)
+            gains.append(block_gains)
+        return torch.cat(outputs, -1), torch.cat(gains, -1), state
+
+    def combine(self, signals: Tensor, low: Tensor, aligned: Tensor, gains: Tensor) -> Tensor:
+        """Return the output at the aid's rate, with the band above 8 kHz, and limited.
+
+        Args:
+            signals: Input in pascals.
+            low: Input at 16 kHz.
+            aligned: Output at 16 kHz, time-aligned with the input.
+            gains: Gains of the highest band from ``process_portions``.
+
+        Shape: (items, time), (items, low_time) twice, (items, hops + 1) -> (items, time).
+        """
+        time = signals.shape[-1]
+        result = resample(aligned, RATE, self.sample_rate)
+        if self.sample_rate != RATE:
+            above_8_khz = signals - resample(low, RATE, self.sample_rate)[:, :time]
+            gain = gain_at_rate(gains, self.sample_rate, time)
+            result = result[:, :time] + (1.0 + gain) * above_8_khz
+        return soft_limit(result, self.limit_spl)
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None

@@ -27,7 +27,7 @@ EXTENSIONS = tuple(
 )
 """Extensions by which audio files are found in folders. libsndfile reads all of these formats."""
 
-_SCANNED_SAMPLES = 1_000_000
+_SCANNED_SAMPLES = 250_000
 """Number of samples per channel that are read at once to scan a recording."""
 
 _LARGEST_SIZE = 2**32 - 1

@@ -4,54 +4,120 @@ from __future__ import annotations
 
 import shutil
 import sys
+import threading
 import time
-from collections.abc import Callable
 from typing import TextIO
 
 _LINE_INTERVAL = 10.0
-"""Seconds between two lines, if stderr is not a terminal."""
+"""Longest time in seconds between two lines, if stderr is not a terminal."""
+
+_TICK = 1.0
+"""Time in seconds between two looks at the clock."""
 
 
-def show_progress(unit: str) -> Callable[..., None]:
-    """Return a function that shows the progress of long work and the time when it will end.
+_active_lines: list[ProgressLine] = []
+"""Lines of which the last one is shown."""
 
-    In a terminal, the function overwrites one line. Elsewhere, it writes a line every 10 seconds.
+
+class ProgressLine:
+    """Line about the progress of long work on stderr, at least every 10 seconds.
+
+    Use it in a ``with`` block, and call it after each unit of work with the number of finished
+    units, their total number and, optionally, a text to append. A terminal shows one line, which is
+    overwritten every second. Before the first call and after the last one, the line says what is
+    done meanwhile, and since when.
+
     The time of the end is estimated from the pace since the first call, without the work of an
     earlier run.
 
     Args:
-        unit: Plural noun for what is counted, such as "items".
+        unit: Plural noun for what is counted, such as "scores".
+        before: Description of the work before the first call.
+        after: Description of the work after the last call.
 
-    Returns:
-        A function to call after each unit, with the number of finished units, their total number
-        and, optionally, a text to append.
-
-    >>> show_progress("items")(1, 4)
+    >>> with ProgressLine("scores") as progress:
+    ...     progress(1, 4)
     """
-    first: tuple[int, float] | None = None
-    last_line = 0.0
-    is_finished = False
 
-    def show(done: int, total: int, details: str = "") -> None:
-        nonlocal first, last_line, is_finished
-        if is_finished:
-            return
-        is_finished = done == total
-        now = time.time()
-        first = first or (done, now)
-        text = f"{done} of {total} {unit}"
-        if first[0] < done < total:
-            seconds = (now - first[1]) / (done - first[0]) * (total - done)
+    def __init__(self, unit: str, before: str = "starting", after: str = "finishing") -> None:
+        self.unit = unit
+        self.before = before
+        self.after = after
+        self._first: tuple[float, float] | None = None
+        self._counts: tuple[float, float] = (0, 0)
+        self._details = ""
+        self._stage_start = self._last_line = time.time()
+        self._ended = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> ProgressLine:
+        _active_lines.append(self)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        _active_lines.remove(self)
+        clear_line(sys.stderr)
+
+    def __call__(self, done: float, total: float, details: str = "") -> None:
+        with self._lock:
+            now = time.time()
+            is_first = self._first is None
+            is_last = done == total and self._counts != (done, total)
+            self._first = self._first or (done, now)
+            self._counts = done, total
+            self._details = details
+            if is_last:
+                self._stage_start = now
+            if is_last or done < total:
+                self._show(self._count(now), now, is_due=is_first or is_last)
+
+    def print(self, text: str, file: TextIO | None = None) -> None:
+        """Print a line of results, in a terminal in place of the line of progress.
+
+        Args:
+            text: Line to print.
+            file: stderr; by default stdout.
+        """
+        with self._lock:
+            clear_line(sys.stderr)
+            print(text, file=file or sys.stdout, flush=True)
+            self._last_line = time.time()
+
+    def _watch(self) -> None:
+        """Show that the work goes on, until it has ended."""
+        while not self._ended.wait(_TICK):
+            if _active_lines[-1] is not self:
+                continue  # The line of a part of the work, such as a training, says more.
+            with self._lock:
+                now = time.time()
+                done, total = self._counts
+                if self._first is not None and done < total:
+                    text = self._count(now)
+                else:
+                    stage = self.before if self._first is None else self.after
+                    text = f"{stage}, {now - self._stage_start:.0f} s"
+                self._show(text, now)
+
+    def _count(self, now: float) -> str:
+        """Return a line with the finished work and the time when all of it will be finished."""
+        done, total = self._counts
+        text = f"{int(done)} of {total:g} {self.unit} ({done / total:.0%})"
+        first_done, start = self._first or (done, now)
+        if first_done < done < total:
+            seconds = (now - start) / (done - first_done) * (total - done)
             clock = time.strftime("%a %H:%M", time.localtime(now + seconds))
             text += f", {seconds / 60:.1f} min left ({clock})"
-        text += details
-        if sys.stderr.isatty() or is_finished or now - last_line >= _LINE_INTERVAL:
-            last_line = now
-            show_line(text, sys.stderr)
-        if sys.stderr.isatty() and is_finished:
-            print(file=sys.stderr)
+        return text + self._details
 
-    return show
+    def _show(self, text: str, now: float, is_due: bool = False) -> None:
+        """Print a line if it is due, or if the last one is too old."""
+        if is_due or sys.stderr.isatty() or now - self._last_line >= _LINE_INTERVAL:
+            self._last_line = now
+            show_line(text, sys.stderr)
 
 
 def clear_line(file: TextIO) -> None:

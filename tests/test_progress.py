@@ -1,8 +1,10 @@
 """Progress and expected end of long work, on stderr."""
 
+import time
+
 import pytest
 
-from hlsim.progress import show_progress
+from hlsim.progress import ProgressLine
 
 
 def test_the_end_follows_from_the_pace_since_the_first_call(
@@ -10,16 +12,16 @@ def test_the_end_follows_from_the_pace_since_the_first_call(
 ) -> None:
     now = [1_000_000.0]
     monkeypatch.setattr("hlsim.progress.time.time", lambda: now[0])
-    show = show_progress("scores")
-    for done, seconds in ((50, 60.0), (60, 9.0), (61, 231.0), (100, 0.0)):
-        show(done, 100, "; no loss")
+    show = ProgressLine("scores")
+    for done, seconds in ((50, 20.0), (60, 1.0), (61, 240.0), (100, 0.0)):
+        show(done, 100, "; loss 1")
         now[0] += seconds
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 3, "a file gets a line every 10 seconds"
-    assert lines[0] == "50 of 100 scores; no loss"
-    assert lines[1].startswith("60 of 100 scores, 4.0 min left")
-    assert lines[1].endswith("; no loss")
-    assert lines[2] == "100 of 100 scores; no loss"
+    assert len(lines) == 3, "a file gets a line every ten seconds"
+    assert lines[0] == "50 of 100 scores (50%); loss 1"
+    assert lines[1].startswith("60 of 100 scores (60%), 1.3 min left")
+    assert lines[1].endswith("; loss 1")
+    assert lines[2] == "100 of 100 scores (100%); loss 1"
 
 
 def test_a_terminal_gets_one_line(
@@ -27,8 +29,54 @@ def test_a_terminal_gets_one_line(
 ) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "30")
-    show = show_progress("outputs of a long name that does not fit")
-    for done in (1, 2, 2):
-        show(done, 2)
-    text = capsys.readouterr().err
-    assert text.count("\n") == 1 and all(len(line) < 30 for line in text.strip("\r\n").split("\r"))
+    with ProgressLine("outputs of a long name that does not fit") as progress:
+        progress(1, 2)
+        progress.print("a result")
+        progress(2, 2)
+        progress(2, 2)
+    printed = capsys.readouterr()
+    assert printed.out == "a result\n"
+    lines = printed.err.split("\r")
+    assert "\n" not in printed.err and all(len(line) < 30 for line in lines)
+    assert not lines[-1] and not lines[-2].strip(), "the line is cleared at the end"
+
+
+def test_the_line_of_a_part_of_the_work_replaces_that_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hlsim.progress._TICK", 0.01)
+    monkeypatch.setattr("hlsim.progress._LINE_INTERVAL", 0.02)
+    with ProgressLine("scores", "training"):
+        with ProgressLine("steps", "preparing"):
+            capsys.readouterr()
+            time.sleep(0.2)
+            assert "training" not in capsys.readouterr().err
+        time.sleep(0.2)
+    assert "training, 0 s" in capsys.readouterr().err
+
+
+def test_there_is_a_sign_of_life_before_between_and_after_the_calls(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hlsim.progress._TICK", 0.01)
+    monkeypatch.setattr("hlsim.progress._LINE_INTERVAL", 0.02)
+
+    def wait_for(text: str) -> None:
+        printed = ""
+        end = time.monotonic() + 10.0
+        while text not in printed:
+            assert time.monotonic() < end, printed
+            time.sleep(0.02)
+            printed += capsys.readouterr().err
+
+    with ProgressLine("scores", "reading", "drawing the page") as progress:
+        wait_for("reading, 0 s")
+        progress(1, 4)
+        progress(2, 4)
+        capsys.readouterr()
+        wait_for("2 of 4 scores (50%), 0.0 min left")
+        progress(4, 4)
+        wait_for("drawing the page, 0 s")
+    capsys.readouterr()
+    time.sleep(0.1)
+    assert not capsys.readouterr().err, "nothing is shown after the end"

@@ -22,7 +22,7 @@ from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE
 from hlsim.data.layouts import find_corpus
 from hlsim.evaluation import haspi_report
-from hlsim.progress import show_progress
+from hlsim.progress import ProgressLine
 from hlsim.report.recordings_page import write_report
 from hlsim.report.verdict import verdict
 
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
         (out / condition).mkdir(parents=True, exist_ok=True)
     items = [(utterance, ear) for utterance, ear, name in instances.items if name == options.input]
     rows = []
-    show = show_progress("ears")
+    progress = ProgressLine("ears")
     for number, (utterance, ear) in enumerate(items):
         name = f"{Path(utterance.path).stem}-{number}.wav"
         clean, noisy = instances.read(utterance)
@@ -67,14 +67,15 @@ def main(arguments: list[str] | None = None) -> None:
             if condition != "clean":
                 files = {"clean": f"clean/{name}", "processed": f"{condition}/{name}"}
                 rows.append({"condition": condition, **files, **ear.to_row()})
-        show(number + 1, len(items))
+        progress(number + 1, len(items))
     write_table(out / "table.csv", rows)
-    report = haspi_report(
-        manifest=out / "table.csv",
-        store=out / "report" / "scores.jsonl",
-        jobs=options.jobs,
-        progress=show_progress("values"),
-    )
+    with ProgressLine("values") as progress:
+        report = haspi_report(
+            manifest=out / "table.csv",
+            store=out / "report" / "scores.jsonl",
+            jobs=options.jobs,
+            progress=progress,
+        )
     assert report.headline is not None
     print(verdict(report.headline))
     print(write_report(report, out / "report"))

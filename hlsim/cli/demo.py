@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hlsim.cli.inputs import check_extras
 from hlsim.cli.options import Parser, count
-from hlsim.progress import show_progress
+from hlsim.progress import ProgressLine
 
 
 def demo(parser: Parser) -> None:
@@ -24,4 +24,6 @@ def _demo(options: argparse.Namespace) -> None:
     from hlsim.cli.demo_study import run_demo
 
     ear = as_audiogram(options.audiogram)
-    print(run_demo(options.out, ear, steps=options.steps, progress=show_progress("scores")))
+    with ProgressLine("scores", "training", "drawing the page") as progress:
+        text = run_demo(options.out, ear, steps=options.steps, progress=progress)
+    print(text)

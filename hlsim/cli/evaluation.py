@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import check_extras, read_ears, warn_of_other_ears
 from hlsim.cli.options import (
+    ALL_EARS,
     EARS_TABLE,
     Parser,
     count,
@@ -21,11 +21,17 @@ from hlsim.cli.options import (
     seed,
     sound_level,
 )
-from hlsim.progress import show_progress
+from hlsim.progress import ProgressLine
 
 if TYPE_CHECKING:
     from hlsim.evaluation.result import Evaluation
     from hlsim.report.page import Page
+
+STORE = "scores.jsonl"
+"""Name of the file of scores in the folder of the results."""
+
+_PLAYED_ITEMS = 3
+"""Number of items that a page plays."""
 
 _CHECKPOINTS = "by name or folder; LABEL=FOLDER sets the name in the tables to LABEL"
 """End of the help text of arguments that name checkpoints."""
@@ -64,11 +70,24 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     simulators = {
         label: load_simulator(name) for label, name in _read_labels(options.names).items()
     }
-    arguments = _arguments(options, evaluate_simulators)
-    if options.compensator:
-        arguments["compensator"] = load_compensator(options.compensator)
-    evaluation = evaluate_simulators(simulators, **arguments)
-    _finish(evaluation, simulators_page(evaluation), options)
+    with _progress() as progress:
+        evaluation = evaluate_simulators(
+            simulators,
+            speech=options.speech,
+            noise=options.noise,
+            audiograms=options.audiograms,
+            teacher=options.teacher,
+            items=options.items,
+            seconds=options.seconds,
+            levels=options.levels,
+            inputs=options.inputs,
+            compensator=load_compensator(options.compensator) if options.compensator else None,
+            measures=options.own_measures,
+            store=options.out / STORE,
+            **_run_settings(options, progress),
+        )
+        page = simulators_page(evaluation)
+    _finish(evaluation, page, options)
 
 
 def evaluate_compensator(parser: Parser) -> None:
@@ -98,11 +117,29 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     from hlsim.report.compensators_page import compensators_page
 
     checkpoints = _read_labels(options.names)
-    arguments = _arguments(options, evaluate_compensators)
-    notes = warn_of_other_ears(checkpoints, arguments["audiogram"])
+    ear: Any = read_ears(options)
+    notes = warn_of_other_ears(checkpoints, ear)
     compensators = {label: load_compensator(name) for label, name in checkpoints.items()}
-    evaluation = replace(evaluate_compensators(compensators, **arguments), notes=notes)
-    _finish(evaluation, compensators_page(evaluation), options)
+    with _progress() as progress:
+        evaluation = evaluate_compensators(
+            compensators,
+            speech=options.speech,
+            noise=options.noise,
+            audiograms=options.audiograms,
+            audiogram=ear,
+            enhancers=options.enhancers,
+            simulator=options.simulator,
+            items=options.items,
+            seconds=options.seconds,
+            levels=options.levels,
+            gain_ears=options.gain_ears,
+            measures=options.own_measures,
+            store=options.out / STORE,
+            **_run_settings(options, progress),
+        )
+        evaluation = replace(evaluation, notes=notes)
+        page = compensators_page(evaluation)
+    _finish(evaluation, page, options)
 
 
 def haspi_report(parser: Parser) -> None:
@@ -110,7 +147,8 @@ def haspi_report(parser: Parser) -> None:
     parser.set_command(
         _haspi_report,
         "--clean clean --before noisy --after enhanced --audiogram N3 --out report",
-        "--manifest items.csv --measures haspi,hasqi --baseline unaided --out report",
+        "--clean clean --condition noisy=noisy --condition A=outputs-a --audiograms ears.csv "
+        "--baseline noisy --out report",
     )
     option = parser.option
     text = "folder of clean speech; all folders have files with the same names"
@@ -119,14 +157,23 @@ def haspi_report(parser: Parser) -> None:
     option("--before", input_path, text)
     option("--after", input_path, "folder of speech after the treatment")
     text = (
+        "condition NAME=FOLDER instead of --before and --after, a folder of the outputs of a "
+        "system; repeat the option for several systems"
+    )
+    option("--condition", _named_folder, text, [], action="append", dest="conditions")
+    text = (
         "CSV file instead of the folders, with columns condition, clean, processed and, if they "
         "are known, listener, ear, item, snr, and hl_250, ... or audiogram"
     )
     option("--manifest", input_path, text)
     text = "folder to which the manifest's paths are relative; by default the manifest's folder"
     option("--root", input_path, text)
-    parser.audiogram(text="; the ear of all files, or of rows of the manifest without an ear")
-    text = "file of the ears of a manifest's listeners, with columns listener, ear, hl_250, ..."
+    text = "; the ear of all files, or of rows of the manifest without an ear"
+    parser.audiogram(ears=ALL_EARS, text=text)
+    text = (
+        "CSV file of ears with columns hl_250, ...: with folders, every file is scored for each of "
+        "them; with a manifest, they are its listeners', with the columns listener and ear, too"
+    )
     option("--audiograms", input_path, text)
     text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
     option("--measures", lambda names: names.split(","), text, ["haspi"])
@@ -141,8 +188,29 @@ def _haspi_report(options: argparse.Namespace) -> None:
     from hlsim.evaluation.recordings import haspi_report
     from hlsim.report.recordings_page import report_page
 
-    evaluation = haspi_report(**_arguments(options, haspi_report))
-    _finish(evaluation, report_page(evaluation), options)
+    ear: Any = read_ears(options)
+    if len(dict(options.conditions)) < len(options.conditions):
+        raise ValueError("two of --condition have the same name; rename one")
+    with _progress() as progress:
+        evaluation = haspi_report(
+            clean=options.clean,
+            before=options.before,
+            after=options.after,
+            conditions=dict(options.conditions) or None,
+            manifest=options.manifest,
+            root=options.root,
+            audiogram=ear,
+            audiograms=options.audiograms,
+            measures=[*options.measures, *options.own_measures],
+            baseline=options.baseline,
+            better_ear=options.better_ear,
+            full_scale_spl=options.full_scale_spl,
+            spl=options.spl,
+            store=options.out / STORE,
+            **_run_settings(options, progress),
+        )
+        page = report_page(evaluation)
+    _finish(evaluation, page, options)
 
 
 def clarity(parser: Parser) -> None:
@@ -182,9 +250,22 @@ def _clarity(options: argparse.Namespace) -> None:
     from hlsim.evaluation.clarity import evaluate_scenes
     from hlsim.report.recordings_page import scenes_page
 
-    arguments = _arguments(options, evaluate_scenes)
-    evaluation = evaluate_scenes(_read_labels(options.names), **arguments)
-    _finish(evaluation, scenes_page(evaluation), options)
+    with _progress() as progress:
+        evaluation = evaluate_scenes(
+            _read_labels(options.names),
+            scenes=options.scenes,
+            listeners=options.listeners,
+            scenes_listeners=options.scenes_listeners,
+            stride=options.stride,
+            enhancers=options.enhancers,
+            linked=options.linked,
+            full_scale_spl=options.full_scale_spl,
+            measures=options.own_measures,
+            out=options.out,
+            **_run_settings(options, progress),
+        )
+        page = scenes_page(evaluation)
+    _finish(evaluation, page, options)
 
 
 def _read_labels(texts: Sequence[str]) -> dict[str, str]:
@@ -205,6 +286,14 @@ def _read_labels(texts: Sequence[str]) -> dict[str, str]:
             )
         labels[label] = name or label
     return labels
+
+
+def _named_folder(text: str) -> tuple[str, Path]:
+    """Convert NAME=FOLDER to the name and the folder."""
+    name, _, folder = text.partition("=")
+    if not name or not folder:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=FOLDER")
+    return name, input_path(folder)
 
 
 def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int]) -> None:
@@ -242,20 +331,20 @@ def _declare_study(parser: Parser) -> None:
     parser.option("--out", Path, "folder for the results", required=True)
 
 
-def _arguments(options: argparse.Namespace, evaluate: Callable[..., Evaluation]) -> dict[str, Any]:
-    """Return the arguments of a function that evaluates: the options with the names of parameters.
+def _progress() -> ProgressLine:
+    """Return the progress of an evaluation."""
+    return ProgressLine("scores", "reading the recordings", "drawing the page")
 
-    The options ``--audiogram``, ``--measure`` and ``--out`` are converted to what it expects.
-    """
-    parameters = inspect.signature(evaluate).parameters
-    values = vars(options) | {
-        "audiogram": read_ears(options) if "audiogram" in options else None,
-        "measures": [*getattr(options, "measures", []), *options.own_measures],
-        "store": options.out / "scores.jsonl",
-        "listen": 3,
+
+def _run_settings(options: argparse.Namespace, progress: ProgressLine) -> dict[str, Any]:
+    """Return the arguments of all evaluations about processes, random draws and the page."""
+    return {
+        "seed": options.seed,
+        "jobs": options.jobs,
+        "dask": options.dask,
+        "progress": progress,
+        "listen": _PLAYED_ITEMS,
     }
-    running = {"jobs": options.jobs, "dask": options.dask, "progress": show_progress("scores")}
-    return {name: values[name] for name in parameters if name in values} | running
 
 
 def _finish(evaluation: Evaluation, page: Page, options: argparse.Namespace) -> None:

@@ -53,6 +53,37 @@ def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
     return as_audiogram(options.audiogram) if options.audiogram else None
 
 
+def read_named_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
+    """Return the ears of a repeated ``--audiogram`` by their names, or the one of ``--listener``.
+
+    The name of a standard ear is its own. That of others consists of the levels, such as
+    "10-20-30-40-50-60-70-80" or "500_30-4000_60".
+
+    Args:
+        options: Parsed options of a command.
+
+    Raises:
+        ValueError: There is no such file or listener, an audiogram is not valid, or two have the
+            same name.
+    """
+    from hlsim.audiogram import as_audiogram
+
+    if options.listener:
+        return {"listener": _read_listener(options.listener)}
+    ears: dict[str, Audiogram | Listener] = {}
+    for value in options.audiogram:
+        if isinstance(value, str):
+            name = value.upper()
+        elif isinstance(value, dict):
+            name = "-".join(f"{hertz:g}_{level:g}" for hertz, level in value.items())
+        else:
+            name = "-".join(f"{level:g}" for level in value)
+        if name in ears:
+            raise ValueError(f"--audiogram {name} appears twice; leave one out")
+        ears[name] = as_audiogram(value)
+    return ears
+
+
 def _read_listener(text: str) -> Listener:
     """Read the value of ``--listener``, which is FILE or FILE:NAME."""
     from hlsim.audiogram.table import read_listeners

@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ears
-from hlsim.cli.options import Parser, full_scale, positive_number
+from hlsim.cli.options import ALL_EARS, Parser, full_scale, positive_number
 
 
 def live(parser: Parser) -> None:
@@ -19,7 +19,7 @@ def live(parser: Parser) -> None:
     )
     option = parser.option
     ears = parser.add_mutually_exclusive_group(required=True)
-    parser.audiogram(group=ears)
+    parser.audiogram(ears=ALL_EARS, group=ears)
     parser.listener("both ears, for stereo headphones", group=ears)
     models = parser.add_mutually_exclusive_group()
     text = "a streaming aid: wdrc (compression in bands), or a hearing aid's name or folder"

@@ -20,6 +20,12 @@ EARS_TABLE = (
 )
 """Help text of options that take a table of ears."""
 
+SIMULATED_EARS = "NH, N1 to N6, S1 to S3"
+"""Standard ears of commands that simulate a loss; N7 exceeds the range of simulators."""
+
+ALL_EARS = "NH, N1 to N7, S1 to S3"
+"""Standard ears of commands that do not simulate a loss."""
+
 
 class Parser(argparse.ArgumentParser):
     """Parser of the program or of a command, whose errors are one line without the usage.
@@ -120,20 +126,30 @@ class Parser(argparse.ArgumentParser):
         )
         self.option("--teacher", str, help_, "msbg")
 
-    def audiogram(self, default: str | None = None, text: str = "", group: Any = None) -> None:
+    def audiogram(
+        self,
+        default: str | None = None,
+        *,
+        ears: str = SIMULATED_EARS,
+        text: str = "",
+        group: Any = None,
+        **settings: Any,
+    ) -> None:
         """Declare ``--audiogram``, the thresholds of one ear.
 
         Args:
             default: Value if the option is missing, such as ``N3``.
+            ears: Names of the standard ears that the command accepts, for the help text.
             text: End of the help text.
             group: Group of argparse that the option joins, such as a mutually exclusive group.
+            settings: Further arguments of ``argparse.ArgumentParser.add_argument``.
         """
         help_ = (
-            "NH, N1 to N7, S1 to S3; eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, "
+            f"{ears}; eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, "
             "6000 and 8000 Hz, separated by commas; or frequencies in Hz with levels, such as "
             f"500:30,1000:40,4000:60{text}"
         )
-        self.option("--audiogram", ear, help_, default, group=group)
+        self.option("--audiogram", ear, help_, default, group=group, **settings)
 
     def listener(self, text: str, group: Any) -> None:
         """Declare ``--listener``, a file with the audiograms of a person's two ears.

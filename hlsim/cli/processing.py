@@ -7,13 +7,21 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ears
-from hlsim.cli.options import Parser, input_path
+from hlsim.cli.inputs import load_compensator, read_named_ears, read_sliders, warn_of_other_ears
+from hlsim.cli.options import ALL_EARS, SIMULATED_EARS, Parser, input_path
+from hlsim.progress import ProgressLine
+
+if TYPE_CHECKING:
+    from hlsim.audiogram import Audiogram
+    from hlsim.audiogram.listener import Listener
+
+PLAYED_PEAK = 0.9
+"""Peak of an output that ``--no-clipping`` makes softer, where 1.0 is full scale."""
 
 
 def simulate(parser: Parser) -> None:
@@ -22,7 +30,8 @@ def simulate(parser: Parser) -> None:
         parser,
         _simulate,
         "speech.wav perceived.wav --audiogram N3 --spl 65",
-        "scenes perceived --listener listeners.json:L0001 --simulator neuro-msbg",
+        "scenes perceived --audiogram N2 --audiogram N4 --simulator neuro-msbg",
+        ears=SIMULATED_EARS,
     )
     text = "msbg (exact), or a checkpoint's name or folder"
     parser.option("--simulator", str, text, "msbg")
@@ -34,7 +43,8 @@ def compensate(parser: Parser) -> None:
         parser,
         _compensate,
         "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
-        "speech aided --audiogram N4 --compensator nalr",
+        "scenes aided --listener listeners.json:L0001 --compensator nalr --no-clipping",
+        ears=ALL_EARS,
     )
     text = (
         "nalr (a prescription), wdrc (compression in bands), or a checkpoint's name or folder; a "
@@ -46,18 +56,31 @@ def compensate(parser: Parser) -> None:
 
 
 def _declare_files(
-    parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str
+    parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str, ears: str
 ) -> None:
-    """Declare the options that both commands have."""
+    """Declare the options that both commands have.
+
+    Args:
+        parser: Parser of the command.
+        run: Function of the parsed options.
+        examples: Options of each example in the help.
+        ears: Names of the standard ears that the command accepts, for the help text.
+    """
     parser.set_command(run, *examples)
     text = "audio file of 16 to 48 kHz (wav, flac, ogg, mp3, ...), or a folder of such files"
     parser.option("input", input_path, text)
     text = "wav file (32-bit float) to write, or a folder for such files if the input is a folder"
     parser.option("output", Path, text)
-    ears = parser.add_mutually_exclusive_group(required=True)
-    parser.audiogram(group=ears)
-    parser.listener("both ears, for stereo files, left first", group=ears)
+    group = parser.add_mutually_exclusive_group(required=True)
+    text = "; repeat the option for several ears, whose names then end those of the outputs"
+    parser.audiogram(ears=ears, text=text, group=group, action="append")
+    parser.listener("both ears, for stereo files, left first", group=group)
     parser.levels("the input; the output keeps the scale of the file")
+    text = (
+        "make outputs that exceed full scale softer, to a peak of 0.9, so that players do not clip "
+        "them; the printed line says by how many dB"
+    )
+    parser.flag("--no-clipping", text)
 
 
 def _simulate(options: argparse.Namespace) -> None:
@@ -68,21 +91,27 @@ def _simulate(options: argparse.Namespace) -> None:
             options.simulator, sample_rate=rate, full_scale_spl=options.full_scale_spl
         )
 
-    _process(options, build, {})
+    _process(options, read_named_ears(options), build, {})
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    warn_of_other_ears({options.compensator: options.compensator}, read_ears(options))
-    _process(options, lambda rate: load_compensator(options, rate), read_sliders(options))
+    ears = read_named_ears(options)
+    for ear in ears.values():
+        warn_of_other_ears({options.compensator: options.compensator}, ear)
+    _process(options, ears, lambda rate: load_compensator(options, rate), read_sliders(options))
 
 
 def _process(
-    options: argparse.Namespace, build: Callable[[int], Any], sliders: dict[str, float]
+    options: argparse.Namespace,
+    ears: Mapping[str, Audiogram | Listener],
+    build: Callable[[int], Any],
+    sliders: dict[str, float],
 ) -> None:
-    """Process the file or each file of the folder, and print a line about each output.
+    """Process the file or each file of the folder for each ear, and print a line per output.
 
     Args:
         options: Options of the command.
+        ears: Audiograms by their names, or one listener.
         build: Function from a sample rate in Hz to a simulator or compensator.
         sliders: Further arguments of the simulator or compensator, each under its name.
     """
@@ -91,87 +120,119 @@ def _process(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hlsim.checks import LOWEST_RATE
 
-    files = _pair_files(options.input, options.output)
-    ears = read_ears(options)
+    tasks = _plan_outputs(options.input, options.output, [*ears])
     build = cache(build)
     if options.input.is_dir():
         build(LOWEST_RATE)  # A model that cannot be loaded is reported before the first file.
     failures = 0
-    for source, target in files.items():
-        try:
-            text = _process_file(options, source, target, ears, build, sliders)
-        except ValueError as error:
-            if source == options.input:
-                raise
-            print(f"hlsim: warning: {source}: not processed: {error}", file=sys.stderr)
-            failures += 1
-        else:
-            print(f"{target}: {text}", flush=True)
+    with ProgressLine("outputs") as progress:
+        for number, (source, target, name) in enumerate(tasks):
+
+            def show(share: float, number: int = number) -> None:
+                progress(number + share, len(tasks))
+
+            try:
+                text = _process_file(options, source, target, ears[name], build, sliders, show)
+            except ValueError as error:
+                if source == options.input:
+                    raise
+                progress.print(f"hlsim: warning: {source}: not processed: {error}", sys.stderr)
+                failures += 1
+            else:
+                progress.print(f"{target}: {text}")
     if failures:
-        raise ValueError(f"{failures} of {len(files)} files failed, see the warnings above")
+        raise ValueError(f"{failures} of {len(tasks)} outputs failed, see the warnings above")
 
 
 def _process_file(
     options: argparse.Namespace,
     source: Path,
     target: Path,
-    ears: Any,
+    ear: Audiogram | Listener,
     build: Callable[[int], Any],
     sliders: dict[str, float],
+    show: Callable[[float], None],
 ) -> str:
-    """Process one file, write the output, and return a line with its level.
+    """Process one file block by block, write the output, and return a line with its level.
 
     Args:
         options: Options of the command.
         source: File to read.
         target: File to write.
-        ears: Audiogram or listener.
+        ear: Audiogram or listener.
         build: Function from a sample rate in Hz to a simulator or compensator.
         sliders: Further arguments of the simulator or compensator, each under its name.
+        show: Function that shows the finished share of the output, 0 to 1.
     """
     import torch
 
-    from hlsim.audio import read_audio, write_audio
-    from hlsim.calibration import level_spl
+    from hlsim.audio import scan_audio, write_parts
+    from hlsim.calibration import POWER_FLOOR
+    from hlsim.cli.long_recordings import Meter, process_recording, read_all
 
-    waveform, rate = read_audio(source)
-    level = float(level_spl(waveform.flatten(), options.full_scale_spl))
+    recording = scan_audio(source)
+    level = 10.0 * math.log10(recording.power) + options.full_scale_spl
     gain_db = 0.0 if options.spl is None else options.spl - level
+    model = build(recording.sample_rate)
     gain = 10.0 ** (gain_db / 20.0)
-    model = build(rate)
+    size = recording.channels, recording.samples, recording.sample_rate
+    meter = Meter()
     with torch.no_grad():
-        output = model(waveform * gain, ears, **sliders) / gain
-    write_audio(target, output, rate)
-    output_level = float(level_spl(output.flatten(), options.full_scale_spl))
-    text = f"input {level + gain_db:.1f} dB SPL, output {output_level + gain_db:.1f} dB SPL"
-    peak = float(output.abs().max())
-    if peak > 1.0:
-        text += f"; the peak is {peak:.3g} times full scale, and most players will clip it"
-    if getattr(model, "highest_frequency", math.inf) < rate / 2:
+        outputs = process_recording(model, recording, gain, ear, **sliders)
+        write_parts(target, meter.measure(outputs, recording.samples, show), *size)
+    text = f"input {level + gain_db:.1f} dB SPL"
+    output_level = 10.0 * math.log10(max(meter.power, POWER_FLOOR)) + options.full_scale_spl
+    text += f", output {output_level + gain_db:.1f} dB SPL"
+    if meter.peak > 1.0 and options.no_clipping:
+        factor = PLAYED_PEAK / meter.peak
+        write_parts(target, (factor * part for part in read_all(scan_audio(target))), *size)
+        text += (
+            f"; the file is {-20.0 * math.log10(factor):.1f} dB softer, so that it does not clip"
+        )
+    elif meter.peak > 1.0:
+        text += f"; the peak is {meter.peak:.3g} times full scale, and most players will clip it"
+    if getattr(model, "highest_frequency", math.inf) < recording.sample_rate / 2:
         text += "; the output has no band above 8 kHz"
     return text
 
 
-def _pair_files(source: Path, target: Path) -> dict[Path, Path]:
-    """Return the file to write for the file, or for each audio file of the folder, to read.
+def _plan_outputs(source: Path, target: Path, names: Sequence[str]) -> list[tuple[Path, Path, str]]:
+    """Return, for each output, the file to read, the file to write and the name of the ear.
+
+    Args:
+        source: File, or folder of files, to read.
+        target: File to write, or folder for the files to write.
+        names: Names of the ears. Those of several ears end the names of the files to write.
 
     Raises:
         ValueError: A file would replace an input or another output.
     """
     from hlsim.audio import find_audio
 
-    inner, outer = source.resolve(), target.resolve()
-    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise ValueError(
-            f"{target}: refusing to overwrite the input; choose a path that neither is inside "
-            f"{source} nor contains it"
-        )
-    if not source.is_dir():
-        return {source: target}
-    files = {
-        path: (target / path.relative_to(source)).with_suffix(".wav") for path in find_audio(source)
-    }
-    output, number = Counter(files.values()).most_common(1)[0]
-    if number > 1:
-        raise ValueError(f"{number} files would be written to {output}; rename all but one of them")
-    return files
+    if source.is_dir():
+        inner, outer = source.resolve(), target.resolve()
+        if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+            raise ValueError(
+                f"{target}: outputs would be inputs of the next run; choose a folder that neither "
+                f"is inside {source} nor contains it"
+            )
+        files = {path: target / path.relative_to(source) for path in find_audio(source)}
+        files = {path: output.with_suffix(".wav") for path, output in files.items()}
+    elif target.is_dir():
+        raise ValueError(f"{target} is a folder; name the file to write, as {target / 'out.wav'}")
+    else:
+        files = {source: target}
+    tasks = []
+    for path, output in files.items():
+        for name in names:
+            named = output.with_stem(f"{output.stem}-{name}") if len(names) > 1 else output
+            tasks.append((path, named, name))
+    inputs = {path.resolve() for path in files}
+    for output, number in Counter(output for _, output, _ in tasks).items():
+        if number > 1:
+            raise ValueError(
+                f"{number} files would be written to {output}; rename all but one of them"
+            )
+        if output.resolve() in inputs:
+            raise ValueError(f"{output}: refusing to overwrite the input; choose another name")
+    return tasks

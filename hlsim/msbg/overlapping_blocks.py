@@ -69,18 +69,19 @@ def in_blocks(
     return torch.cat(outputs, -1)
 
 
-def block_bounds(samples: int, rate: int) -> list[Block]:
+def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[Block]:
     """Divide the samples of a signal into overlapping blocks.
 
-    Each block contributes about 8 s to the output. Its input begins at least 0.75 s earlier and
-    ends at least 0.55 s later, because MSBG's filters make the output depend on these margins, for
-    which the result is cut off. A signal that is hardly longer than a block is not divided. Each
-    block begins where the frames of smearing and the values of envelopes lie at the same samples as
-    in the whole signal.
+    Each block contributes about ``seconds`` to the output. Its input begins at
+    least 0.75 s earlier and ends at least 0.55 s later, because MSBG's filters make the output
+    depend on these margins, for which the result is cut off. A signal that is hardly longer than a
+    block is not divided. Each block begins where the frames of smearing and the values of envelopes
+    lie at the same samples as in the whole signal.
 
     Args:
         samples: Length of the signal in samples.
         rate: Sample rate in Hz.
+        seconds: Duration of the output of a block, by default 8 s.
 
     Returns:
         Where the input and the output of each block begin and end.
@@ -91,9 +92,8 @@ def block_bounds(samples: int, rate: int) -> list[Block]:
     common = math.lcm(HOP, STEP, round(2 * HALF_RATE_STEP))
     # the smallest number of samples that is a whole number of hops and of steps
     unit = common * rate // math.gcd(common * rate, MSBG_RATE)
-    return split_into_blocks(
-        samples, round(_BLOCK_SECONDS * rate), _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit
-    )
+    hop = round((seconds or _BLOCK_SECONDS) * rate)
+    return split_into_blocks(samples, hop, _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit)
 
 
 def _hooks_are_allowed() -> bool:

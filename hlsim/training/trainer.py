@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import timedelta
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from hlsim.checkpoint import read_record, read_weights, save_checkpoint
 from hlsim.files import lock_folder
-from hlsim.progress import clear_line, show_progress
+from hlsim.progress import ProgressLine, clear_line
 from hlsim.training.batches import BatchData
 from hlsim.training.module import TrainingModule
 from hlsim.version import __version__
@@ -105,24 +105,37 @@ class BestCheckpoint(L.Callback):
 
 
 class StepProgress(L.Callback):
-    """Callback that shows steps, remaining time, loss and scores on stderr, see ``show_progress``.
+    """Callback that shows steps, remaining time, loss and scores on stderr, see ``ProgressLine``.
 
-    >>> StepProgress().show is None  # until the training starts
+    >>> StepProgress().line is None  # until the training starts
     True
     """
 
     def __init__(self) -> None:
-        self.show: Callable[..., None] | None = None
+        self.line: ProgressLine | None = None
+
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        if trainer.is_global_zero:
+            self.line = ProgressLine("steps", "preparing the training", "validating").__enter__()
+
+    def teardown(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        self._close()
+
+    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self.line is not None:
+            self.line.__exit__()
+            self.line = None
 
     def _report(self, trainer: L.Trainer, module: Any) -> None:
-        if not trainer.is_global_zero:
+        if self.line is None:
             return
-        self.show = self.show or show_progress("steps")
         metrics = trainer.callback_metrics
         values = [f"{name} {metrics[name]:.3f}" for name in ("loss", "score") if name in metrics]
-        self.show(
-            trainer.global_step, module.recipe.steps, "".join(f"; {value}" for value in values)
-        )
+        details = "".join(f"; {value}" for value in values)
+        self.line(trainer.global_step, module.recipe.steps, details)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         self._report(trainer, module)

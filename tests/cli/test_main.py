@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -90,6 +91,7 @@ prepare {folder} --out {out} | no audio in it
 simulate {text} {out} --audiogram N3 | text.wav: cannot be read
 simulate {speech} {folder}/o.mp3 --audiogram N3 | o.mp3: expected the extension
 simulate {speech} {speech} --audiogram N3 | refusing to overwrite
+simulate {speech} {folder} --audiogram N3 | name the file to write
 simulate {folder} {folder}/new --audiogram N3 | neither is inside
 simulate {folder} {folder}/.. --audiogram N3 | nor contains
 simulate {folder} {folder}-new --audiogram N3 | no audio in it
@@ -165,6 +167,45 @@ def test_a_presentation_level_is_that_of_the_input(
         check_output(tmp_path / "out.wav", expected / gain, atol=1e-5)  # at the file's scale
 
 
+def test_several_ears_give_one_output_each(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waveform, rate = read_audio(utterance)
+    ears = ("n2", "500:30,4000:60", "10,10,20,20,30,40,50,60")
+    names = ("N2", "500_30-4000_60", "10-10-20-20-30-40-50-60")
+    options = [word for ear in ears for word in ("--audiogram", ear)]
+    call = ("compensate", utterance, tmp_path / "out.wav", "--compensator", "nalr", *options)
+    assert run(*call) == 0
+    printed = capsys.readouterr().out
+    values: list[Any] = ["N2", {500: 30, 4000: 60}, [10, 10, 20, 20, 30, 40, 50, 60]]
+    for name, ear in zip(names, values, strict=True):
+        path = tmp_path / f"out-{name}.wav"
+        check_output(path, NALR(sample_rate=rate)(waveform, ear))
+        assert printed.count(f"{path}: ") == 1
+    assert len(list(tmp_path.iterdir())) == 3
+    assert "N2 appears twice" in error_of(capsys, *call, "--audiogram", "N2")
+    (tmp_path / "out-N2.wav").replace(tmp_path / "a-N2.wav")
+    call = ("simulate", tmp_path / "a-N2.wav", tmp_path / "a.wav", "--audiogram")
+    assert "refusing to overwrite" in error_of(capsys, *call, "N2", "--audiogram", "N4")
+
+
+def test_no_clipping_makes_a_loud_output_softer(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waveform, rate = read_audio(utterance)
+    output = NALR(N3, sample_rate=rate)(waveform / waveform.abs().max())
+    write_audio(tmp_path / "loud.wav", waveform / waveform.abs().max(), rate)
+    call = ("compensate", tmp_path / "loud.wav", tmp_path / "out.wav", "--compensator", "nalr")
+    call += ("--audiogram", "N3", "--no-clipping")
+    peak = float(output.abs().max())
+    assert run(*call) == 0 and peak > 1.0
+    check_output(tmp_path / "out.wav", output * 0.9 / peak)
+    softer_db = 20.0 * math.log10(peak / 0.9)
+    assert f"the file is {softer_db:.1f} dB softer" in capsys.readouterr().out
+    write_audio(tmp_path / "loud.wav", 0.001 * waveform, rate)
+    assert run(*call) == 0 and "softer" not in capsys.readouterr().out
+
+
 def write_listeners(folder: Path, **listeners: Listener) -> Path:
     rows = [
         {"listener": name, "ear": side, **ear.to_row()}
@@ -219,7 +260,7 @@ def test_folders_keep_their_tree_and_bad_files_are_reported(
     assert "no checkpoint 'nobody'" in capsys.readouterr().err
     assert run(*call, "nalr") == 2
     printed = capsys.readouterr()
-    assert "broken.wav: cannot be read" in printed.err and "1 of 3 files failed" in printed.err
+    assert "broken.wav: cannot be read" in printed.err and "1 of 3 outputs failed" in printed.err
     assert printed.out.count("players will clip") == 2
     written = {
         path.relative_to(tmp_path / "out").as_posix()
@@ -342,6 +383,6 @@ def test_a_stopped_command_says_how_to_continue(
     utterance: Path,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr("hlsim.audio.read_audio", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("hlsim.audio.scan_audio", Mock(side_effect=KeyboardInterrupt))
     assert run("simulate", utterance, tmp_path / "out.wav", "--audiogram", "N3") == 130
     assert "run the same command again" in capsys.readouterr().err

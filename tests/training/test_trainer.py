@@ -157,9 +157,9 @@ def test_a_resumed_training_shows_its_total(
     run(VectorTraining(), tmp_path)
     output = capsys.readouterr()
     assert output.out.startswith("the training continues after step 5 of 9\n")
-    lines = [line.strip() for line in output.err.split("\r") if line.strip()]
+    lines = [line.strip() for line in output.err.split("\r") if "steps" in line]
     assert lines[0].startswith("6 of 9 steps")
-    assert any(line.startswith("7 of 9 steps, 0.0 min left") for line in lines)
+    assert any(line.startswith("7 of 9 steps (78%), 0.0 min left") for line in lines)
     assert all(len(line) < 80 for line in lines)
 
 

@@ -1,0 +1,95 @@
+"""Hearing aids on signals that are too long for the memory: block by block, with one state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from compensators.filter_bank import DELAY, HOP, RATE
+from compensators.wearable import Slider, State, Wearable
+from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import gain_to_pascals
+from hlsim.checks import check_waveform
+from hlsim.dsp.overlap import Block, split_into_blocks
+from hlsim.dsp.resample import resample
+from hlsim.torchtools import flatten_items
+
+_BLOCK_SECONDS = 10.0
+"""Duration of the output of a block."""
+
+_MARGIN_SECONDS = 0.01
+"""Duration that contains the kernels of resampling (4.3 ms) and the delay of an aid (4 ms)."""
+
+
+def process_blocks(
+    aid: Wearable,
+    read: Callable[[Sequence[Block]], Iterable[Tensor]],
+    samples: int,
+    audiogram: AudiogramLike,
+    **sliders: Slider,
+) -> Iterator[Tensor]:
+    """Yield the time-aligned output of an aid for a long signal, one part after the other.
+
+    The parts together are the output for the whole signal, to about 1e-6 of its peak. The memory
+    does not depend on the length of the signal.
+
+    Args:
+        aid: Hearing aid at the sample rate of the signal.
+        read: Function from blocks to their inputs, an iterable of tensors (..., time).
+        samples: Length of the signal.
+        audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the leading
+            dimensions of the signal.
+        sliders: Value from 0 to 1 under each slider's name; by default those of ``SLIDERS``.
+
+    Raises:
+        ValueError: The audiogram or a slider is not valid.
+
+    >>> from compensators import WDRC
+    >>> speech = torch.randn(2, 400000)  # 25 s
+    >>> read = lambda blocks: (block.cut_input(speech) for block in blocks)
+    >>> [part.shape for part in process_blocks(WDRC(), read, 400000, "N3")]
+    [torch.Size([2, 160000]), torch.Size([2, 240000])]
+    """
+    rate = aid.sample_rate
+    # the smallest number of samples that lasts a whole number of hops and of samples at 16 kHz
+    unit = math.lcm(HOP, RATE // math.gcd(rate, RATE)) * rate // RATE
+    margin = math.ceil(_MARGIN_SECONDS * rate / unit) * unit
+    blocks = split_into_blocks(samples, round(_BLOCK_SECONDS * rate), 2 * margin, 2 * margin, unit)
+    gain = gain_to_pascals(aid.full_scale_spl)
+    settings = {**aid.SLIDERS, **sliders}.values()
+    state: State | None = None
+    # Where a block is cut, resampling lacks context. The aid starts one margin later, with the
+    # state that the block before had reached there.
+    starts = [0, *(block.input_start + margin for block in blocks[1:])]
+    for block, waveform, start, next_start in zip(
+        blocks, read(blocks), starts, [*starts[1:], samples], strict=True
+    ):
+        check_waveform(waveform, full_scale_spl=aid.full_scale_spl)
+        batch, fitted = aid.prepare(waveform, audiogram)
+        values = aid.stack_sliders([*settings], batch, fitted)
+        if state is None:
+            state = aid.initial_state(values)
+        signals = flatten_items(waveform, batch, fitted.dtype) * gain
+        low = resample(signals, rate, RATE)[:, (start - block.input_start) * RATE // rate :]
+        if block.input_stop == samples:
+            low_time = low.shape[-1]
+            padded = functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
+        else:
+            padded = low[:, : -(margin * RATE // rate)]
+            low_time = padded.shape[-1] - DELAY
+        signals = signals[:, start - block.input_start :][:, : math.ceil(low_time * rate / RATE)]
+
+        before_next = (next_start - start) * RATE // (rate * HOP) * HOP
+        head, tail = padded.tensor_split([before_next], -1)
+        head_output, head_gains, state = aid.process_portions(head, fitted, values, state)
+        tail_output, tail_gains, _ = aid.process_portions(tail, fitted, values, state)
+        delayed = torch.cat((head_output, tail_output), -1)
+        gains = torch.cat((head_gains, tail_gains[:, 1:]), -1)
+        aligned = delayed[:, DELAY : DELAY + low_time]
+        output = aid.combine(signals, low[:, :low_time], aligned, gains) / gain
+        part = output[:, block.output_start - start : block.output_stop - start]
+        yield part.reshape(*batch, -1).to(waveform.dtype)

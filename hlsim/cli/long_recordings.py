@@ -1,0 +1,170 @@
+"""Simulators and aids on recordings of any length: block by block, with one block in memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from compensators import NALR
+from compensators.long_signals import process_blocks
+from compensators.nalr import ORDER
+from compensators.wearable import Wearable
+from hlsim.audio import Recording, read_parts
+from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.thresholds import check_two_channels
+from hlsim.calibration import NEURO_RATE
+from hlsim.dsp.overlap import Block, split_into_blocks
+from hlsim.dsp.resample import ROLLOFF, ZERO_CROSSINGS
+from hlsim.msbg import MSBG
+from hlsim.msbg.overlapping_blocks import block_bounds
+from hlsim.neuro.network import EarNetwork
+
+_HALF_RATE_HZ = 20000
+"""Highest sample rate in Hz at which MSBG works at 22.05 kHz."""
+
+_BLOCK_SECONDS = 8.0
+"""Duration of the output of a block, and of a part that is only read."""
+
+
+class Meter:
+    """Mean square and peak of a signal that passes part by part.
+
+    Attributes:
+        power: Mean square of all samples of all channels.
+        peak: Largest magnitude of a sample.
+
+    >>> import torch
+    >>> meter = Meter()
+    >>> parts = list(meter.measure([torch.ones(1, 2), -torch.ones(1, 2)], 4, print))
+    0.5
+    1.0
+    >>> meter.power, meter.peak
+    (1.0, 1.0)
+    """
+
+    def __init__(self) -> None:
+        self.power = 0.0
+        self.peak = 0.0
+
+    def measure(
+        self, parts: Iterable[Tensor], samples: int, show: Callable[[float], None]
+    ) -> Iterator[Tensor]:
+        """Yield all parts unchanged.
+
+        Args:
+            parts: Parts of the signal, (channels, time).
+            samples: Number of samples per channel of all parts together.
+            show: Function that is called after each part with the share of the signal that has
+                passed, 0 to 1.
+        """
+        passed = 0
+        for part in parts:
+            yield part
+            passed += part.shape[-1]
+            self.power += float(part.double().square().sum()) / (len(part) * samples)
+            self.peak = max(self.peak, float(part.abs().max()))
+            show(passed / samples)
+
+
+def process_recording(
+    model: nn.Module, recording: Recording, gain: float, ears: Any, **sliders: float
+) -> Iterator[Tensor]:
+    """Yield the output of a simulator or an aid for a recording, one part after the other.
+
+    The parts together are the output for the whole recording: by simulators at 16 kHz bit by bit,
+    by MSBG above 20 kHz to 5e-4 of the peak (in frames that smearing leaves nearly empty, which
+    depend on the last bits), otherwise to 2e-5. The memory does not depend on the
+    length, except for simulators of your own and networks with layers other than convolutions,
+    whose output at any time depends on the whole recording.
+
+    Args:
+        model: Simulator or aid at the sample rate of the recording.
+        recording: Recording from ``scan_audio``.
+        gain: Factor on the input, by which the output is divided.
+        ears: Audiogram, or listener for a stereo recording.
+        sliders: Further arguments of an aid, each under its name.
+
+    Yields:
+        Consecutive parts at the scale of the file, (channels, time).
+    """
+
+    def read(blocks: Sequence[Block]) -> Iterable[Tensor]:
+        bounds = [(block.input_start, block.input_stop) for block in blocks]
+        return (part * gain for part in read_parts(recording, bounds))
+
+    if isinstance(model, Wearable):
+        outputs = process_blocks(model, read, recording.samples, ears, **sliders)
+    else:
+        blocks = divide_recording(model, recording.samples, recording.sample_rate)
+        process = _process_channels if len(blocks) > 1 else _process_all
+        outputs = (
+            block.cut_output(process(model, part, ears, sliders))
+            for block, part in zip(blocks, read(blocks), strict=True)
+        )
+    return (output / gain for output in outputs)
+
+
+def _process_all(model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]) -> Tensor:
+    """Return the output of a model, (channels, time)."""
+    output: Tensor = model(part, ears, **sliders)
+    return output
+
+
+def _process_channels(
+    model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]
+) -> Tensor:
+    """Return the output of a model, channel by channel, as models process long signals themselves.
+
+    Shape: (channels, time) -> (channels, time).
+    """
+    ears_of_channels = [ears] * len(part)
+    if isinstance(ears, Listener):
+        check_two_channels(part)
+        ears_of_channels = [*ears.ears().values()]
+    outputs = [
+        model(channel, ear, **sliders) for channel, ear in zip(part, ears_of_channels, strict=True)
+    ]
+    return torch.stack(outputs)
+
+
+def read_all(recording: Recording) -> Iterator[Tensor]:
+    """Yield consecutive parts of a recording, (channels, time)."""
+    hop = round(_BLOCK_SECONDS * recording.sample_rate)
+    blocks = split_into_blocks(recording.samples, hop, 0, 0)
+    return read_parts(recording, [(block.input_start, block.input_stop) for block in blocks])
+
+
+def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
+    """Divide a recording into overlapping blocks that a model can process one by one.
+
+    Args:
+        model: Simulator or aid whose output depends on a limited part of its input; for any other,
+            the recording is one block.
+        samples: Length of the recording.
+        rate: Sample rate in Hz.
+
+    >>> [block.output_start for block in divide_recording(NALR(), 320000, 16000)]
+    [0, 128000]
+    """
+    if isinstance(model, MSBG):
+        # At high rates, MSBG works at 44.1 instead of 22.05 kHz, and takes twice the memory.
+        return block_bounds(samples, rate, None if rate <= _HALF_RATE_HZ else _BLOCK_SECONDS / 2)
+    hop = round(_BLOCK_SECONDS * rate)
+    if isinstance(model, NALR):
+        return split_into_blocks(samples, hop, ORDER, ORDER)
+    field = model._receptive_field if isinstance(model, EarNetwork) else None
+    if field is None:
+        return [Block(0, 0, samples, samples)]
+    step, reach = field
+    if rate == NEURO_RATE:
+        return split_into_blocks(samples, hop, reach, reach, step)
+    # Resampling to 16 kHz and back adds the reach of its kernel twice.
+    reach += 2 * math.ceil(ZERO_CROSSINGS / ROLLOFF + 1)
+    common = math.gcd(rate, NEURO_RATE)
+    unit = math.lcm(step, NEURO_RATE // common) * rate // NEURO_RATE
+    margin = reach * rate / NEURO_RATE
+    return split_into_blocks(samples, hop, margin, margin, unit)

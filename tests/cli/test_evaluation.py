@@ -1,0 +1,87 @@
+"""Every option of an evaluation reaches the parameter of its function."""
+
+import inspect
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+
+from hlsim import Audiogram
+from hlsim.cli.main import main
+from hlsim.progress import ProgressLine
+
+STUDY = "--measure my:measure --jobs 3 --dask tcp://host:8786 --seed 7 --out {out}"
+ITEMS = "--speech {a} --noise {b} --items 5 --seconds 1.5 --levels 55 75"
+
+CALLS = {
+    "hlsim.evaluation.simulators:evaluate_simulators": (
+        f"evaluate-simulator msbg --audiograms standard --teacher my:teacher {ITEMS} "
+        f"--inputs as-is compensated --compensator nalr {STUDY}"
+    ),
+    "hlsim.evaluation.compensators:evaluate_compensators": (
+        f"evaluate-compensator nalr --audiograms standard --audiogram N3 {ITEMS} --enhancer my:e "
+        f"--simulator neuro-msbg-light --gain-ears n1 {STUDY}"
+    ),
+    "hlsim.evaluation.recordings:haspi_report": (
+        "haspi-report --clean {a} --before {b} --after {c} --manifest {d} --root {e} --audiogram "
+        "N3 --audiograms {f} --measures stoi,haspi --baseline noisy --better-ear --spl 60 "
+        f"--condition A={{a}} --condition B={{b}} {STUDY}"
+    ),
+    "hlsim.evaluation.clarity:evaluate_scenes": (
+        "clarity {a} mine=nalr --listeners {b} --scenes-listeners {c} --every 3 --enhancer my:e "
+        f"--linked --full-scale-spl 110 {STUDY}"
+    ),
+}
+"""Command with all its options, by the function that it calls."""
+
+EXPECTED: dict[str, Any] = {
+    "speech": "a", "noise": "b", "items": 5, "seconds": 1.5, "levels": [55.0, 75.0],
+    "teacher": "my:teacher", "inputs": ["as-is", "compensated"], "enhancers": ["my:e"],
+    "simulator": "neuro-msbg-light", "gain_ears": ["N1"], "clean": "a", "before": "b", "after": "c",
+    "manifest": "d", "root": "e", "baseline": "noisy", "better_ear": True, "spl": 60.0,
+    "conditions": {"A": "a", "B": "b"}, "scenes": "a", "listeners": "b", "scenes_listeners": "c",
+    "stride": 3, "linked": True, "aids": {"mine": "nalr"}, "seed": 7, "jobs": 3,
+    "dask": "tcp://host:8786", "audiogram": Audiogram.standard("N3"),
+}  # fmt: skip
+"""Expected argument by parameter; single letters are paths."""
+
+
+@pytest.mark.parametrize("target", CALLS)
+def test_every_option_reaches_its_parameter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
+) -> None:
+    pytest.importorskip("matplotlib")
+    paths = {letter: tmp_path / letter for letter in "abcdef"}
+    for path in paths.values():
+        path.mkdir()
+    module, _, name = target.partition(":")
+    function = getattr(import_module(module), name)
+    called = Mock(side_effect=ValueError("called"))
+    monkeypatch.setattr(f"{module}.{name}", called)
+    words = CALLS[target].format(**paths, out=tmp_path / "out").split()
+    assert main(words) == 2
+    signature = inspect.signature(function)
+    bound = signature.bind(*called.call_args.args, **called.call_args.kwargs)
+    arguments = {**bound.arguments, **bound.arguments.get("running", {})}
+    missing = signature.parameters.keys() - bound.arguments.keys()
+    assert not missing, "an argument is left at its default"
+    for parameter, value in EXPECTED.items():
+        if parameter in arguments:
+            actual = arguments[parameter]
+            if isinstance(actual, dict):
+                actual = {key: _letter(item) for key, item in actual.items()}
+            assert _letter(actual) == value, parameter
+    named_measures = ["stoi", "haspi"] if name == "haspi_report" else []
+    assert arguments["measures"] == [*named_measures, "my:measure"]
+    assert isinstance(arguments["progress"], ProgressLine)
+    if name == "evaluate_scenes":
+        assert arguments["out"] == tmp_path / "out" and arguments["full_scale_spl"] == 110.0
+    else:
+        assert arguments["store"] == tmp_path / "out" / "scores.jsonl"
+
+
+def _letter(value: Any) -> Any:
+    """Return the name of a path of one letter, and any other value unchanged."""
+    return value.name if isinstance(value, Path) and len(value.name) == 1 else value
