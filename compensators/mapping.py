@@ -116,7 +116,7 @@ class MappingCompensator(Aid, EarNetwork):
         # The limit is the last step, because resampling can overshoot.
         return soft_limit(result, self.config.limit_spl)
 
-    def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
+    def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
         spectrum = self.stft.analyse(signals)
         start = interpolate(nalr_gains_db(ears), FREQUENCIES, self.config.hz) / NEPER_DB
         features = self._features(spectrum, ears, start)
@@ -134,7 +134,7 @@ class MappingCompensator(Aid, EarNetwork):
             factor = phase_factor(self.phase_decoder(features, size), gain)
         return self.stft.synthesise(spectrum * factor, signals.shape[-1])
 
-    _amplify = _process
+    _amplify = process_items
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
         """Return the correction in nepers, smooth over time and frequency.

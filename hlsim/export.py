@@ -270,7 +270,7 @@ class _Call(nn.Module):
 def _simulate(simulator: NeuroMSBG, waveform: Tensor, thresholds: Tensor) -> dict[str, Tensor]:
     """Call a simulator without its validation, which reads the values of tensors."""
     gain = gain_to_pascals(simulator.full_scale_spl)
-    return {"perceived": simulator._process(waveform * gain, thresholds) / gain}
+    return {"perceived": simulator.process_items(waveform * gain, thresholds) / gain}
 
 
 def _fit(aid: Wearable, thresholds: Tensor) -> dict[str, Tensor]:

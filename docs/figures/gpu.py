@@ -76,7 +76,7 @@ from hlsim.losses.criteria import CRITERIA, weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics import haspi, hasqi, mbstoi
 from hlsim.neuro import NeuroConfig
-from hlsim.neuro.scan import _kernel as mamba_kernel
+from hlsim.neuro.family.scan import _kernel as mamba_kernel
 
 Row = dict[str, Any]
 Step = Callable[[], Any]
@@ -770,7 +770,7 @@ def simulator_row(
 
     if not plain:
         return step_row(run, network, loss, items * seconds)
-    with mock.patch("hlsim.neuro.scan._kernel", lambda: None):
+    with mock.patch("hlsim.neuro.family.scan._kernel", lambda: None):
         return step_row(run, network, loss, items * seconds)
 
 

@@ -57,8 +57,9 @@ def _live(options: argparse.Namespace) -> None:
     import torch
 
     from hlsim.calibration import NEURO_RATE
-    from hlsim.cli.microphone import Live, SimulatedStream, play
+    from hlsim.cli.microphone import Live, play
     from hlsim.neuro import load_pretrained
+    from hlsim.neuro.stream import SimulatedStream
 
     torch.set_num_threads(1)  # Threads would wait for each other for more than 4 ms.
     scale = options.full_scale_spl

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -19,10 +20,10 @@ from hlsim.neuro.decoders import Decoder, phase_factor
 from hlsim.neuro.encoder import (
     AudiogramEncoder,
     DenseEncoder,
-    FrameEncoder,
     log_magnitude,
     sine_of_phase,
 )
+from hlsim.neuro.family.frames import FrameEncoder
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
 from hlsim.torchtools import built_in_float32
@@ -84,7 +85,15 @@ class NeuroMSBG(EarNetwork):
 
     config: NeuroConfig
 
-    @built_in_float32
+    def __new__(cls, config: NeuroConfig | None = None, **options: Any) -> Self:
+        # ``NeuroMSBG(config)`` is an object of the subclass for the structure of the configuration.
+        kind: type = cls
+        if cls is NeuroMSBG:
+            is_bands = config is not None and config.structure == "bands"
+            kind = BandNeuroMSBG if is_bands else DualPathNeuroMSBG
+        network: Self = super().__new__(kind)
+        return network
+
     def __init__(
         self,
         config: NeuroConfig | None = None,
@@ -101,9 +110,48 @@ class NeuroMSBG(EarNetwork):
         self.prior = Prior(self.stft, compute_prior) if config.prior else None
         if self.prior is not None:
             self._additional_field = self.prior.receptive_field
-        self.bands = BandCorrection(config) if config.structure == "bands" else None
-        if self.bands is not None:
-            return
+
+
+class BandNeuroMSBG(NeuroMSBG):
+    """Neuro-MSBG of the structure ``bands``, which corrects the gains in MSBG's channels.
+
+    Args:
+        config: Sizes and choices, with ``structure="bands"``.
+        options: Keyword arguments of ``NeuroMSBG``.
+
+    >>> BandNeuroMSBG(NeuroConfig(structure="bands"))(torch.randn(1600), "N3").shape
+    torch.Size([1600])
+    """
+
+    prior: Prior
+
+    @built_in_float32
+    def __init__(self, config: NeuroConfig | None = None, **options: Any) -> None:
+        super().__init__(config, **options)
+        self.bands = BandCorrection(self.config)
+
+    def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
+        severity = severity_index(ears)
+        spectrum = self.stft.analyse(self.prior.filter(signals, severity))
+        output_spectrum = self.bands(spectrum, ears, severity, self.prior)
+        return self.stft.synthesise(output_spectrum, signals.shape[-1])
+
+
+class DualPathNeuroMSBG(NeuroMSBG):
+    """Neuro-MSBG of the structures ``dual-path`` and ``monolithic``: encoder, blocks and decoders.
+
+    Args:
+        config: Sizes and choices, by default ``NeuroConfig()``.
+        options: Keyword arguments of ``NeuroMSBG``.
+
+    >>> DualPathNeuroMSBG(NeuroConfig(channels=8))(torch.randn(1600), "N3").shape
+    torch.Size([1600])
+    """
+
+    @built_in_float32
+    def __init__(self, config: NeuroConfig | None = None, **options: Any) -> None:
+        super().__init__(config, **options)
+        config = self.config
         frequencies = self.stft.frequencies
         channels = config.channels
         is_monolithic = config.structure == "monolithic"
@@ -129,7 +177,7 @@ class NeuroMSBG(EarNetwork):
         if self.severity is not None:
             nn.init.zeros_(self.severity.weight)
 
-    def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
+    def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
         if self.config.level_aware:
             return self._simulate(signals, ears)
         rms = signals.square().mean(-1, keepdim=True).add(POWER_FLOOR).sqrt()
@@ -145,9 +193,6 @@ class NeuroMSBG(EarNetwork):
         if self.prior is not None:
             signals = self.prior.filter(signals, severity)
         spectrum = self.stft.analyse(signals)
-        if self.bands is not None and self.prior is not None:
-            output_spectrum = self.bands(spectrum, ears, severity, self.prior)
-            return self.stft.synthesise(output_spectrum, samples)
         powers = power(spectrum)
         prior_factor = self.prior(powers, ears, severity) if self.prior is not None else None
         features = self._features(spectrum, powers, ears, prior_factor)

@@ -29,7 +29,7 @@ class EarNetwork(nn.Module):
     """Base class of networks from waveform and audiogram to waveform.
 
     The class converts the input to pascals at 16 kHz, and the output back to its scale and rate.
-    Subclasses set ``config`` and implement ``_process``.
+    Subclasses set ``config`` and implement ``process_items``.
 
     On a CPU, a few items run at a time. Long signals run in overlapping parts if a sample of the
     output depends on a limited part of the input (``cnn`` blocks). This changes no output, and
@@ -109,14 +109,14 @@ class EarNetwork(nn.Module):
         """
         gain = gain_to_pascals(self.full_scale_spl)
         inputs = resample(signals * gain, self.sample_rate, NEURO_RATE)
-        process = self._process
+        process = self.process_items
         if self.checkpoint:
             # The networks draw no random numbers, whose state need not be stored.
             process = partial(checkpoint, process, use_reentrant=False, preserve_rng_state=False)
-        if self._receptive_field is None:
+        if self.receptive_field is None:
             output = process(inputs, ears)
         else:
-            step, field = self._receptive_field
+            step, field = self.receptive_field
             hop = _samples_at_once(inputs)
             blocks = split_into_blocks(inputs.shape[-1], hop, field, field, step)
             outputs = [block.cut_output(process(block.cut_input(inputs), ears)) for block in blocks]
@@ -125,7 +125,7 @@ class EarNetwork(nn.Module):
         return self._finish(output) / gain
 
     @property
-    def _receptive_field(self) -> tuple[int, int] | None:
+    def receptive_field(self) -> tuple[int, int] | None:
         """Step and receptive field in samples at 16 kHz; None if the field is the whole signal.
 
         Parts of a signal must start at multiples of the step. The receptive field is the number of
@@ -134,7 +134,7 @@ class EarNetwork(nn.Module):
         field = self.config.receptive_field
         return None if field is None else (self.config.step, field + self._additional_field)
 
-    def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
+    def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Process signals in pascals at 16 kHz for ears in dB HL.
 
         Shape: (items, time), (items, 8) -> (items, time).

@@ -22,8 +22,9 @@ from compensators import WDRC
 from hlsim import Listener, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
-from hlsim.cli.microphone import Live, SimulatedStream, _key_reader, play
+from hlsim.cli.microphone import Live, _key_reader, play
 from hlsim.extras import MissingExtraError
+from hlsim.neuro.stream import SimulatedStream
 from tests.compensators.aids import EAR, tone, varied_hearing_aid
 
 FLAGS = ("input_overflow", "input_underflow", "output_overflow", "output_underflow")
@@ -211,19 +212,6 @@ def test_keys_are_read_from_a_terminal_whose_settings_are_restored(
     assert termios.tcgetattr(stdin) == settings
     os.close(keyboard)
     os.close(stdin)
-
-
-def test_simulated_blocks_equal_the_whole_signal() -> None:
-    simulator = load_pretrained("neuro-msbg")
-    stream, signal = SimulatedStream(simulator, EAR), 0.03 * torch.randn(24 * 1024)
-    assert (stream.latency, stream.block) == (3200, 128)
-    perceived = torch.cat([stream(chunk) for chunk in signal.split(1536)])
-    whole = simulator(signal, EAR)
-    middle = slice(stream.latency, -2 * stream.latency)  # the stream begins with silence
-    difference = perceived[stream.latency :][middle] - whole[: -stream.latency][middle]
-    assert difference.abs().max() < 1e-4 * whole.abs().max()
-    with pytest.raises(ValueError, match="finite receptive field"):
-        SimulatedStream(load_pretrained("neuro-msbg-lstm"), EAR)
 
 
 @pytest.mark.parametrize(

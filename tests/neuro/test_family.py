@@ -1,5 +1,7 @@
 """All kinds of blocks, baselines and ablations have their size and obey laws."""
 
+import copy
+import pickle
 from pathlib import Path
 
 import pytest
@@ -8,6 +10,7 @@ import torch
 from hlsim import Audiogram, NeuroMSBG, load_pretrained
 from hlsim.data.ears import draw_thresholds
 from hlsim.neuro import NeuroConfig
+from hlsim.neuro.model import BandNeuroMSBG, DualPathNeuroMSBG
 from hlsim.training.recipes import SimulatorRecipe
 
 yaml = pytest.importorskip("yaml")
@@ -152,3 +155,11 @@ def test_bounded_gradient_of_bands_has_no_second_derivative() -> None:
     (slope,) = torch.autograd.grad(model(leaf, N3).square().sum(), leaf, create_graph=True)
     with pytest.raises(RuntimeError, match="no second derivative; use neuro-msbg or msbg"):
         torch.autograd.grad(slope.sum(), leaf)
+
+
+def test_structure_decides_the_class() -> None:
+    for structure, kind in (("dual-path", DualPathNeuroMSBG), ("bands", BandNeuroMSBG)):
+        model = NeuroMSBG(NeuroConfig(structure=structure, channels=8))
+        assert type(model) is kind
+        twin = pickle.loads(pickle.dumps(copy.deepcopy(model)))
+        assert type(twin) is kind and twin.config == model.config

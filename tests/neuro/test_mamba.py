@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.neuro.mamba import Mamba
+from hlsim.neuro.family.mamba import Mamba
 
 # Parameters of Mamba(d_model=64) in mamba_ssm 2.2
 SHAPES = {

@@ -13,8 +13,8 @@ from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.losses.waveform import noise_to_signal_db
 from hlsim.neuro import NeuroConfig, network
-from hlsim.neuro.blocks import BidirectionalLSTM, EncoderLayer
 from hlsim.neuro.decoders import phase_factor
+from hlsim.neuro.family.sequences import BidirectionalLSTM, EncoderLayer
 
 N3 = Audiogram.standard("N3")
 
@@ -71,7 +71,7 @@ def test_items_and_blocks_one_by_one_equal_processing_at_once(
         parameter.data += 0.05 * torch.randn_like(parameter)
     waveforms, ears = 0.02 * torch.randn(2, 40_000, dtype=torch.float64), draw_thresholds(2)
     shapes: list[torch.Size] = []
-    process: Any = model._process
+    process: Any = model.process_items
 
     def process_and_record(signals: Tensor, ears: Tensor) -> Tensor:
         shapes.append(signals.shape)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.neuro import scan
-from hlsim.neuro.scan import selective_scan
+from hlsim.neuro.family.scan import selective_scan
 
 NAMES = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
 

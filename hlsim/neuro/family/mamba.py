@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.neuro.scan import selective_scan
+from hlsim.neuro.family.scan import selective_scan
 
 
 class Mamba(nn.Module):

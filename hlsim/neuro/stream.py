@@ -1,0 +1,63 @@
+"""A simulator for a signal that arrives in chunks."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram.listener import Listener
+from hlsim.calibration import NEURO_RATE
+from hlsim.neuro.model import NeuroMSBG
+
+
+class SimulatedStream:
+    """Simulator for a signal that arrives in chunks.
+
+    Call it with each chunk in turn; it returns as many samples of what is perceived. This output is
+    delayed by the simulator's look-ahead, so that it depends on past input only. Its first
+    ``latency`` samples belong to the silence before the first chunk.
+
+    Args:
+        simulator: Neuro-MSBG at 16 kHz with a finite receptive field, such as ``neuro-msbg``.
+        audiogram: One ear, or a listener with two.
+
+    Attributes:
+        latency: Delay of the output in samples.
+        block: Every chunk must be a multiple of this many samples long.
+
+    Raises:
+        ValueError: The simulator is not a Neuro-MSBG at 16 kHz with a finite receptive field.
+
+    >>> import hlsim
+    >>> stream = SimulatedStream(hlsim.load_pretrained("neuro-msbg"), Audiogram.standard("N3"))
+    >>> stream(torch.zeros(1536)).shape
+    torch.Size([1536])
+    """
+
+    def __init__(self, simulator: nn.Module, audiogram: Audiogram | Listener) -> None:
+        field = simulator.receptive_field if isinstance(simulator, NeuroMSBG) else None
+        if field is None or simulator.sample_rate != NEURO_RATE:
+            raise ValueError(
+                f"expected a Neuro-MSBG at {NEURO_RATE} Hz with a finite receptive field, such "
+                "as neuro-msbg"
+            )
+        self._simulator = simulator
+        self._audiogram = audiogram
+        self.block, look_ahead = field
+        self.latency = math.ceil(look_ahead / self.block) * self.block
+        self._past = torch.zeros(2 * self.latency)
+
+    def __call__(self, chunk: Tensor) -> Tensor:
+        """Return what is perceived. Shape: (time,), or (2, time) for a listener -> the same.
+
+        The number of samples must be a multiple of ``block``.
+        """
+        samples = chunk.shape[-1]
+        window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
+        self._past = window[..., samples:]
+        with torch.no_grad():
+            perceived: Tensor = self._simulator(window, self._audiogram)
+        return perceived[..., self.latency : self.latency + samples]

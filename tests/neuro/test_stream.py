@@ -1,0 +1,21 @@
+"""A simulator in blocks returns, later, what it returns for the whole signal."""
+
+import pytest
+import torch
+
+from hlsim import load_pretrained
+from hlsim.neuro.stream import SimulatedStream
+from tests.compensators.aids import EAR
+
+
+def test_simulated_blocks_equal_the_whole_signal() -> None:
+    simulator = load_pretrained("neuro-msbg")
+    stream, signal = SimulatedStream(simulator, EAR), 0.03 * torch.randn(24 * 1024)
+    assert (stream.latency, stream.block) == (3200, 128)
+    perceived = torch.cat([stream(chunk) for chunk in signal.split(1536)])
+    whole = simulator(signal, EAR)
+    middle = slice(stream.latency, -2 * stream.latency)  # the stream begins with silence
+    difference = perceived[stream.latency :][middle] - whole[: -stream.latency][middle]
+    assert difference.abs().max() < 1e-4 * whole.abs().max()
+    with pytest.raises(ValueError, match="finite receptive field"):
+        SimulatedStream(load_pretrained("neuro-msbg-lstm"), EAR)
