@@ -311,7 +311,7 @@ def _write_onnx(
 ) -> None:
     """Write a program, and raise ValueError if onnxruntime computes other outputs than torch."""
     for module in ("onnx", "onnxscript", "onnxruntime"):
-        require(module, "dev")
+        require(module, "onnx")
     with torch.no_grad():
         expected = program.module()(**inputs)
     with atomic_path(path) as temporary:
@@ -325,7 +325,7 @@ def _write_onnx(
             raise ValueError(f"{path}: ONNX cannot represent the program: {error}") from error
         assert converted is not None
         converted.save(str(temporary), external_data=False)
-        runtime = require("onnxruntime", "dev")
+        runtime = require("onnxruntime", "onnx")
         options = runtime.SessionOptions()
         options.log_severity_level = 3  # Only errors are logged.
         session = runtime.InferenceSession(
@@ -338,5 +338,6 @@ def _write_onnx(
             if not difference <= TOLERANCE * peak:
                 raise ValueError(
                     f"{path}: the output of onnxruntime differs by {float(difference / peak):.0e} "
-                    f"of its peak, expected {TOLERANCE:g} or less; the file was not written"
+                    f"of its peak, expected {TOLERANCE:g} or less; the file was not written. "
+                    "Update onnx, onnxscript and onnxruntime"
                 )

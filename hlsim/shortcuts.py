@@ -106,8 +106,9 @@ def simulate(
         ear: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
             mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        simulator: ``"msbg"``, the exact model; the name or folder of a checkpoint such as
-            ``"neuro-msbg"``; ``package.module:name``, a simulator of your own; or a module.
+        simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name or folder
+            of a checkpoint such as ``"neuro-msbg"``; ``package.module:name``, a simulator of your
+            own; or a module.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The door to all simulators: the exact MSBG, trained networks, and simulators of your own."""
+"""The door to all simulators: MSBG, trained networks, a linear ear, and simulators of your own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    has_listeners,
+    resolve_thresholds,
+    store_thresholds,
+)
 from hlsim.calibration import (
     NEURO_RATE,
     PASCAL_SPL,
@@ -18,6 +23,8 @@ from hlsim.calibration import (
     set_level,
 )
 from hlsim.checks import check_rate, check_waveform
+from hlsim.dsp.fir import filter_without_delay
+from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
 from hlsim.neuro import load_pretrained
@@ -26,6 +33,75 @@ from hlsim.torchtools import broadcast_shape, flatten_items
 
 EXACT = "msbg"
 """Name of the exact MSBG."""
+
+LINEAR = "attenuation"
+"""Name of ``Attenuation``."""
+
+_HALF_LENGTH_SECONDS = 0.064
+"""Time in seconds that the filter of ``Attenuation`` covers before and after time 0."""
+
+
+class Attenuation(nn.Module):
+    """Linear ear: each frequency is attenuated by the hearing loss, and nothing else happens.
+
+    The gain at a frequency is the threshold times -1, in dB. Thresholds are interpolated linearly
+    over frequency, and stay constant below 250 Hz and above 8 kHz. There is neither recruitment nor
+    smearing nor delay. Use it beside MSBG to see whether a result depends on these.
+
+    Args:
+        audiogram: Ear or ears; may be passed to each call instead.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, for the warning about loud
+            signals.
+
+    Raises:
+        ValueError: The rate or the level is out of range, or the audiogram is invalid.
+
+    >>> ear = Attenuation([20.0] * 8)
+    >>> tone = torch.sin(0.1 * torch.arange(16000))
+    >>> ratio = ear(tone)[4000:-4000].norm() / tone[4000:-4000].norm()
+    >>> ratio.round(decimals=3)
+    tensor(0.1000)
+    """
+
+    def __init__(
+        self,
+        audiogram: AudiogramLike | None = None,
+        *,
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
+    ) -> None:
+        super().__init__()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+        self._thresholds = (store_thresholds(audiogram),)
+        self._two_ears = has_listeners(audiogram)
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+        """Attenuate signals.
+
+        Shape: (..., time) -> (..., time).
+
+        Args:
+            waveform: Input signals.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) in dB HL broadcasts
+                over the leading dimensions of the waveform; by default those of the constructor.
+
+        Raises:
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes do
+                not broadcast.
+        """
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
+        (stored,) = self._thresholds
+        ears = resolve_thresholds(stored, audiogram, waveform, two_ears=self._two_ears)
+        with torch.autocast(waveform.device.type, enabled=False):
+            dtype = torch.promote_types(waveform.dtype, torch.float32)
+            half = round(_HALF_LENGTH_SECONDS * self.sample_rate)
+            hz = tuple(self.sample_rate * k / (2.0 * half) for k in range(half + 1))
+            gains = 10.0 ** (-interpolate(ears.to(dtype), FREQUENCIES, hz) / 20.0)
+            taps = torch.fft.irfft(gains.to(dtype.to_complex())).roll(half, -1)
+            window = torch.hann_window(2 * half, dtype=dtype, device=waveform.device)
+            return filter_without_delay(waveform.to(dtype), taps * window).to(waveform.dtype)
 
 
 class PluginSimulator(nn.Module):
@@ -110,10 +186,10 @@ def load_simulator(
     """Return the simulator that a name, a folder or a module describes.
 
     Args:
-        simulator: ``"msbg"``, the exact model; the name of a checkpoint that ships with hlsim, such
-            as ``"neuro-msbg"``, or the folder of a checkpoint; ``package.module:name`` or
-            ``path/to/file.py:name``, a simulator of your own (``PluginSimulator``); or a module,
-            which is validated and returned.
+        simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name of a
+            checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or the folder of a
+            checkpoint; ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
+            (``PluginSimulator``); or a module, which is validated and returned.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
@@ -132,8 +208,9 @@ def load_simulator(
                 raise ValueError(f"expected a simulator with {attribute}={value}, got {setting}")
         return simulator
     name = str(simulator)
-    if name == EXACT:
-        return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    if name in (EXACT, LINEAR):
+        kind = MSBG if name == EXACT else Attenuation
+        return kind(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     if ":" in name and not Path(name).is_dir():
         return PluginSimulator(name, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)

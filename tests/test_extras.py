@@ -1,13 +1,40 @@
 """Simulators are compared without the extra that needs a compiler."""
 
+import re
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 from torch import nn
 
 import hlsim
+import hlsim.export
+from hlsim.extras import MissingExtraError
 from tests.helpers import write_ears
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_messages_ask_for_extras_of_users_only() -> None:
+    """The extra dev has everything that the tests need, and docs what the site needs."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    for package in ("hlsim", "compensators"):
+        for path in (ROOT / package).rglob("*.py"):
+            source = path.read_text()
+            named = set(re.findall(r"""require\([\w."]+, (?:extra=)?"(\w+)"\)""", source))
+            assert named <= extras.keys() - {"dev", "docs"}, path
+
+
+def test_export_without_onnx_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    simulator = hlsim.load_pretrained("neuro-msbg-light")
+    with pytest.raises(MissingExtraError, match=r"pip install 'hlsim\[onnx\]'"):
+        hlsim.export.export_onnx(simulator, tmp_path / "ear.onnx", seconds=0.1)
 
 
 def test_simulators_are_compared_without_pesq(

@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import hlsim
 from hlsim import MSBG, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.simulators import PluginSimulator, load_simulator
+from hlsim.simulators import Attenuation, PluginSimulator, load_simulator
 
 PLUGIN = """
 class Quieter:
@@ -75,6 +76,43 @@ def test_a_plug_in_is_the_ear_of_simulate(plugin: str) -> None:
 def test_invalid_plug_ins_are_rejected(plugin: str, name: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         load_simulator(f"{plugin}:{name}")
+
+
+@pytest.mark.parametrize("rate", [16000, 44100])
+@pytest.mark.parametrize("ear", ["N3", "S3", [-10.0, 0.0, 5.0, 100.0, 20.0, 100.0, 60.0, 60.0]])
+def test_linear_ear_attenuates_tones_by_the_interpolated_threshold(rate: int, ear: object) -> None:
+    simulator = load_simulator("attenuation", sample_rate=rate)
+    thresholds = hlsim.Audiogram.standard(ear).levels if isinstance(ear, str) else ear
+    hz = np.array([125.0, 250.0, 700.0, 1500.0, 2000.0, 3400.0, 5000.0, 7900.0])
+    phase = 2.0 * np.pi * hz[:, None] * np.arange(rate // 2) / rate
+    tones = torch.from_numpy(np.sin(phase))
+    perceived = simulator(tones, ear)
+    # Far from the ends: the output is in phase with the input.
+    middle = slice(rate // 8, -rate // 8)
+    weight = torch.hann_window(tones[:, middle].shape[-1], dtype=torch.float64)
+    products = (perceived[:, middle] * tones[:, middle] * weight).sum(-1)
+    gains = products / (tones[:, middle].square() * weight).sum(-1)
+    expected = -np.interp(hz, hlsim.audiogram.FREQUENCIES, thresholds)
+    tolerance = 0.05 if isinstance(ear, str) else 0.4  # jumps of 95 dB between frequencies
+    np.testing.assert_allclose(20.0 * torch.log10(gains), expected, atol=tolerance)
+
+
+def test_linear_ear_is_linear_and_takes_ears_as_other_simulators_do() -> None:
+    speech = hlsim.example_speech()[:16000]
+    ear = Attenuation("N3")
+    torch.testing.assert_close(ear(10.0 * speech), 10.0 * ear(speech))
+    normal = ear(speech, "NH")
+    torch.testing.assert_close(normal, speech, atol=1e-6, rtol=0.0)
+    both = Attenuation(hlsim.Listener("N2", "N4"))(torch.stack([speech, speech]))
+    torch.testing.assert_close(both, Attenuation()(speech, ["N2", "N4"]))
+    thresholds = torch.full((8,), 40.0, requires_grad=True)
+    ear(speech, thresholds).square().sum().backward()
+    assert bool((thresholds.grad < 0.0).all())
+    loss = HearingLossLoss("N3", simulator="attenuation")
+    assert 0.0 <= float(loss(speech, speech)) < float(loss(0.1 * speech, speech))
+    for bad in ("N7", [0.0] * 7):
+        with pytest.raises(ValueError):
+            ear(speech, bad)
 
 
 def test_unknown_names_and_modules_of_another_rate_are_rejected() -> None:

@@ -242,7 +242,7 @@ class Audiogram:
         Raises:
             MissingExtraError: pyclarity is not installed.
         """
-        module = require("clarity.utils.audiogram", "dev")
+        module = require("clarity.utils.audiogram", "clarity")
         return module.Audiogram(np.array(self.levels), np.array(self.frequencies))
 
 

@@ -93,14 +93,13 @@ class HearingLossLoss(nn.Module):
             simulator, ``"msbg"`` included, receives the levels at eight frequencies,
             ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
-            exact model; ``package.module:name``, a simulator of your own; or a module, which is
-            called with a waveform and thresholds. The module itself is frozen, so pass a copy of
-            one that is still trained. It may have the
-            attributes ``sample_rate``, ``full_scale_spl`` and ``aligned`` (false if its output is
-            delayed), which are validated; ``emulates_msbg``, true if its normal ear and its phases
-            are those of MSBG; ``highest_frequency`` of its output in Hz; and
-            ``needs_exact_lengths``, true if silence after the end of an item changes the output
-            before.
+            exact model; ``"attenuation"``, a linear ear; ``package.module:name``, a simulator of
+            your own; or a module, which is called with a waveform and thresholds. The module itself
+            is frozen, so pass a copy of one that is still trained. It may have the attributes
+            ``sample_rate``, ``full_scale_spl`` and ``aligned`` (false if its output is delayed),
+            which are validated; ``emulates_msbg``, true if its normal ear and its phases are those
+            of MSBG; ``highest_frequency`` of its output in Hz; and ``needs_exact_lengths``, true if
+            silence after the end of an item changes the output before.
         sample_rate: Sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
             below 8 kHz. The criterion ``"paper"`` resamples what it compares to 16000.
         full_scale_spl: Level in dB SPL of RMS 1.0.

@@ -77,7 +77,7 @@ def test_items_and_blocks_one_by_one_equal_processing_at_once(
         shapes.append(signals.shape)
         return process(signals, ears)
 
-    monkeypatch.setattr(model, "_process", process_and_record)
+    monkeypatch.setattr(model, "process_items", process_and_record)
     expected = output_and_gradient(model, waveforms, ears)
     monkeypatch.setattr(network, "_CPU_SAMPLES", 12_000)
     results = output_and_gradient(model, waveforms, ears)

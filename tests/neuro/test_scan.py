@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.neuro import scan
+from hlsim.neuro.family import scan
 from hlsim.neuro.family.scan import selective_scan
 
 NAMES = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")

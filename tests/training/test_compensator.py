@@ -82,6 +82,13 @@ def test_a_simulator_of_your_own_is_named_in_the_record(data: TrainingData, tmp_
     assert about["simulator"] == "hlsim:MSBG"
 
 
+@pytest.mark.parametrize("simulator", ["attenuation", "hlsim:MSBG"])
+def test_a_simulator_without_a_checkpoint_trains(
+    simulator: str, data: TrainingData, tmp_path: Path
+) -> None:
+    assert train(data, SMALL, tmp_path, simulator=simulator)["simulator"] == simulator
+
+
 def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_path: Path) -> None:
     start = load_compensator("compensator-general")
     model = start.config.to_dict()  # type: ignore[union-attr]
