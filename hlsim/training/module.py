@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.checkpoint import read_record
-from hlsim.simulators import EXACT, PluginSimulator, load_simulator
+from hlsim.simulators import EXACT, LINEAR, PluginSimulator, load_simulator
 from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
 
@@ -194,6 +194,6 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
         state = {name: tensor.cpu().contiguous() for name, tensor in loaded.state_dict().items()}
         digest = hashlib.sha256(safetensors.torch.save(state)).hexdigest()
         return {role: type(simulator).__name__, f"{role}_sha256": digest}
-    if str(simulator) == EXACT:
-        return {role: EXACT}
+    if str(simulator) in (EXACT, LINEAR):
+        return {role: str(simulator)}
     return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}
