@@ -113,7 +113,7 @@ def test_takes_the_recipes_steps_and_validates_after_the_last(
     lines = output.out.splitlines()
     assert [line.split(":")[0] for line in lines] == [f"step {i} of 9" for i in (0, 2, 4, 6, 8, 9)]
     assert "valid_sum" in lines[0]
-    assert output.err.startswith("0 of 9 steps\n") and "9 of 9 steps; loss " in output.err
+    assert "0 of 9 steps (0%)\n" in output.err and "9 of 9 steps (100%); loss " in output.err
     assert list((tmp_path / "new" / "out" / "events").glob("events.out.tfevents.*"))
     again = VectorTraining()
     run(again, tmp_path / "new" / "out")
