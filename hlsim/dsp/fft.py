@@ -19,7 +19,7 @@ MKL takes up to three times as long for 2^10 * 49 points as for 2^4 * 3125 point
 
 
 def rfft(signals: Tensor, points: int | None = None) -> Tensor:
-    """Compute the Fourier transform of real signals, with a faster gradient than torch's.
+    """Compute the Fourier transform of real signals, with a faster backward pass than autograd's.
 
     Shape: (..., time) -> complex (..., points // 2 + 1).
 
@@ -36,9 +36,9 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
 
 
 class _RFFT(torch.autograd.Function):
-    """Real Fourier transform whose gradient is a real transform as well.
+    """Real Fourier transform with a hand-written backward pass, which is a real transform, too.
 
-    The gradient of ``torch.fft.rfft`` is a complex transform of twice the length.
+    Autograd's backward pass of ``torch.fft.rfft`` is a complex transform of twice the length.
     """
 
     @staticmethod
@@ -55,7 +55,7 @@ class _RFFT(torch.autograd.Function):
         # The inverse counts each frequency twice, except 0 Hz and, for even lengths, the last one.
         # The weights are complex because torch would convert real ones for each item.
         weights = gradient.new_full(gradient.shape[-1:], 0.5)
-        # An assignment to a single number would make the host wait for a GPU.
+        # An assignment to a single number would synchronise with a GPU.
         weights[0].fill_(1.0)
         if ctx.points % 2 == 0:
             weights[-1].fill_(1.0)
@@ -87,7 +87,7 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
 
 
 def power(spectrum: Tensor) -> Tensor:
-    """Compute the squared magnitude of complex numbers, with a faster gradient than torch's.
+    """Compute squared magnitudes of complex numbers, with a faster backward pass than autograd's.
 
     Shape: complex (...) -> real (...).
 
@@ -99,7 +99,7 @@ def power(spectrum: Tensor) -> Tensor:
 
 
 class _Power(torch.autograd.Function):
-    """Squared modulus whose gradient takes one step instead of torch's six."""
+    """Squared modulus with a hand-written backward pass of one operation instead of six."""
 
     @staticmethod
     def forward(spectrum: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class Block(NamedTuple):
 
         Nothing is cut off the end of the last block, whose result may be longer than its input.
 
-        Shape: (..., time) -> (..., output_stop - output_start).
+        Shape: (..., time) -> (..., output_stop - output_start), or longer for the last block.
         """
         start = self.output_start - self.input_start
         if self.output_stop == self.input_stop:

@@ -31,7 +31,7 @@ from hlsim.msbg.recruitment import apply_gains, expand, recruitment_gains
 from hlsim.torchtools import constant
 
 _TAIL = 3200
-"""Samples of silence behind a signal, 73 ms.
+"""Samples of zero-padding behind a signal, 73 ms.
 
 This is as long as the longest advance, and as the narrowest channel takes to decay by 80 dB.
 """
@@ -94,9 +94,10 @@ def common_period(rate: int, rate_divisor: int = 1) -> int:
 
 
 def _whole_steps(rate_divisor: int) -> int:
-    """Return a number of samples at 44.1 kHz that is a whole number of envelope steps.
+    """Return a duration in samples at 44.1 kHz of which FFT lengths may be multiples.
 
-    At the model rate, it is an even number of samples.
+    It spans whole envelope steps, and at the rate of the model an even number of samples: 24 at
+    44.1 kHz, which is one step, or 196 for signals at 22.05 kHz, which is eight steps of 24.5.
     """
     return STEP if rate_divisor == 1 else round(8 * HALF_RATE_STEP)
 
@@ -120,7 +121,7 @@ def simulate_cochlea(
     Shape: (items, time), (items, channels) -> complex (items, points // (2 * rate_divisor) + 1).
 
     Args:
-        signals: Signals in Pa, which are followed by silence and then treated as periodic.
+        signals: Signals in Pa, which are zero-padded to ``points`` and then treated as periodic.
         ratios: dB by which each channel changes per dB of input, from ``expansion_ratios`` in
             ``hlsim.msbg.recruitment``.
         bank: Filter bank for the severity of the ears.
@@ -170,10 +171,11 @@ def simulate_cochlea(
 
 
 def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tensor]:
-    """Compute the channels of a rate band, and the sums of their rectified samples for ``smooth``.
+    """Compute the channels of a rate band in Pa, and the sums from which ``smooth`` gets envelopes.
 
     Shape: complex (items, bins) -> (items, channels, time), (items, channels, 3, steps), where time
-        is points or, for analytic signals, whose real and imaginary parts alternate, 2 * points.
+        is ``band.points``, or twice as many for the detector ``"modulus"``, whose channels are
+        analytic signals with alternating real and imaginary parts.
     """
     band_spectrum = spectrum[..., None, : band.response.shape[-1]] * band.response
     if band.detector == "itself":
@@ -190,13 +192,17 @@ def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tenso
 def simulate_delayed_cochlea(
     signals: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, is_last: bool
 ) -> Tensor:
-    """Simulate the cochlea with its delay, and with the end of the signal that pyclarity computes.
+    """Simulate the cochlea for output that is not aligned, sample by sample as pyclarity does.
+
+    The delay of the filters and of smearing is already in the input, and stays there. If the
+    signals end here, their last samples are computed with all channels at 44.1 kHz and with
+    pyclarity's treatment of the end.
 
     Shape: (items, time), (items, channels) -> (items, time).
 
     Args:
         signals: Input of the cochlea at 44.1 kHz in Pa.
-        ratios: Expansion ratios of the channels.
+        ratios: dB by which each channel changes per dB of input, from ``expansion_ratios``.
         bank: Filter bank for the severity of the ears.
         smears: Whether the signals have been smeared.
         is_last: Whether the signals end here, and are not cut from longer ones.
@@ -257,7 +263,7 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
 
 @constant
 def _before_advanced_end(bank: FilterBank, points: int, length: int) -> NDArray[np.bool]:
-    """Compute a mask of the samples before the end of each channel, (channels, points).
+    """Compute a mask of the samples before the end of each channel: bool, (channels, points).
 
     pyclarity advances each channel by dropping its first samples, and fills the end with zeros.
     """

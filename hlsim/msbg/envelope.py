@@ -71,10 +71,12 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
 
 
 def _modulus_with_harmonics(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the result of ``detect`` with harmonics, and what its gradient needs.
+    """Compute the result of ``detect`` with harmonics, and intermediate results for its gradient.
+
+    Shape: complex (...) -> (...), (...), (...).
 
     Returns:
-        The result, the modulus, and the squared cosine of the phase.
+        The result and the modulus in Pa, and the squared cosine of the phase.
     """
     squared_modulus = power(signals).add_(POWER_FLOOR)
     squared_cosine = signals.real.square() / squared_modulus
@@ -85,7 +87,15 @@ def _modulus_with_harmonics(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class _ModulusWithHarmonics(torch.autograd.Function):
-    """``_modulus_with_harmonics`` with a gradient that takes half as many steps as torch's."""
+    """``_modulus_with_harmonics`` with a hand-written backward pass: half of autograd's operations.
+
+    Let r be the modulus of the signal x + i y, c = x^2 / r^2 the squared cosine of its phase, and
+    r P(c) the result with P(c) = 1/5 + 12/5 c - 16/15 c^2. Then dr/dx = x / r, dr/dy = y / r,
+    dc/dx = 2 x (1 - c) / r^2 and dc/dy = -2 y c / r^2, so that the derivative
+
+    - with respect to x is x / r (P + 2 (1 - c) P'), which is x / r (5 - 20/3 c + 16/5 c^2);
+    - with respect to y is y / r (P - 2 c P'), which is y / r (1/5 - 12/5 c + 16/5 c^2).
+    """
 
     @staticmethod
     def forward(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -103,6 +113,7 @@ class _ModulusWithHarmonics(torch.autograd.Function):
             # This gradient is itself differentiated, so it must depend on the signals.
             modulus, squared_cosine = _modulus_with_harmonics(signals)[1:]
         scaled = gradient / modulus
+        # Both polynomials in c of the formulae above, by Horner's rule
         real_factor = scaled * ((squared_cosine * (16 / 5) - 20 / 3) * squared_cosine + 5)
         imag_factor = scaled * ((squared_cosine * (16 / 5) - 12 / 5) * squared_cosine + 1 / 5)
         return torch.complex(signals.real * real_factor, signals.imag * imag_factor)
@@ -217,7 +228,7 @@ def envelope_lowpass(
 
 @lru_cache(maxsize=4)
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Design the low-pass that smooths the envelope of each channel of a filter bank.
+    """Design the low-pass at 44.1 kHz that smooths the envelope of each channel of a filter bank.
 
     It is an elliptic filter of second order. Its cut-off frequency is 75 Hz, or three quarters of
     the channel's equivalent rectangular bandwidth if this is lower.

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
-    """Compute what is to be added to the envelopes of a signal that ends abruptly.
+    """Compute the correction in Pa that is added to the envelopes of a signal that ends abruptly.
 
     pyclarity smooths envelopes with ``scipy.signal.filtfilt``, which continues a signal beyond its
     end. ``hlsim.msbg.envelope.envelope`` lets silence follow the signal. The result is the
@@ -95,7 +95,11 @@ def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
 
 @lru_cache(maxsize=4)
 def _oscillations(bank: FilterBank) -> tuple[Array, Array]:
-    """Compute the results of ``_oscillation`` for the low-passes of all channels."""
+    """Compute the results of ``_oscillation`` for the low-passes of all channels.
+
+    Returns:
+        Weights, (channels, 2, 4096), and oscillations, (channels, samples, 2).
+    """
     results = [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
     weights, oscillations = zip(*results, strict=True)
     return np.stack(weights), np.stack(oscillations)

@@ -60,7 +60,7 @@ _HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which aligned signals run at 22.05 kHz inside the model."""
 
 _CPU_SAMPLES = 384_000
-"""Largest number of samples that are processed at once on a CPU, or with ``checkpoint``."""
+"""Largest number of samples that are processed at once on a CPU, or with checkpointing."""
 
 _DEVICE_SAMPLES = 12_000_000
 """Largest number of samples that are processed at once on another device."""
@@ -111,8 +111,8 @@ class MSBG(nn.Module):
     Attributes:
         thresholds: Thresholds of the constructor's ears at ``FREQUENCIES`` in dB HL, (..., 8), or
             None. They are constants; to train an ear, pass it with each call.
-        checkpoint: Whether activations are computed again in the backward pass, a few items or one
-            block at a time, instead of stored. False by default.
+        checkpoint: Whether to use gradient checkpointing: activations are computed again in the
+            backward pass, a few items or one block at a time, instead of stored. False by default.
 
     Raises:
         ValueError: The rate, the level or an audiogram is out of range.
@@ -199,10 +199,13 @@ class MSBG(nn.Module):
     def _simulate(
         self, waveform: Tensor, thresholds: Tensor, grids: list[Audiogram | None]
     ) -> Tensor:
-        """Compute the perceived signals. Shape: (..., time), (..., 8) -> (..., time).
+        """Compute the perceived signals.
+
+        Shape: (..., time), (..., 8) -> (..., time), or longer with ``aligned=False``; then outputs
+            that are shorter than the longest one are zero-padded.
 
         Args:
-            waveform: Input.
+            waveform: Input in the unit of ``full_scale_spl``.
             thresholds: Ears at the eight frequencies in dB HL.
             grids: Ears at other frequencies, from ``ears_on_other_grids``.
         """
@@ -214,7 +217,7 @@ class MSBG(nn.Module):
         if self.rescale_active:
             signals = signals * active_rescaling(signals, self.sample_rate)
 
-        # The severity decides which filters the host launches, so the host needs the thresholds.
+        # The severity decides which filters the CPU launches, so the CPU needs the thresholds.
         levels_on_host = flatten_items(on_host(thresholds), batch, dtype)
         if grids:
             ear_of_item = torch.arange(len(grids)).reshape(thresholds.shape[:-1]).expand(batch)
@@ -264,7 +267,8 @@ class MSBG(nn.Module):
             is_last: Whether the signals end here, and are not cut from longer ones.
             group: Properties that the ears share.
 
-        Shape: (items, time), (items, frequencies) -> (items, time).
+        Shape: (items, time), (items, frequencies) -> (items, time), or longer with
+            ``aligned=False``.
         """
         rate = self.sample_rate
         samples = signals.shape[-1]
@@ -394,19 +398,23 @@ def active_rescaling(signals: Tensor, rate: int) -> Tensor:
 def _group_items(
     ears: Tensor, is_trained: bool, grids: list[Audiogram | None]
 ) -> dict[_Group, list[int]]:
-    """Group items that can be processed in one batch.
+    """Group items by severity, absence of a loss and frequencies of the audiogram.
+
+    The items of a group are processed in one batch.
 
     Args:
         ears: Thresholds on the CPU in dB HL, (items, 8).
-        is_trained: Whether the ears require a gradient. Then no ear is treated as one without a
-            loss.
-        grids: For each item its ear if it is not at the eight frequencies; or an empty list.
+        is_trained: Whether the ears require a gradient. If so, ears at 0 dB HL take the general
+            path, which has a gradient, instead of the shortcut.
+        grids: Ear of each item, or None for an item at the eight frequencies; an empty list if all
+            items are.
 
     Returns:
         Indices of the items of each group, in ascending order.
 
     Raises:
-        ValueError: A threshold was out of range, and a GPU has turned it into NaN.
+        ValueError: A threshold is NaN. On a GPU, thresholds out of range were replaced by NaN
+            earlier, because checking them would have synchronised with the GPU.
     """
     if bool(ears.isnan().any()):
         raise ValueError(

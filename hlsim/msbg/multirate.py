@@ -130,7 +130,11 @@ def _rate_and_detector(
         centre: Centre frequency in Hz.
         top: Frequency in Hz up to which the channel is kept.
         is_wide: Whether harmonics of the channel reach down to 0 Hz.
-        rate_divisor, highest: Arguments of ``multirate_bank``.
+        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: Highest frequency in Hz that the output needs.
+
+    Returns:
+        Number of samples per step of the envelope, and the name of the detector.
     """
     steps_per_second = MSBG_RATE / _envelope_step(rate_divisor)
     if centre < _RECTIFIED_BELOW_HZ:
@@ -148,6 +152,12 @@ def _assign_rates(
     bank: FilterBank, count: int, rate_divisor: int, highest: float
 ) -> list[tuple[slice, int, str]]:
     """Choose the sample rate and the detector of the lowest ``count`` channels of a filter bank.
+
+    Args:
+        bank: Filter bank.
+        count: Number of channels.
+        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: Highest frequency in Hz that the output needs.
 
     Returns:
         For each group of neighbouring channels with the same choice: their indices, the number of

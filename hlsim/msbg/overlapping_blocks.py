@@ -1,6 +1,7 @@
 """Processing of long signals in overlapping blocks of 8 s, which bounds the memory.
 
-For gradients, each block is computed again in the backward pass instead of stored.
+Gradients of long signals use gradient checkpointing: each block is computed again in the backward
+pass, and its activations are not stored.
 """
 
 import math
@@ -37,7 +38,8 @@ def in_blocks(
 ) -> Tensor:
     """Apply a function to overlapping blocks of long signals, and join its outputs.
 
-    The blocks overlap by so much that the output is the same as that for whole signals.
+    The overlap, 0.75 s before and 0.55 s after each block, covers the memory of MSBG, so the joined
+    output equals that for the whole signal to about 1e-6.
 
     Args:
         process: Function of the signals of a block, of the ears, and of whether the signals end
@@ -45,10 +47,11 @@ def in_blocks(
         signals: Signals of all items.
         ears: Thresholds of all items in dB HL.
         rate: Sample rate in Hz.
-        checkpoints_short: Whether signals of one block, too, are computed again in the backward
-            pass.
+        checkpoints_short: Whether to use gradient checkpointing even for signals that fit in one
+            block.
 
-    Shape: (items, time), (items, levels) -> (items, time).
+    Shape: (items, time), (items, levels) -> (items, time), or longer if ``process`` returns more
+        samples for the last block, as MSBG does with ``aligned=False``.
 
     >>> speech, ear = torch.randn(1, 320000), torch.zeros(1, 8)  # 20 s
     >>> output = in_blocks(lambda signals, ears, is_last: 0.5 * signals, speech, ear, rate=16000)
@@ -72,11 +75,11 @@ def in_blocks(
 def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[Block]:
     """Divide the samples of a signal into overlapping blocks.
 
-    Each block contributes about ``seconds`` to the output. Its input begins at
-    least 0.75 s earlier and ends at least 0.55 s later, because MSBG's filters make the output
-    depend on these margins, for which the result is cut off. A signal that is hardly longer than a
-    block is not divided. Each block begins where the frames of smearing and the values of envelopes
-    lie at the same samples as in the whole signal.
+    Each block contributes about ``seconds`` to the output. Its input begins at least 0.75 s earlier
+    and ends at least 0.55 s later, because MSBG's filters make the output depend on these margins;
+    the result for the margins is discarded. A signal of up to one and a half blocks is not divided.
+    Each block begins where the frames of smearing and the steps of envelopes lie at the same
+    samples as in the whole signal.
 
     Args:
         samples: Length of the signal in samples.
@@ -84,7 +87,7 @@ def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[
         seconds: Duration of the output of a block, by default 8 s.
 
     Returns:
-        Where the input and the output of each block begin and end.
+        Bounds of the input and the output of each block, as indices of half-open ranges.
 
     >>> [(block.input_start, block.input_stop) for block in block_bounds(320000, rate=16000)]
     [(0, 133120), (102400, 256000), (225280, 320000)]
@@ -97,7 +100,10 @@ def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[
 
 
 def _hooks_are_allowed() -> bool:
-    """Return whether autograd accepts the hooks of checkpoints, which ``torch.func`` forbids."""
+    """Return whether autograd accepts the hooks of gradient checkpointing.
+
+    Inside transforms such as ``torch.func.grad``, it does not.
+    """
     try:
         with torch.autograd.graph.saved_tensors_hooks(torch.clone, torch.clone):
             return True

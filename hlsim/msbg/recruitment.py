@@ -47,16 +47,17 @@ _DIP_RATIO = 0.3
 def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     """Compute how many dB the perceived level in each channel changes per dB of input.
 
-    The channels are the bands of a filter bank. This expansion ratio is 105 / (105 - threshold),
-    where 105 dB SPL is the level at which a sound is as loud for an impaired ear as for a normal
-    ear. Thresholds must be below 105 dB HL; simulators accept at most 100 dB HL.
+    The channels are the bands of a filter bank. The number of dB per dB, the *expansion ratio*, is
+    105 / (105 - threshold), where 105 dB SPL is the level at which a sound is as loud for an
+    impaired ear as for a normal ear. Thresholds must be below 105 dB HL; simulators accept at most
+    100 dB HL.
 
     Shape: (..., frequencies), (frequencies, channels) -> (..., channels).
 
     Args:
         thresholds: Audiograms in dB HL.
-        weights: Weights from ``hlsim.audiogram.thresholds.interpolation_weights``, which
-            interpolate thresholds to the centre frequencies of the channels.
+        weights: Weights from ``hlsim.dsp.interpolation.interpolation_weights``, which interpolate
+            thresholds to the centre frequencies of the channels.
 
     >>> expansion_ratios(torch.full((8,), 35.0), torch.full((8, 1), 0.125))
     tensor([1.5000])
@@ -150,10 +151,16 @@ def apply_gains(
 def _correct_kinks(
     sample_gains: Tensor, envelopes: Tensor, ratios: Tensor, kernel: Tensor
 ) -> Tensor:
-    """Compute gains anew from interpolated envelopes, where a slight loss meets a small envelope.
+    """Replace gains where a slight loss meets a small envelope, by gains from the envelope.
 
     Shape: (..., channels, time), (..., channels, steps), (..., channels), (rows, columns) ->
         (..., channels, time).
+
+    Args:
+        sample_gains: Interpolated linear gains, which may be changed in place.
+        envelopes: Envelopes in Pa.
+        ratios: Expansion ratios.
+        kernel: Weights from ``interpolation_kernel``.
     """
     is_slight = (ratios != 1.0) & (ratios < _SLIGHT_RATIO)
     has_kink = _find_dips(envelopes) & is_slight.unsqueeze(-1)
@@ -165,14 +172,17 @@ def _correct_kinks(
         kink_gains = recruitment_gains(kink_envelopes, kink_ratios)
         sample_gains.unflatten(-1, (-1, samples))[has_kink] = kink_gains
         return sample_gains
-    # Indexing by a mask would make the host wait for the device.
+    # Indexing by a mask would synchronise with the GPU.
     sample_envelopes = interpolate(envelopes, kernel)
     corrected = recruitment_gains(sample_envelopes, ratios)
     return torch.where(has_kink.repeat_interleave(samples, -1), corrected, sample_gains)
 
 
 def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
-    """Add up channels times factors. Shape: (..., channels, time) twice -> (..., time)."""
+    """Add up channels times factors.
+
+    Shape: (..., channels, time), (..., channels, time) -> (..., time).
+    """
     if channels.device.type != "cpu":
         return (channels * factors).sum(-2)
     # One channel at a time and in place, the sum stays in the processor's cache. torch's sum takes
@@ -185,7 +195,9 @@ def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
 
 
 def _pad_periodically(values: Tensor) -> Tensor:
-    """Add the values before the first and after the last step that interpolation needs.
+    """Pad with two values before the first step and three after the last, for interpolation.
+
+    They are taken from the other end, because the signal is periodic.
 
     Shape: (..., steps) -> (..., steps + 5).
     """
@@ -193,7 +205,9 @@ def _pad_periodically(values: Tensor) -> Tensor:
 
 
 def _find_dips(envelopes: Tensor) -> Tensor:
-    """Find the steps where an envelope goes through or close to zero.
+    """Find the steps where an envelope in Pa goes through or close to zero.
+
+    Between such a step and the next, the envelope is below 0.3 times a neighbouring value.
 
     Shape: (..., steps) -> bool (..., steps).
     """

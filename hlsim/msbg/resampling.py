@@ -22,7 +22,7 @@ from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant
 
 _FIR_TAIL = 2 * EAR_DELAY + 132
-"""Samples at 44.1 kHz by which the filters of the way out lengthen a signal."""
+"""Samples at 44.1 kHz by which the inverse ear and the final low-pass lengthen a signal."""
 
 
 def to_cochlea(signals: Tensor, rate: int, length: int, rate_divisor: int) -> Tensor:
@@ -128,7 +128,7 @@ def from_cochlea(
 
 @constant
 def _inward_block_response() -> NDArray[np.complex128]:
-    """Compute the response of outer and middle ear for ``filter_in_blocks``."""
+    """Compute the response of outer and middle ear at 44.1 kHz in blocks, complex (2049,)."""
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 

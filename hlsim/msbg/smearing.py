@@ -28,7 +28,7 @@ HOP = 64
 """Samples at 44.1 kHz from one frame to the next."""
 
 FFT = 512
-"""Length of the Fourier transform of a frame, which is followed by as many zeros."""
+"""Length of the Fourier transform of a frame, which is zero-padded to twice its length."""
 
 SMEARING_DELAY = 3 * HOP
 """Delay of smearing in samples at 44.1 kHz, because its frames are read three hops late."""
@@ -215,11 +215,12 @@ def smear_spectrum(
 def _smear_spectrum(
     spectrum: Tensor, matrix: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Compute the results of ``smear_spectrum`` and what its gradient needs.
+    """Compute the results of ``smear_spectrum`` and the intermediate results for its gradient.
 
     Returns:
-        The smeared spectrum, its power, the real and the imaginary part of the factor on the
-        spectrum, and the power of the spectrum.
+        The smeared spectrum; its power in Pa^2; the real and the imaginary part of the complex
+        factor on the spectrum, of which one is nearly 0; and the power of the spectrum in Pa^2. All
+        have the shape of the spectrum, (..., bins).
     """
     spectrum_power = power(spectrum)
     smeared_power = (spectrum_power @ matrix.mT).add_(_POWER_FLOOR)
@@ -233,16 +234,19 @@ def _smear_spectrum(
 
 
 class _SmearSpectrum(torch.autograd.Function):
-    """``_smear_spectrum`` with a gradient that takes a third of the steps of torch's.
+    """``_smear_spectrum`` with a hand-written backward pass: a third of autograd's operations.
 
     Let x be the spectrum, p = |x|^2 its power, A the matrix, s = A p the smeared power, f the
-    factor with |f|^2 = s / p and z = f x the smeared spectrum. Let h be the gradient with respect
-    to s, and g the gradient with respect to z times the conjugate of f. Then, with
-    e = Re(conj(x) g) and t = e / s + 2 h,
+    complex factor with f^2 = s / p, which is imaginary where s < 0, and z = f x the smeared
+    spectrum. The outputs are z and s. Let h be the gradient with respect to s, and g the gradient
+    with respect to z times the conjugate of f. Then, with e = Re(conj(x) g) and t = e / s + 2 h,
 
     - the gradient with respect to x is g + x (A^T t - e / p), because the power of one frequency
       changes the factors of others;
     - the gradient with respect to A is t p^T / 2.
+
+    Both gradients grow without limit where s is near 0 or f is large. With a ``gradient_floor`` c,
+    |s| counts as c p at least in the division e / s, and |f|^2 as 1 / c at most.
     """
 
     @staticmethod
@@ -271,7 +275,7 @@ class _SmearSpectrum(torch.autograd.Function):
             magnitude = smeared_power.abs()
             bounded = torch.maximum(magnitude, floor * spectrum_power)
             divisor = torch.copysign(bounded, smeared_power)
-            # Where smearing amplifies by more than 1 / floor, the factor counts as 1 / floor.
+            # Where smearing amplifies the power by more than 1 / floor, it counts as 1 / floor.
             limit = spectrum_power / (floor * magnitude + _DIVISION_EPS)
             limit = limit.clamp_max(1.0).sqrt()
             divisor = divisor * limit
@@ -281,8 +285,9 @@ class _SmearSpectrum(torch.autograd.Function):
             eps = smeared_power.new_full((), _DIVISION_EPS)
             divisor = smeared_power + torch.copysign(eps, smeared_power)
 
-        # Real and imaginary parts are computed separately, because torch would first convert the
-        # real factors of a complex product to complex numbers.
+        # g = gradient * conj(f), e = Re(conj(x) g), t = e / s + 2 h, then both gradients. Real and
+        # imaginary parts are computed separately, because torch would first convert the real
+        # factors of a complex product to complex numbers.
         g_real = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
         g_imag = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
         e = torch.addcmul(spectrum.real * g_real, spectrum.imag, g_imag)
@@ -310,7 +315,7 @@ class _SmearSpectrum(torch.autograd.Function):
 
 @constant
 def _window(rate_divisor: int) -> Tensor:
-    """Compute the window of analysis and synthesis, followed by as many zeros.
+    """Compute the window of analysis and synthesis, zero-padded to twice its length.
 
     The squares of four windows that are one hop apart add up to 1.
 
@@ -324,11 +329,11 @@ def _window(rate_divisor: int) -> Tensor:
 
 
 def _cut_frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
-    """Cut waveforms into windowed frames in the order in which ``smear3`` reads them.
+    """Cut waveforms into windowed frames as pyclarity's ``smear3`` does, three hops late.
 
-    From the fifth frame on, frame k covers hops k - 3 to k. The first four frames of ``smear3`` are
-    irregular, as if hops 1 to 3 were repeated after the first four hops. Each frame is followed by
-    as many samples again, which the window sets to 0.
+    From the fifth frame on, frame k covers hops k - 3 to k. The first four frames are irregular, as
+    if hops 1 to 3 were repeated after the first four hops. Each frame is zero-padded to twice its
+    length by the window.
 
     Shape: (..., time), (8 * hop,) -> (..., count, 8 * hop).
     """
@@ -338,7 +343,7 @@ def _cut_frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tenso
 
 
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
-    """Add frames in the order in which ``smear3`` writes them.
+    """Overlap-add frames as pyclarity's ``smear3`` does, including its irregular last three hops.
 
     Shape: (..., count, 4 * hop) -> (..., hop * (count + 3)).
     """
@@ -349,7 +354,7 @@ def _overlap_add(frames: Tensor, hop: int) -> Tensor:
         total[..., part : part + count, :].add_(parts[..., part, :])
     if count >= 4:
         total[..., 3:count, :].add_(parts[..., : count - 3, 3, :])
-        # In the last three hops, smear3 adds the first three parts of the fourth last frame instead
-        # of the fourth parts of the last three frames.
+        # In the last three hops, smear3 repeats the first three parts of the fourth last frame, and
+        # leaves out the fourth parts of the last three frames.
         total[..., count:, :].add_(parts[..., count - 4, :3, :])
     return total.flatten(-2)
