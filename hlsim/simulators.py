@@ -74,6 +74,8 @@ class Attenuation(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
+        # samples before and after a sample of the output on which it depends
+        self.reach = round(_HALF_LENGTH_SECONDS * self.sample_rate)
         self._thresholds = (store_thresholds(audiogram),)
         self._two_ears = has_listeners(audiogram)
 
@@ -96,7 +98,7 @@ class Attenuation(nn.Module):
         ears = resolve_thresholds(stored, audiogram, waveform, two_ears=self._two_ears)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = torch.promote_types(waveform.dtype, torch.float32)
-            half = round(_HALF_LENGTH_SECONDS * self.sample_rate)
+            half = self.reach
             hz = tuple(self.sample_rate * k / (2.0 * half) for k in range(half + 1))
             gains = 10.0 ** (-interpolate(ears.to(dtype), FREQUENCIES, hz) / 20.0)
             taps = torch.fft.irfft(gains.to(dtype.to_complex())).roll(half, -1)

@@ -22,6 +22,7 @@ from hlsim.dsp.resample import ROLLOFF, ZERO_CROSSINGS
 from hlsim.msbg import MSBG
 from hlsim.msbg.overlapping_blocks import block_bounds
 from hlsim.neuro.network import EarNetwork
+from hlsim.simulators import Attenuation
 
 _HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which MSBG works at 22.05 kHz."""
@@ -156,7 +157,9 @@ def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
     hop = round(_BLOCK_SECONDS * rate)
     if isinstance(model, NALR):
         return split_into_blocks(samples, hop, ORDER, ORDER)
-    field = model._receptive_field if isinstance(model, EarNetwork) else None
+    if isinstance(model, Attenuation):
+        return split_into_blocks(samples, hop, model.reach, model.reach)
+    field = model.receptive_field if isinstance(model, EarNetwork) else None
     if field is None:
         return [Block(0, 0, samples, samples)]
     step, reach = field

@@ -25,6 +25,7 @@ BLOCKS = ("hlsim.cli.long_recordings", "compensators.long_signals", "hlsim.msbg.
         ("msbg", 16000),
         ("neuro-msbg", 16000),
         ("neuro-msbg-light", 44100),
+        ("attenuation", 44100),
         ("nalr", 16000),
         ("wdrc", 44100),
         ("hearing-aid", 16000),
@@ -41,7 +42,7 @@ def test_the_output_by_blocks_is_that_of_the_whole_recording(
     write_audio(tmp_path / "speech.wav", signal, rate)
     ear: Any = hlsim.Listener("N2", "N4") if channels == 2 else "N3"
     settings: dict[str, Any] = {"linked": True} if name == "wdrc" else {}
-    load: Any = load_simulator if "msbg" in name else load_compensator
+    load: Any = load_simulator if "msbg" in name or name == "attenuation" else load_compensator
     model = load(name, sample_rate=rate, **settings)
     if name == "msbg":  # Its whole output is computed in blocks, too, and must have the same bits.
         monkeypatch.setattr("hlsim.msbg.overlapping_blocks._BLOCK_SECONDS", seconds)
