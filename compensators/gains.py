@@ -86,8 +86,8 @@ class Aid(nn.Module):
         tensor([ 1.,  8., 18., 20., 21., 22., 23., 24.])
         """
         check_number("level", level, 0.0, 120.0)
-        weight = next(self.parameters(), torch.empty(0))
-        thresholds = self.find_thresholds(audiogram).to(weight)
+        thresholds = self.find_thresholds(audiogram)
+        thresholds = thresholds.to(next(self.parameters(), thresholds))
         ears = thresholds.reshape(-1, len(FREQUENCIES))
         noise = _speech_noise(like=ears) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
         # The first second, in which gains settle, is left out.

@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from compensators import NALR, HearingAid, MappingCompensator, load_compensator
+from compensators import NALR, WDRC, HearingAid, MappingCompensator, load_compensator
+from compensators.gains import Aid
 from hlsim import MSBG, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
 
 EAR = [22.3, 27.7, 31.1, 40.9, 50.3, 55.7, 60.1, 60.9]
@@ -31,6 +32,7 @@ LOADERS: dict[str, Callable[[], nn.Module]] = {
 FITTED: dict[str, Callable[[], nn.Module]] = {
     "MSBG": lambda: MSBG(EAR),
     "NALR": lambda: NALR(EAR),
+    "WDRC": lambda: WDRC(EAR),
 }
 LOSSES: dict[str, Callable[[], nn.Module]] = {
     "HearingLossLoss": lambda: HearingLossLoss(EAR),
@@ -72,6 +74,17 @@ def test_results_do_not_depend_on_the_default_type(name: str, clean: Tensor) -> 
         result = call(name, build(name), clean)
         assert torch.get_default_dtype() == torch.bfloat16
     assert torch.equal(result, expected)
+
+
+@pytest.mark.parametrize("kind", [NALR, WDRC, HearingAid, MappingCompensator])
+def test_gains_do_not_depend_on_the_default_type(kind: Callable[..., Aid]) -> None:
+    torch.manual_seed(0)
+    expected = kind(EAR).gains()
+    with default_type(torch.bfloat16):
+        torch.manual_seed(0)
+        aid = kind(EAR)
+        assert torch.equal(aid.gains(), expected)
+        assert torch.equal(aid.gains(EAR), expected)
 
 
 @pytest.mark.parametrize("name", [*LOADERS, *FITTED, *LOSSES])
