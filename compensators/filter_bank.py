@@ -61,7 +61,7 @@ SPEECH_SPECTRUM = {
 
 
 @lru_cache(maxsize=8)
-def band_centres(bands: int) -> tuple[float, ...]:
+def filter_centres(bands: int) -> tuple[float, ...]:
     """Return the centre frequencies of the bands in Hz, from 0 to 8000.
 
     Neighbours are an equal number of ERBs (bandwidths of the normal ear), but at least 125 Hz,
@@ -70,7 +70,7 @@ def band_centres(bands: int) -> tuple[float, ...]:
     Args:
         bands: Number of bands, 4 to 40.
 
-    >>> [round(hertz) for hertz in band_centres(4)]
+    >>> [round(hertz) for hertz in filter_centres(4)]
     [0, 526, 2264, 8000]
     """
     low, high = 0.0, 100.0
@@ -92,7 +92,7 @@ def _spaced_frequencies(count: int, erbs: float) -> list[float]:
     return frequencies
 
 
-def band_powers(powers: Tensor, bands: int) -> Tensor:
+def filter_powers(powers: Tensor, bands: int) -> Tensor:
     """Add up the power in each band from the power at each frequency of a frame.
 
     A frequency between two centres belongs to both bands, in inverse proportion to the distance.
@@ -103,14 +103,14 @@ def band_powers(powers: Tensor, bands: int) -> Tensor:
 
     Shape: (items, frames, FRAME / 2 + 1) -> (items, frames, bands) in Pa^2.
 
-    >>> band_powers(torch.ones(1, 1, FRAME // 2 + 1), bands=4).round()
+    >>> filter_powers(torch.ones(1, 1, FRAME // 2 + 1), bands=4).round()
     tensor([[[ 5., 18., 60., 46.]]])
     """
-    return powers @ _band_shares(bands, FRAME, like=powers)
+    return powers @ _filter_shares(bands, FRAME, like=powers)
 
 
 @constant
-def _band_shares(bands: int, points: int) -> NDArray[np.float64]:
+def _filter_shares(bands: int, points: int) -> NDArray[np.float64]:
     """Return the weight of each band at each frequency of a Fourier transform of ``points``.
 
     The weights are linear between the centres of bands, and sum to 1 at each frequency.
@@ -118,7 +118,7 @@ def _band_shares(bands: int, points: int) -> NDArray[np.float64]:
     Returns: (points / 2 + 1, bands).
     """
     frequencies = np.arange(points // 2 + 1) * RATE / points
-    return interpolation_weights(band_centres(bands), frequencies).T
+    return interpolation_weights(filter_centres(bands), frequencies).T
 
 
 def _filter_taps(bands: int) -> NDArray[np.float64]:
@@ -126,7 +126,7 @@ def _filter_taps(bands: int) -> NDArray[np.float64]:
 
     Returns: (bands, 2 * DELAY + 1).
     """
-    impulses = np.fft.irfft(_band_shares(bands, GRID_POINTS).T, GRID_POINTS)
+    impulses = np.fft.irfft(_filter_shares(bands, GRID_POINTS).T, GRID_POINTS)
     taps = np.roll(impulses, DELAY, -1)[:, : 2 * DELAY + 1]
     return taps * np.hanning(2 * DELAY + 3)[1:-1]
 
@@ -217,7 +217,7 @@ def speech_band_levels(bands: int) -> NDArray[np.float64]:
     >>> print(speech_band_levels(4).round())
     [60. 63. 53. 43.]
     """
-    powers = speech_density(GRID_POINTS) @ _band_shares(bands, GRID_POINTS)[1:]
+    powers = speech_density(GRID_POINTS) @ _filter_shares(bands, GRID_POINTS)[1:]
     return 10.0 * np.log10(powers / powers.sum()) + SPEECH_SPL
 
 

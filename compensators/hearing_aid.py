@@ -9,7 +9,7 @@ from torch.nn import functional
 from compensators.config import HearingAidConfig
 from compensators.filter_bank import (
     HISTORY,
-    band_powers,
+    filter_powers,
     frame_power,
     level_db,
 )
@@ -192,7 +192,7 @@ class HearingAid(Wearable):
 
         Shape: (items, frames, FRAME / 2 + 1) -> (items, frames, bands + 1 + bins).
         """
-        by_band = band_powers(powers, self.bands)
+        by_band = filter_powers(powers, self.bands)
         bins = powers[..., 1 : self.config.bins + 1]
         return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from compensators.filter_bank import band_powers, level_db, speech_band_levels
+from compensators.filter_bank import filter_powers, level_db, speech_band_levels
 from compensators.smoothing import follow_peaks
 from compensators.wearable import State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
@@ -84,7 +84,7 @@ class WDRC(Wearable):
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         levels, memory = follow_peaks(
-            level_db(band_powers(powers, self.bands)), state["levels"], self.attack, self.release
+            level_db(filter_powers(powers, self.bands)), state["levels"], self.attack, self.release
         )
         above_speech = levels - speech_band_levels(self.bands, like=levels)
         loss, prescribed = fitted.chunk(2, -1)

@@ -26,7 +26,7 @@ from compensators.filter_bank import (
     HOP,
     RATE,
     apply_gains,
-    band_centres,
+    filter_centres,
     frame_power,
     gain_at_rate,
 )
@@ -137,7 +137,7 @@ class Wearable(Aid):
 
         Shape: (items, 8) in dB HL -> (items, 2 * bands).
         """
-        centres = band_centres(self.bands)
+        centres = filter_centres(self.bands)
         prescribed = interpolate(nalr_gains_db(thresholds), FREQUENCIES, centres)
         return torch.cat((interpolate(thresholds, FREQUENCIES, centres), prescribed), -1)
 

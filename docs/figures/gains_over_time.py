@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators import load_compensator
-from compensators.filter_bank import DELAY, HOP, RATE, apply_gains, band_centres
+from compensators.filter_bank import DELAY, HOP, RATE, apply_gains, filter_centres
 from compensators.limiter import soft_limit
 from hlsim import Audiogram
 from hlsim.dsp.fft import power
@@ -55,7 +55,7 @@ class PromptGains(nn.Module):
         self.stft = STFT(WINDOW, WINDOW, FRAME_HOP)
         # Between two centres, a frequency counts for both bands, as in the filter bank.
         frequencies = np.arange(WINDOW // 2 + 1) * RATE / WINDOW
-        rows = [np.interp(frequencies, band_centres(BANDS), row) for row in np.eye(BANDS)]
+        rows = [np.interp(frequencies, filter_centres(BANDS), row) for row in np.eye(BANDS)]
         self.shares = torch.from_numpy(np.stack(rows, 1)).float()
 
     @torch.no_grad()

@@ -100,8 +100,8 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
         )
     # The frequencies are at most 4 Hz apart, because the lowest band is 29 Hz wide.
     points = max(len(x), sample_rate // 4)
-    reference_powers = _band_powers(x, points, sample_rate)
-    estimate_powers = _band_powers(y, points, sample_rate)
+    reference_powers = _third_octave_powers(x, points, sample_rate)
+    estimate_powers = _third_octave_powers(y, points, sample_rate)
     loudest = reference_powers.max()
     if loudest <= 0.0:
         raise ValueError("expected a reference with power between 125 Hz and 7 kHz, got none")
@@ -112,7 +112,7 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
     return float(np.median(differences[is_loud]))
 
 
-def _band_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarray:
+def _third_octave_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarray:
     """Compute the power in each one-third-octave band. Shape: (time,) -> (bands,)."""
     frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
     lower_edges = _BAND_CENTRES_HZ * 2.0 ** (-1 / 6)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from compensators.filter_bank import HISTORY, HOP, band_powers, frame_power
+from compensators.filter_bank import HISTORY, HOP, filter_powers, frame_power
 from compensators.hearing_aid import HearingAid
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, level_spl, set_level
 from hlsim.losses.score_loss import score_loss
@@ -51,7 +51,7 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
     with torch.no_grad():
         parts = torch.stack((clean, signal - clean))
         frames = frame_power(functional.pad(parts, (HISTORY, 0)).flatten(0, 1))
-        speech, noise = band_powers(frames, aid.bands).chunk(2)
+        speech, noise = filter_powers(frames, aid.bands).chunk(2)
         wiener = ((speech + _POWER_FLOOR) / (speech + noise + _POWER_FLOOR)).sqrt()
         lowest_gain = 10.0 ** (-aid.config.reduction_db / 20.0)
         target = (wiener**_WIENER_EXPONENT).clamp_min(lowest_gain)[:, _GAIN_DELAY:]

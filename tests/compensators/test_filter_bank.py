@@ -8,11 +8,11 @@ from compensators.filter_bank import (
     DELAY,
     HISTORY,
     HOP,
-    _band_shares,
+    _filter_shares,
     _filter_taps,
     apply_gains,
-    band_centres,
-    band_powers,
+    filter_centres,
+    filter_powers,
     frame_power,
     level_db,
 )
@@ -27,18 +27,18 @@ def test_filters_sum_to_a_delay(count: int) -> None:
     impulse[DELAY] = 1.0
     assert np.abs(_filter_taps(count).sum(0) - impulse).max() < 1e-12
     assert np.allclose(_filter_taps(count), _filter_taps(count)[:, ::-1])  # linear phase
-    assert np.allclose(_band_shares(count, 512).sum(1), 1.0)
-    assert band_centres(count)[0] == 0.0
-    assert band_centres(count)[-1] == pytest.approx(8000.0, abs=1.0)
-    assert (np.diff(band_centres(count))[:-1] > 124.9).all()
+    assert np.allclose(_filter_shares(count, 512).sum(1), 1.0)
+    assert filter_centres(count)[0] == 0.0
+    assert filter_centres(count)[-1] == pytest.approx(8000.0, abs=1.0)
+    assert (np.diff(filter_centres(count))[:-1] > 124.9).all()
 
 
 def test_levels_are_in_db_spl() -> None:
     for hertz in (250.0, 1000.0, 3001.0):
         powers = frame_power(tone(hertz, 65.0)[None, : HISTORY + 200 * HOP])
         assert (level_db(powers.sum(-1)) - 65.0).abs().max() < 0.3
-        bands = level_db(band_powers(powers, 20)).mean((0, 1))
-        assert abs(band_centres(20)[int(bands.argmax())] - hertz) < 260.0
+        bands = level_db(filter_powers(powers, 20)).mean((0, 1))
+        assert abs(filter_centres(20)[int(bands.argmax())] - hertz) < 260.0
     noise = set_level(torch.randn(1, HISTORY + 400 * HOP), 50.0)
     assert float(level_db(frame_power(noise).sum(-1).mean())) == pytest.approx(50.0, abs=0.3)
     assert float(level_db(torch.zeros(1))) == pytest.approx(0.0, abs=1e-4)

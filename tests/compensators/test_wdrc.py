@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from compensators import WDRC
-from compensators.filter_bank import band_centres, band_powers, speech_band_levels
+from compensators.filter_bank import filter_centres, filter_powers, speech_band_levels
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.dsp.interpolation import interpolate
@@ -21,12 +21,12 @@ def test_the_static_curve_is_nalrs_gain_with_a_ratio_above_the_knee_up_to_the_li
     sliders = torch.zeros(6, 1000, 0).double()
     steady = powers.expand(-1, 1000, -1)
     gains, _ = aid.compute_gains(steady, aid.fit(ears), sliders, aid.initial_state(sliders[:, 0]))
-    levels = 10.0 * band_powers(powers[:, 0], BANDS).log10() + 94.0
+    levels = 10.0 * filter_powers(powers[:, 0], BANDS).log10() + 94.0
     above_speech = levels - torch.tensor(speech_band_levels(BANDS))
     assert (above_speech < -25.0).any()
     assert (above_speech > 40.0).any()
     ratios = (1.0 + (ears[:, :1] - 10.0) / 40.0).clamp(1.0, 3.0)
-    prescribed = interpolate(nalr_gains_db(ears), FREQUENCIES, band_centres(BANDS))
+    prescribed = interpolate(nalr_gains_db(ears), FREQUENCIES, filter_centres(BANDS))
     expected = prescribed + (1.0 / ratios - 1.0) * above_speech.clamp(min=-20.0)
     expected = torch.minimum(expected.clamp(min=0.0), (110.0 - levels).clamp(min=0.0))
     assert (gains[:, -1] - expected).abs().max() < 0.01
