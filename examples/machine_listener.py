@@ -62,9 +62,9 @@ from hlsim import Audiogram
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.data.augment import mix
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.data.clips import Clips
+from hlsim.data.mixing import mix
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.conditions import AtLevelOf, EqualiserLike, Unaided
 from hlsim.evaluation.running.fingerprint import fingerprint, value_hash

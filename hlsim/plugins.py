@@ -28,7 +28,7 @@ _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 
 
 def load_plugin(name: str, kind: str) -> Any:
-    """Import a function, a PyTorch module or another object of your own code by its name.
+    """Import a function, a PyTorch module or another callable of your own code by its name.
 
     A class is called without arguments, and the object is returned. From then on, Python searches
     for modules in the working directory or, for a file, in its folder first.
@@ -38,10 +38,11 @@ def load_plugin(name: str, kind: str) -> Any:
         kind: Noun for the object in error messages, such as ``"simulator"``.
 
     Raises:
-        ValueError: The name has another form, the import fails, or the object does not exist.
+        ValueError: The name has another form, the import fails, or the object does not exist or
+            cannot be called.
 
-    >>> load_plugin("math:pi", kind="measure")
-    3.141592653589793
+    >>> load_plugin("math:sqrt", kind="measure")
+    <built-in function sqrt>
     """
     parts = _NAME.fullmatch(name)
     if parts is None:
@@ -57,9 +58,15 @@ def load_plugin(name: str, kind: str) -> Any:
             sys.path.insert(0, os.getcwd())
             module = importlib.import_module(source)
         plugin = getattr(module, attribute)
-        return plugin() if isinstance(plugin, type) else plugin
+        plugin = plugin() if isinstance(plugin, type) else plugin
     except Exception as error:  # because code of a plug-in may raise anything
         raise ValueError(f"cannot load the {kind} {name}: {_describe(error)}") from error
+    if not callable(plugin):
+        raise ValueError(
+            f"expected {kind} {name} to be a function, a module or a class, got an object of type "
+            f"{type(plugin).__name__}"
+        )
+    return plugin
 
 
 class WaveformPlugin:
@@ -87,9 +94,6 @@ class WaveformPlugin:
     def __init__(self, name: str, kind: str) -> None:
         self.name, self.kind = name, kind
         self.function: Callable[..., Tensor] = load_plugin(name, kind)
-        if not callable(self.function):
-            type_name = type(self.function).__name__
-            raise ValueError(f"expected {kind} {name} to be callable, got type {type_name}")
         if isinstance(self.function, nn.Module):
             self.function.eval()
         self._number = next(_load_numbers)
@@ -109,17 +113,17 @@ class WaveformPlugin:
     def call(self, waveform: Tensor, *arguments: Any) -> Tensor:
         """Call the plug-in, and validate its output.
 
-        Shape: (..., time) -> (..., time), in the precision of the waveform. The output of an aid
-        may have another duration.
+        Shape: (..., time) -> (..., time), in the precision of the waveform; for an aid
+        (..., time) -> (..., samples) with any number of samples.
 
         Args:
             waveform: First argument of the plug-in.
             arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: The plug-in fails, its output is not a real tensor of the expected shape,
-                or it is not finite. Samples of an output with a gradient may be NaN or infinite, so
-                that a gradient scaler can detect them.
+            ValueError: The plug-in fails, its output is not a real tensor of this shape, or samples
+                are NaN or infinite. Samples of an output with a gradient may be, so that a gradient
+                scaler can detect them.
         """
         if isinstance(self.function, nn.Module):
             self.function.to(waveform.device)
@@ -129,7 +133,8 @@ class WaveformPlugin:
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
         is_real = isinstance(output, Tensor) and not output.is_complex()
         end = -1 if self.kind == "aid" else None  # An aid may change the duration.
-        if not is_real or output.shape[:end] != waveform.shape[:end]:
+        has_shape = is_real and output.ndim == waveform.ndim
+        if not has_shape or output.shape[:end] != waveform.shape[:end]:
             kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
             raise ValueError(
                 f"{self.kind} {self.name} returned {kind} of shape "
@@ -155,7 +160,8 @@ class WaveformPlugin:
         """
         output = self(waveform, *arguments)
         channels = [
-            signal.reshape(-1, signal.shape[-1])[0].numpy() for signal in (output, waveform)
+            signal.reshape(-1, signal.shape[-1])[0].resolve_neg().numpy()
+            for signal in (output, waveform)
         ]
         correlation = np.abs(correlate(*channels, method="fft"))
         delay = int(correlation.argmax()) - (waveform.shape[-1] - 1)

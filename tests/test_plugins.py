@@ -44,6 +44,12 @@ def broken(waveform):
 def late(waveform):
     return waveform.roll(80, -1)
 
+def mean(waveform):
+    return waveform.mean()
+
+def negative(waveform):
+    return torch.complex(waveform, -waveform).conj().imag
+
 number = 3
 """
 
@@ -69,8 +75,8 @@ def test_a_module_and_a_file_give_the_same_plugin(module: str) -> None:
     waveform = noise()
     for name in (f"{module}:half", f"{module}.py:half", f"./{module}.py:Quieter"):
         torch.testing.assert_close(WaveformPlugin(name, "teacher")(waveform), waveform / 2)
-    Path(f"{module}.py").write_text("number = 4")  # a changed file is loaded again
-    assert load_plugin(f"{module}.py:number", "measure") == 4
+    Path(f"{module}.py").write_text("def four(): return 4")  # a changed file is loaded again
+    assert load_plugin(f"{module}.py:four", "measure")() == 4
 
 
 def test_another_process_loads_the_plugin_once_under_the_same_name(module: str) -> None:
@@ -87,6 +93,19 @@ def test_outputs_that_are_no_waveform_are_rejected(module: str, attribute: str) 
         plugin(noise())
 
 
+@pytest.mark.parametrize("waveform", [torch.ones(100), torch.ones(2, 100)])
+def test_a_scalar_is_no_output_of_an_aid(module: str, waveform: Tensor) -> None:
+    WaveformPlugin(f"{module}:short", "aid")(waveform)
+    with pytest.raises(ValueError, match=r"returned torch.float32 of shape \(\)"):
+        WaveformPlugin(f"{module}:mean", "aid")(waveform)
+
+
+def test_outputs_with_the_negative_bit_are_accepted(module: str) -> None:
+    plugin = WaveformPlugin(f"{module}:negative", "teacher")
+    assert plugin(noise()).is_neg()
+    plugin.check_aligned(noise(), 16000)
+
+
 def test_outputs_that_are_not_aligned_are_rejected(module: str) -> None:
     WaveformPlugin(f"{module}:half", "teacher").check_aligned(noise(), 16000)
     with pytest.raises(ValueError, match=r"delays by 5\.0 ms"):
@@ -98,5 +117,6 @@ def test_names_that_cannot_be_loaded_are_rejected(module: str) -> None:
     for name in ("msbg", "no_such_module:half", "none.py:half", ":half", "x:", unknown):
         with pytest.raises(ValueError, match=name):
             load_plugin(name, "teacher")
-    with pytest.raises(ValueError, match="to be callable"):
-        WaveformPlugin(f"{module}:number", "teacher")
+    for load in (load_plugin, WaveformPlugin):
+        with pytest.raises(ValueError, match="got an object of type int"):
+            load(f"{module}:number", "teacher")

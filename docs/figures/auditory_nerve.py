@@ -27,8 +27,8 @@ from torch import nn
 from compensators import NALR, WDRC, load_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
+from hlsim.data.mixing import mix
 from hlsim.evaluation.items import read_ears
 
 RATE = 16000  # Hz
@@ -123,7 +123,7 @@ def main(speech: str, noise: str, audiograms: str, count: str = "32") -> None:
         normal = neurogram(clean[middle].double().numpy(), NORMAL_EAR)
         for scene, signal in (
             ("clean", clean),
-            ("noisy", mix(clean[None], masker[None], torch.tensor([7.5]))[0]),
+            ("noisy", mix(clean, masker, 7.5, None)),
         ):
             outputs = {"unaided": signal} | {
                 aid: module(signal, ear) for aid, module in aids.items()

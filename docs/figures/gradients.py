@@ -18,8 +18,8 @@ from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import set_level
-from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
+from hlsim.data.mixing import mix
 
 RATE = 16000
 HALF_HOP = 12  # samples
@@ -55,7 +55,7 @@ def main() -> None:
     ears = [measured[item % len(measured)][1] for item in range(items)]
     clean = set_level(Clips(speech, sample_rate=RATE, seconds=2.0).draw(items, generator), 65.0)
     noise_clips = Clips(noise, sample_rate=RATE, seconds=2.0, repeat=True).draw(items, generator)
-    noisy = mix(clean, noise_clips, 2.5 + 15.0 * torch.rand(items, generator=generator))
+    noisy = mix(clean, noise_clips, 2.5 + 15.0 * torch.rand(items, generator=generator), None)
     nalr = NALR(sample_rate=RATE)
     scenes = (clean, nalr(clean, ears), noisy, nalr(noisy, ears))
     print("| criterion | through | clean | clean, NAL-R | noisy | noisy, NAL-R |")

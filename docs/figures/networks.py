@@ -31,8 +31,8 @@ from examples.training.conv_tasnet import conv_tasnet
 from examples.training.filter_bank import SAMPLE_RATE
 from hlsim import Audiogram, HASPILoss, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
+from hlsim.data.mixing import mix
 from hlsim.dsp.stft import STFT
 from hlsim.evaluation.conditions import AtLevelOf
 from hlsim.evaluation.measures import MEASURES
@@ -162,7 +162,7 @@ def train_network(
         elif options.noisy:
             noise = draw_speech_shaped_noise(speech, generator)
         if noise is not None:
-            network_input = mix(speech, noise, 10.0 * torch.rand(4, generator=generator))
+            network_input = mix(speech, noise, 10.0 * torch.rand(4, generator=generator), None)
         value = loss(network(network_input), speech)
         optimiser.zero_grad()
         value.backward()

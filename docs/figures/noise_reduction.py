@@ -25,8 +25,8 @@ from examples.enhancers import GTCRN, DeepFilterNet3, RNNoise
 from hlsim import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
+from hlsim.data.mixing import mix
 from hlsim.metrics import haspi
 
 RATE, SECONDS, LEVEL = 16000, 3.0, 65.0
@@ -60,8 +60,8 @@ def make_scenes(speech: str, noise: str, items: int) -> dict[str, tuple[Tensor, 
         fftconvolve(clean.numpy(), room_response(generator).numpy()[None], axes=-1)
     )
     return {
-        "noise, 2.5 to 17.5 dB": (mix(clean, noises, snr), clean),
-        "babble of six, 0 dB": (mix(clean, torch.stack(talkers).sum(0), torch.zeros(items)), clean),
+        "noise, 2.5 to 17.5 dB": (mix(clean, noises, snr, None), clean),
+        "babble of six, 0 dB": (mix(clean, torch.stack(talkers).sum(0), 0.0, None), clean),
         "a second talker, 0 dB": (clean + talkers[0], clean),
         "a room of 0.5 s": (set_level(reverberant[:, : clean.shape[-1]], LEVEL), clean),
         "quiet": (clean, clean),

@@ -41,9 +41,10 @@ from examples.machine_listener import PEAK, RATE, Whisper, agreed_text, internal
 from hlsim import MSBG
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import draw_uniform, mix
+from hlsim.data.augment import draw_uniform
 from hlsim.data.clips import Clips
 from hlsim.data.ears import draw_thresholds
+from hlsim.data.mixing import mix
 from hlsim.losses.score_loss import score_loss
 from hlsim.metrics.band_levels import band_level_loss
 

@@ -15,6 +15,9 @@ from hlsim.audiogram.scale import EARS, FREQUENCIES, HIGHEST_SIMULATED, LOWEST_L
 from hlsim.audiogram.value import Audiogram, EarLike, check_range, find_audiogram
 from hlsim.torchtools import broadcast_shape, known_on_host, on_device, on_host
 
+# Checkpoints of PyTorch and Lightning may hold ears, for example among the hyperparameters.
+torch.serialization.add_safe_globals([Audiogram, Listener])
+
 AudiogramLike = EarLike | Listener | Sequence[EarLike] | Sequence[Listener]
 """One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
 item, or a tensor or an array of thresholds in dB HL at the eight ``FREQUENCIES``, (..., 8)."""

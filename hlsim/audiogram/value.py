@@ -43,8 +43,9 @@ class Audiogram:
     were measured, as pyclarity does. Everything else uses ``thresholds``, the levels at eight
     frequencies. Simulators accept thresholds up to 100 dB HL.
 
-    Checkpoints that hold audiograms, say as hyperparameters, are loaded with ``weights_only=True``
-    inside ``torch.serialization.safe_globals([Audiogram, Listener])``.
+    PyTorch loads checkpoints that hold audiograms or listeners, for example as hyperparameters,
+    with ``weights_only=True`` once a loss, a simulator or an aid was imported, and otherwise inside
+    ``torch.serialization.safe_globals([Audiogram, Listener])``.
 
     Args:
         levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
-from hlsim.dsp.active_level import active_level_db
+from hlsim.data.mixing import mix
 
 HIGHEST_LEVEL = 115.0
 """Highest RMS level of a training signal in dB SPL."""
@@ -58,34 +58,6 @@ def replace_share(
     """
     is_replaced = torch.rand(len(signals), 1, generator=generator) < share
     return torch.where(is_replaced, replacements, signals)
-
-
-def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None = None) -> Tensor:
-    """Add noise to speech at a signal-to-noise ratio.
-
-    The speech stays as it is, and the noise is scaled.
-
-    Args:
-        speech: Speech with shape (items, time).
-        noise: Noise with shape (items, time).
-        snr_db: Level of the speech minus RMS level of the noise in dB, with shape (items,).
-        sample_rate: Sample rate in Hz, with which the level of the speech is its active level
-            without pauses (ITU-T P.56). If it is None, the level is that of the RMS.
-
-    Returns:
-        Noisy speech with shape (items, time).
-
-    >>> speech, noise = torch.ones(1, 100), 5.0 * torch.ones(1, 100)
-    >>> mix(speech, noise, torch.tensor([20.0]))[0, :2]
-    tensor([1.1000, 1.1000])
-    """
-    level = 10.0 * speech.square().mean(-1).clamp_min(_POWER_FLOOR).log10()
-    if sample_rate is not None:
-        for item, waveform in enumerate(speech):
-            if bool(waveform.any()):
-                level[item] = active_level_db(waveform, sample_rate)
-    noise_level = (level - snr_db).clamp_min(-200.0)  # the level of silence
-    return speech + set_level(noise, noise_level, full_scale_spl=0.0)
 
 
 def equalise(
@@ -195,7 +167,7 @@ def augment_speech(
 
     signal = speech
     if noise is not None:
-        noisy = mix(speech, noise, uniform(-5.0, 20.0), NEURO_RATE)
+        noisy = mix(speech, noise, uniform(-5.0, 20.0))
         signal = replace_share(speech, noisy, 0.4, generator)
     if treated:
         compressed = compress(signal, uniform(1.5, 4.0), NEURO_RATE)

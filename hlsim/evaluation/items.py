@@ -16,9 +16,10 @@ from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.checks import check_names, check_number
-from hlsim.data.augment import compress, mix
+from hlsim.data.augment import compress
 from hlsim.data.clips import Clips
 from hlsim.data.ears import MILDER, draw_thresholds
+from hlsim.data.mixing import mix
 from hlsim.evaluation.study import Item
 
 SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
@@ -256,7 +257,7 @@ def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor,
     """Return speech in noise at an SNR in dB, and this SNR, which is NaN without noise."""
     if noise is None:
         return clean, math.nan
-    return mix(clean[None], noise[None], torch.tensor([snr]))[0], snr
+    return mix(clean, noise, snr, sample_rate=None), snr
 
 
 def _facts(ear: Audiogram, level: float, snr_column: str, snr: float) -> dict[str, Any]:

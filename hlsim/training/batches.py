@@ -22,12 +22,12 @@ from hlsim.data.augment import (
     augment_speech,
     draw_uniform,
     equalise_share,
-    mix,
     replace_share,
 )
 from hlsim.data.clips import Clips, Source, hash_source
 from hlsim.data.ears import draw_thresholds
 from hlsim.data.manifest import read_manifest
+from hlsim.data.mixing import mix
 from hlsim.data.tones_and_clicks import draw_sounds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 
@@ -241,7 +241,7 @@ class _CompensatorBatches(_RandomBatches):
             noise = equalise_share(noise, recipe.equalised, generator)
             if recipe.babble:
                 noise = replace_share(noise, _babble(voices), recipe.babble, generator)
-            noisy = mix(clean, noise, draw_uniform(*recipe.snr, (count,), generator), NEURO_RATE)
+            noisy = mix(clean, noise, draw_uniform(*recipe.snr, (count,), generator))
             noisy = replace_share(clean, noisy, recipe.noisy, generator)
             is_speech = (clips == voices).all(-1, keepdim=True)
             signal = torch.where(is_speech, noisy, clean)

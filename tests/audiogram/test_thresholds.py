@@ -1,5 +1,6 @@
 """Thresholds as tensors: converted, validated, stored, and interpolated as numpy interpolates."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from compensators import NALR, load_compensator
 from hlsim import MSBG, load_pretrained
 from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.interpolation import interpolate, interpolation_weights
@@ -80,3 +82,9 @@ def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
         assert interpolated.shape == (2, 3, 9) and interpolated.dtype == ears.dtype
         np.testing.assert_allclose(interpolated.reshape(6, 9).numpy(), expected, rtol=1e-5)
     np.testing.assert_allclose(rows @ interpolation_weights(FREQUENCIES, hz), expected, rtol=1e-12)
+
+
+def test_torch_loads_files_that_hold_ears(tmp_path: Path) -> None:
+    ears = [Audiogram.standard("N3"), Audiogram([30, 40], [500, 4000]), Listener("N1", "N3")]
+    torch.save(ears, tmp_path / "ears.pt")
+    assert torch.load(tmp_path / "ears.pt", weights_only=True) == ears

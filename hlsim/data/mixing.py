@@ -1,0 +1,81 @@
+"""Noisy speech at a signal-to-noise ratio."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hlsim.calibration import NEURO_RATE, dbfs, set_level
+from hlsim.checks import check_rate
+from hlsim.dsp.active_level import active_level_db
+from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
+
+
+def mix(
+    speech: Audio,
+    noise: Samples,
+    snr: float | Tensor,
+    sample_rate: int | None = NEURO_RATE,
+    *,
+    channels: bool = False,
+) -> Audio:
+    """Add noise to speech at a signal-to-noise ratio.
+
+    The speech stays as it is, and the noise is scaled; silence gets no noise. The level of the
+    speech is the active level of ITU-T P.56, which leaves pauses out; the level of the noise is its
+    RMS level.
+
+    Args:
+        speech: Tensor or NumPy array of speech, ``(..., time)``.
+        noise: Noise of the same shape, or longer; its end is then left out.
+        snr: Signal-to-noise ratio in dB, or a tensor with one per signal, ``(...)``.
+        sample_rate: Sample rate in Hz, 16000 to 48000. ``None`` takes the RMS level of the speech
+            with its pauses instead of the active level.
+        channels: Whether the second last dimension holds the channels of a recording, which have
+            one SNR and one gain, so that the level differences between ears stay. Otherwise, each
+            channel is a signal of its own.
+
+    Returns:
+        Noisy speech, of the type and shape of ``speech``.
+
+    Raises:
+        ValueError: The shapes do not fit, the noise is silent or shorter than the speech, samples
+            are NaN or infinite, or the SNR is not a number.
+
+    Example:
+        >>> import hlsim
+        >>> speech = hlsim.example_speech()
+        >>> noisy = hlsim.mix(speech, torch.randn(2 * len(speech)), snr=5.0)
+        >>> noisy.shape
+        torch.Size([64320])
+    """
+    signal = as_samples(speech)
+    masker = as_samples(noise)[..., : signal.shape[-1]].to(signal)
+    ratio = torch.as_tensor(snr, device=signal.device)
+    if masker.shape != signal.shape or signal.ndim < 1 + channels:
+        raise ValueError(
+            "expected speech and noise of the same shape (..., time), or longer noise, got "
+            f"{tuple(signal.shape)} and {tuple(as_samples(noise).shape)}; repeat short noise, or "
+            "expand it to the shape of the speech"
+        )
+    if not bool((signal.isfinite() & masker.isfinite()).all()):
+        raise ValueError("expected finite samples, got NaN or infinity; replace or remove them")
+    if bool((masker == 0.0).all((-2, -1) if channels else -1).any()):
+        raise ValueError("expected noise, got silence; use another part of the recording")
+    if bool(ratio.isnan().any()):
+        raise ValueError(f"expected an SNR in dB, got {snr}")
+    level = dbfs(signal)
+    if sample_rate is not None:
+        rate = check_rate(sample_rate)
+        waveforms = signal.detach().cpu().reshape(-1, signal.shape[-1])
+        for number, waveform in enumerate(waveforms):
+            if bool(waveform.any()):  # A channel may be silent.
+                level.view(-1)[number] = active_level_db(waveform, rate)
+    if channels:
+        loudest = level.amax(-1, keepdim=True)
+        power = (10.0 ** ((level - loudest) / 10.0)).mean(-1)
+        level = loudest.squeeze(-1) + 10.0 * power.log10()
+        masker = masker.flatten(-2)
+    noise_level = (level - ratio).clamp_min(-200.0)  # the level of silence
+    scaled = set_level(masker, noise_level, full_scale_spl=0.0)
+    return as_type_of(speech, signal + scaled.reshape(signal.shape))
