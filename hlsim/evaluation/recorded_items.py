@@ -274,12 +274,13 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
     for number, (row, audiogram) in enumerate(read_audiograms(audiograms), start=1):
         side = EAR_NAMES.get(text_in(row, "ear").lower(), "")
         ears.append((text_in(row, "listener") or f"row {number}", side, audiogram))
+    source = audiograms if is_file else "the table"
     names = [(listener, side) for listener, side, _ in ears]
     for listener, side in names:
         if names.count((listener, side)) > 1:
             raise ValueError(
-                f"{audiograms if is_file else 'the table'}: expected one row for each ear, got several of listener "
-                f"{listener!r}, ear {side!r}; name the listener and the ear of each row"
+                f"{source}: expected one row for each ear, got several of listener {listener!r}, "
+                f"ear {side!r}; name the listener and the ear of each row"
             )
     return ears
 

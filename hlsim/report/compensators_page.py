@@ -15,10 +15,13 @@ from hlsim.report.plots import (
     condition_colours,
     curves_picture,
     gain_picture,
+    means_pictures,
     scores_pictures,
 )
 from hlsim.report.results import (
     GAIN_NOTE,
+    HASQI_NOTE,
+    SEVERITY_NOTE,
     STATISTICS_NOTE,
     VERSION_NOTE,
     Columns,
@@ -58,8 +61,6 @@ _COLUMN_NOTES = (
     "the median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
     "perceived by the impaired ear and, for clean speech, by a normal ear, both by the exact "
     "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0.",
-    "The reference of HASQI is clean speech amplified by NAL-R, which is therefore its ceiling: "
-    "an output that is closer to normal hearing than NAL-R's has a lower HASQI.",
     "A condition at a compensator's level is NAL-R, or an equaliser, whose output is brought to "
     "the RMS level of the compensator's output for the same item. The equaliser is for each ear "
     f"a fixed filter with the compensator's mean insertion gain in 24 bands, for {UTTERANCES} "
@@ -107,9 +108,12 @@ def compensators_page(evaluation: Evaluation) -> Page:
     ]
     names = evaluation.aids
     tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in main.items()]
-    about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE]
+    means = [
+        picture for name, group in main.items() for picture in means_pictures(group, _GROUPS[name])
+    ]
+    about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE, HASQI_NOTE]
     sections = [
-        Section("Scores", about, tables),
+        Section("Scores", about, tables, means),
         *listening_sections(replace(evaluation, comparisons=next(iter(main.values())).comparisons)),
         Section("Gain", [_GAINS], pictures=_gain_pictures(evaluation)),
         Section("Could it be worn?", [_WEARING], [_wearing_table(evaluation)]),
@@ -125,7 +129,7 @@ def _about(evaluation: Evaluation) -> str:
     ears = evaluation.table["ear"].nunique()
     return (
         f"{settings['items']} items of {settings['seconds']:g} s; ears: {ears}; speech at "
-        f"{levels} dB SPL in turn; seed {settings['seed']}. {VERSION_NOTE} Both compare with the "
+        f"{levels} dB SPL in turn; seed {settings['seed']}. {VERSION_NOTE} Both compare with "
         "clean speech, in noise too."
     )
 
@@ -144,7 +148,7 @@ def _details(evaluation: Evaluation) -> Section:
             summary_table(f"By {title}", *_rows(group, fact))
             for fact, title in {
                 "input_level": "input level (dB SPL)",
-                "severity": "degree of loss",
+                "severity": "MSBG's degree of loss",
                 "snr": "SNR (dB)",
             }.items()
             if group.table[fact].nunique() > 1
@@ -163,7 +167,9 @@ def _details(evaluation: Evaluation) -> Section:
         sections.append(Section(_GROUPS[name], tables=tables, sections=inner_sections))
     sections.append(Section("Steady tones", [_TONES], pictures=_tone_pictures(evaluation)))
     enhancers = [f"Enhancer: {name}." for name in evaluation.settings["enhancers"]]
-    return detail_section(evaluation, sections, [*_COLUMN_NOTES, STATISTICS_NOTE, *enhancers])
+    return detail_section(
+        evaluation, sections, [*_COLUMN_NOTES, SEVERITY_NOTE, STATISTICS_NOTE, *enhancers]
+    )
 
 
 def _gain_pictures(evaluation: Evaluation) -> list[Picture]:

@@ -100,6 +100,7 @@ class Sound:
         audio: Contents of a FLAC file.
         loudness: Level in dB relative to full scale with which the sound is played.
         spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram.
+        note: Text on the spectrogram, which says why it is black.
 
     >>> Sound("unaided", 10.2, b"fLaC", -30.0, b"\\x89PNG").label
     'unaided'
@@ -110,6 +111,7 @@ class Sound:
     audio: bytes
     loudness: float
     spectrogram: bytes
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -298,11 +300,12 @@ def _render(template: str, **values: Any) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """Return a text in which no character has a meaning in Markdown, such as that of an image."""
-    text = re.sub(
-        r"([\\`*\[\]|~]|(?<!\w)_|_(?!\w)|^>|^[#+-](?=[\s#]))", r"\\\1", " ".join(text.split())
-    )
-    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text)
+    """Return a text in which no character has a meaning in Markdown, such as that of an image.
+
+    Brackets have one only before a parenthesis, a colon or other brackets.
+    """
+    marks = r"([\\`*|~]|(?<!\w)_|_(?!\w)|^>|^[#+-](?=[\s#])|(?<=\])[(:\[])"
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", re.sub(marks, r"\\\1", " ".join(text.split())))
 
 
 def _data_uri(data: bytes) -> str:

@@ -23,6 +23,8 @@ from hlsim.report.page import (
 )
 
 _PEAK = 0.9  # largest sample of the sounds of a group
+_VISIBLE_SPL = 10.0  # level of a bin above which its colour can be told from black
+_VISIBLE_SHARE = 0.005  # share of visible bins below which a spectrogram looks black
 _HIGHEST_HZ = 8000.0  # at which MSBG and HASPI end
 
 _EXPLANATION = (
@@ -58,8 +60,12 @@ def _item_section(headline: Comparison | None, sounds: ItemSounds) -> Section:
         place, count = sounds.rank
         rank = f"change {sounds.change:+.3f}, rank {place} of {count}"
         title += f" ({headline.title}: {rank})"
-    thresholds = ", ".join(f"{level:g}" for level in sounds.ear.thresholds)
-    texts = [f"{sounds.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."]
+    ear = sounds.ear
+    thresholds = ", ".join(f"{level:g}" for level in ear.thresholds)
+    texts = [
+        f"Pure-tone average {ear.pta:.0f} dB HL, WHO grade: {ear.who_grade}; MSBG's group: "
+        f"{ear.severity}. Thresholds: {thresholds} dB HL."
+    ]
     texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
     return Section(title, texts, player=make_player(sounds.groups, sounds.sample_rate))
 
@@ -109,13 +115,27 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
         peak: Largest sample of all signals of the group, which is played as 0.9.
     """
     level = float(level_spl(signal.flatten()))
+    levels = spectrogram_levels(signal, sample_rate)
     return Sound(
         label,
         level,
         encode_flac(signal * (_PEAK / peak), sample_rate),
         loudness=level - _full_scale(peak),
-        spectrogram=_spectrogram_png(spectrogram_levels(signal, sample_rate)),
+        spectrogram=_spectrogram_png(levels),
+        note=_describe_black(levels),
     )
+
+
+def _describe_black(levels: Tensor) -> str:
+    """Return why a spectrogram looks black, or an empty text if it does not.
+
+    Args:
+        levels: Levels in dB SPL. Shape: (bins, frames).
+    """
+    if float(levels.max()) < SPECTROGRAM_LEVELS[0]:
+        return "nothing is perceived"
+    visible_share = float((levels > _VISIBLE_SPL).float().mean())
+    return "almost nothing is perceived" if visible_share < _VISIBLE_SHARE else ""
 
 
 def _peak(group: Mapping[str, Tensor]) -> float:

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram.plot import frequency_axis
+from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.statistics import MIN_ITEMS_FOR_INTERVAL, bootstrap_interval
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
 from hlsim.report.page import Picture
@@ -165,6 +167,59 @@ def gain_picture(
         for name, line, style in zip(names, gains.tolist(), _LINE_STYLES, strict=False):
             curves[name] = (row["frequencies"], line, {"color": colours[aid], "linestyle": style})
     return curves_picture(curves, title, "insertion gain (dB)")
+
+
+def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
+    """Draw the mean of the most important score under each condition, with its 95 % interval.
+
+    Args:
+        evaluation: The evaluation.
+        part: Name of the part of the items, for the title.
+
+    Returns: The picture, or an empty list if fewer than two conditions have scores.
+
+    >>> import pandas
+    >>> from hlsim.evaluation import MEASURES
+    >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
+    >>> conditions = [Condition("a"), Condition("b")]
+    >>> evaluation = Evaluation([], conditions, [MEASURES["haspi"]], table)
+    >>> [picture.title for picture in means_pictures(evaluation)]
+    ['HASPI of all conditions']
+    """
+    measure = evaluation.scores[0]
+    title = column_title(measure)
+    scores = evaluation.wide(measure).dropna(axis=1, how="all")
+    if len(scores.columns) < 2:
+        return []
+    colours = condition_colours(evaluation.conditions)
+    has_intervals = False
+    means: list[tuple[str, float, tuple[float, float] | None]] = []
+    for name in scores:
+        values = scores[name].dropna().to_numpy()
+        is_enough = len(values) >= MIN_ITEMS_FOR_INTERVAL
+        interval = bootstrap_interval(values) if is_enough else None
+        has_intervals |= is_enough
+        means.append((name, float(values.mean()), interval))
+
+    def draw(axes: Any) -> None:
+        for place, (name, mean, interval) in enumerate(means):
+            if interval is not None:
+                axes.plot(interval, [place, place], color=colours[name], linewidth=2.0)
+            axes.plot([mean], [place], "o", color=colours[name])
+        labels = [fill(name, 22) for name, _, _ in means]
+        axes.set_yticks(range(len(means)), labels)
+        axes.set(xlabel=title, ylim=(len(means) - 0.5, -0.5))
+        axes.grid(axis="x", alpha=0.4)
+
+    note = "Points are means over items"
+    if has_intervals:
+        note += (
+            ", lines their 95 % intervals. The intervals of two conditions may overlap although "
+        )
+        note += "their difference is significant, because each item is scored under both"
+    heading = f"{title} of all conditions" + (f", {part[0].lower()}{part[1:]}" if part else "")
+    return [_draw_picture(draw, heading, f"{note}.", height=1.0 + 0.4 * len(means))]
 
 
 def scores_pictures(evaluation: Evaluation) -> list[Picture]:

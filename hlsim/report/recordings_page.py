@@ -11,9 +11,10 @@ from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Section, Table
 from hlsim.report.players import listening_sections
-from hlsim.report.plots import scores_pictures
+from hlsim.report.plots import means_pictures, scores_pictures
 from hlsim.report.results import (
     GAIN_NOTE,
+    HASQI_NOTE,
     Columns,
     comparison_table,
     score_columns,
@@ -84,8 +85,11 @@ def report_page(evaluation: Evaluation) -> Page:
         tables.append(comparison_table([headline], "The comparison of the first sentence"))
         texts = [limits(headline), *texts, *_words(evaluation, headline)]
     texts = [*evaluation.notes, *describe_missing_pairs(evaluation), *texts]
+    if "hasqi" in evaluation.scores:
+        texts.append(HASQI_NOTE)
+    pictures = [*means_pictures(evaluation), *scores_pictures(evaluation)]
     sections = [
-        Section("Scores", texts, tables, scores_pictures(evaluation)),
+        Section("Scores", texts, tables, pictures),
         *listening_sections(evaluation),
         score_details(evaluation),
     ]
@@ -129,8 +133,9 @@ def scenes_page(evaluation: Evaluation) -> Page:
     first_sentence, *further_verdicts = planned or [
         f"No pair of aids could be compared with {NAL_R}."
     ]
-    texts = [*evaluation.notes, *further_verdicts, _ABOUT_SCENES]
-    tables, pictures = [_conditions_table(evaluation)], scores_pictures(evaluation)
+    texts = [*evaluation.notes, *further_verdicts, _ABOUT_SCENES, HASQI_NOTE]
+    pictures = [*means_pictures(evaluation), *scores_pictures(evaluation)]
+    tables = [_conditions_table(evaluation)]
     sections = [
         Section("Conditions", texts, tables, pictures),
         *listening_sections(evaluation),

@@ -31,6 +31,16 @@ STATISTICS_NOTE = (
     "did not change; W is the smaller rank sum."
 )
 
+HASQI_NOTE = (
+    "HASQI compares with clean speech amplified by NAL-R, which is therefore its ceiling: an "
+    "output that is closer to normal hearing than NAL-R's has a lower HASQI."
+)
+
+SEVERITY_NOTE = (
+    "Degrees of loss are MSBG's four groups by the mean loss from 2 to 8 kHz, which ends at 15, 35 "
+    "and 56 dB HL. They are not the grades of the WHO, which follow from the pure-tone average."
+)
+
 VERSION_NOTE = "HASPI and HASQI are computed in version 2, as by pyclarity 0.9."
 
 Columns = dict[str, tuple[Callable[["DataFrame"], Any], str]]
@@ -235,7 +245,8 @@ def _comparison_sections(evaluation: Evaluation) -> list[Section]:
     if len(headline.by_severity) > 1:
         parts |= {f"loss: {name}": part for name, part in headline.by_severity.items()}
     if len(parts) > 1:
-        sections.append(Section("Parts of the items", tables=[paired_table(pair, parts)]))
+        notes = [SEVERITY_NOTE] if len(headline.by_severity) > 1 else []
+        sections.append(Section("Parts of the items", notes, [paired_table(pair, parts)]))
     return sections
 
 

@@ -53,7 +53,7 @@ _TREATMENTS = {
 """Titles of the treatments of the input."""
 
 _FACTS = {
-    "severity": "By degree of loss",
+    "severity": "By MSBG's degree of loss",
     "input_level": "By level (dB SPL)",
     "speech": "Clean or noisy",
 }

@@ -65,3 +65,21 @@ def test_spectrograms_have_one_scale() -> None:
 def test_silence_is_rejected() -> None:
     with pytest.raises(ValueError, match="silent"):
         make_player({"": {"silence": torch.zeros(1600)}}, 16000)
+
+
+def test_a_black_spectrogram_says_why() -> None:
+    loud = tone(60.0)
+    sounds = {"loud": loud, "faint": tone(-20.0), "click": torch.zeros(8000)}
+    sounds["click"][4000] = 0.05
+    notes = {sound.label: sound.note for sound in make_player({"": sounds}, 16000).sounds}
+    assert notes["loud"] == ""
+    assert notes["faint"] == "nothing is perceived"
+    page = make_player({"": {"loud": loud, "faint": tone(-20.0)}}, 16000).html()
+    assert page.count(">nothing is perceived<") == 1
+
+
+def test_little_colour_is_almost_nothing() -> None:
+    signal = 1e-7 * torch.ones(160000)
+    signal[:800] = tone(30.0)[:800]
+    (sound,) = make_player({"": {"a": signal}}, 16000).sounds
+    assert sound.note == "almost nothing is perceived"

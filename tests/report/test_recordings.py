@@ -14,6 +14,7 @@ from hlsim.evaluation import Condition, Evaluation, compare
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.recorded_items import Recording
 from hlsim.evaluation.sounds import perceive_items
+from hlsim.report.plots import means_pictures
 from hlsim.report.recordings_page import report_page
 from hlsim.report.verdict import verdict
 from hlsim.report.writing import write_results
@@ -116,3 +117,27 @@ def test_conditions_without_a_common_item_are_named(tmp_path: Path) -> None:
     )
     assert f"of the condition NAL-R is {means['NAL-R']:.3f} on average (6 items, at" in page.verdict
     assert "no item has two scores, so that nothing can be compared" in page.verdict
+
+
+def test_a_picture_shows_the_means_of_all_conditions(tmp_path: Path) -> None:
+    study = evaluation(tmp_path)
+    (picture,) = means_pictures(study)
+    text = picture.data.decode()
+    assert "unaided" in text and "NAL-R" in text and "&lt;my&gt; aid" in text
+    assert "95 % intervals" in picture.note
+    few = replace(study, table=study.table[study.table.item < 3])
+    assert "95 %" not in means_pictures(few)[0].note
+    single = replace(study, table=study.table[study.table.condition == "unaided"])
+    assert means_pictures(single) == []
+
+
+def test_the_reference_of_hasqi_and_both_scales_of_loss_are_stated(tmp_path: Path) -> None:
+    study = evaluation(tmp_path, listen=1)
+    page = report_page(study)
+    assert "amplified by NAL-R" not in " ".join(page.sections[0].paragraphs)
+    ear = study.sounds[0].ear
+    about = page.sections[1].sections[0].paragraphs[0]
+    assert f"WHO grade: {ear.who_grade}; MSBG's group: {ear.severity}" in about
+    table = study.table.assign(hasqi=study.table.haspi)
+    both = replace(study, table=table, measures=[*study.measures, MEASURES["hasqi"]])
+    assert "amplified by NAL-R" in " ".join(report_page(both).sections[0].paragraphs)
