@@ -2,8 +2,8 @@
 
 A threshold is the level in dB HL (relative to normal hearing) from which an ear hears a tone of a
 frequency; a higher threshold is a greater loss. An *ear* is one audiogram, a *listener* has two.
-Wherever an ear is expected, an ``Audiogram``, a name such as ``"N3"``, eight thresholds or a
-dictionary of frequencies to thresholds will do.
+Wherever an ear is expected, an ``Audiogram``, a name such as ``"N3"``, eight thresholds or a dict
+of frequencies to thresholds will do.
 """
 
 from hlsim.audiogram.scale import (

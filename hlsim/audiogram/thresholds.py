@@ -196,7 +196,8 @@ def resolve_thresholds(
     except RuntimeError:
         raise ValueError(
             f"audiograms of shape {tuple(thresholds.shape)} do not fit a waveform of shape "
-            f"{tuple(waveform.shape)}; pass one audiogram, or leading dimensions that broadcast"
+            f"{tuple(waveform.shape)}; pass one audiogram, (8,), or one per item, "
+            f"{(*waveform.shape[:-1], len(FREQUENCIES))}"
         ) from None
     return on_device(thresholds, waveform.device)
 

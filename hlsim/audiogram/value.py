@@ -257,7 +257,8 @@ def as_audiogram(ear: EarLike) -> Audiogram:
     Args:
         ear: An ``Audiogram`` of hlsim or pyclarity; the name of a standard audiogram, such as
             ``"N3"`` or ``"n3"``; eight thresholds in dB HL at ``FREQUENCIES``, as a sequence, an
-            array or a tensor; or a mapping of frequencies in Hz to thresholds in dB HL.
+            array or a tensor; a mapping of frequencies in Hz to thresholds in dB HL; or a pandas
+            ``Series`` of thresholds by position, by frequency, or by column of a table.
 
     Raises:
         ValueError: The value is none of these, or its thresholds are not valid.
