@@ -105,7 +105,8 @@ def _read_name(column: str) -> ThresholdColumn | None:
     hz = _read_hz(match["number"], bool(match["kilo"]))
     if words & _OTHER_LEVELS:
         return None
-    begins_with_frequency = hz in _USUAL_HZ and known.issuperset(before)
+    has_other_unit = name[match.end("number") :][:1].isalpha() and not match["kilo"]  # "500ms"
+    begins_with_frequency = hz in _USUAL_HZ and known.issuperset(before) and not has_other_unit
     if not (is_known or is_explicit or begins_with_frequency):
         return None
     ears = {EAR_NAMES[word] for word in words if word in EAR_NAMES}

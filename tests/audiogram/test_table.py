@@ -43,6 +43,7 @@ def read_text(folder: Path, text: str) -> list[Audiogram]:
         '"250\nHz","500\nHz","1000\nHz"\n10,22.5,30\n',
         "250 Hz R,500_R,right 1k\n10,22.5,30\n",
         "AUXU1K1R,2nd visit,2019-05-01,bc_500,250,500,1000\n7,7,7,7,10,22.5,30\n",
+        "threshold_500ms_db_spl,250,500,1000\n7,10,22.5,30\n",
         "hl_250,hl_500,hl_1000,hl_8000_extrapolated_flat\n10,22.5,30,30\n",
         "hl_250,hl_500,hl_1000\n,,\n10,22.5,30\n,,\n",
         "Frequency (Hz),Threshold (dB HL)\n1000,30\n250,10\n500,22.5\n",
