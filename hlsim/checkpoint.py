@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from hlsim.files import atomic_path, write_atomically
+from hlsim.suggestions import suggest
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config")
@@ -166,9 +167,10 @@ def _find_folder(name: str | Path) -> Path:
     for folder in (path, checkpoints_folder() / path, path / "checkpoint"):
         if (folder / CONFIG).is_file():
             return folder
+    suggestion = suggest(str(name), [*list_pretrained(), "msbg", "nalr", "wdrc"])
     raise ValueError(
-        f"no checkpoint {str(name)!r}; expected {', '.join(list_pretrained())}, or a folder with "
-        f"{CONFIG}; models without a checkpoint are msbg, nalr and wdrc"
+        f"no checkpoint {str(name)!r}{suggestion}; expected {', '.join(list_pretrained())}, or a "
+        f"folder with {CONFIG}; models without a checkpoint are msbg, nalr and wdrc"
     )
 
 

@@ -93,7 +93,7 @@ def example_speech() -> Tensor:
 
 def simulate(
     audio: Audio,
-    ear: AudiogramLike,
+    audiogram: AudiogramLike,
     sample_rate: int = NEURO_RATE,
     *,
     simulator: str | Path | torch.nn.Module = "msbg",
@@ -103,7 +103,7 @@ def simulate(
 
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
-        ear: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
+        audiogram: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
             mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name or folder
@@ -125,12 +125,12 @@ def simulate(
     """
     model = load_simulator(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     with torch.no_grad():
-        return as_type_of(audio, model(_as_finite_tensor(audio), ear))
+        return as_type_of(audio, model(_as_finite_tensor(audio), audiogram))
 
 
 def compensate(
     audio: Audio,
-    ear: AudiogramLike,
+    audiogram: AudiogramLike,
     sample_rate: int = NEURO_RATE,
     *,
     compensator: str | Path = "hearing-aid",
@@ -140,7 +140,7 @@ def compensate(
 
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
-        ear: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
+        audiogram: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
             mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
         sample_rate: Sample rate in Hz, 16000 (default) to 48000.
         compensator: ``"nalr"`` or ``"wdrc"``, or the name or folder of a checkpoint, such as
@@ -163,7 +163,7 @@ def compensate(
     """
     aid = load_compensator(compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     with torch.no_grad():
-        return as_type_of(audio, aid(_as_finite_tensor(audio), ear))
+        return as_type_of(audio, aid(_as_finite_tensor(audio), audiogram))
 
 
 def listen(
@@ -247,7 +247,8 @@ class Players:
         """
         from hlsim.report.page import Page, Section
 
-        title = ", ".join(sound.label for sound in self._player.sounds).capitalize()
+        title = ", ".join(sound.label for sound in self._player.sounds)
+        title = title[:1].upper() + title[1:]
         page = Page(title, "", [Section("Listen", player=self._player)])
         write_atomically(Path(path), page.html())
 

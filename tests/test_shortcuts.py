@@ -43,10 +43,11 @@ def test_one_gain_calibrates_all_channels_of_a_file(tmp_path) -> None:
 
 def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
     pytest.importorskip("matplotlib")
-    players = hlsim.listen(original=SPEECH, soft_copy=0.1 * SPEECH.numpy())
-    assert repr(players).startswith("Players(original ") and ", soft copy " in repr(players)
+    players = hlsim.listen(original=SPEECH, soft_N4=0.1 * SPEECH.numpy())
+    assert repr(players).startswith("Players(original ") and ", soft N4 " in repr(players)
     players.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
+    assert "<h1>Original, soft N4</h1>" in page, "labels keep their capitals"
     assert page.count("<audio controls") == page.count("<img") == 2
     assert "hlsim-player" in players._repr_html_()
 

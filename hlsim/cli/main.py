@@ -12,12 +12,17 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from hlsim.cli.options import Parser
+from hlsim.suggestions import suggest
 from hlsim.version import __version__
 
 GROUPS = {
     "listen": {
         "simulate": ("processing", "simulate a hearing loss on a file or a folder of files"),
         "compensate": ("processing", "apply a hearing aid to a file or a folder of files"),
+        "listen": (
+            "listen",
+            "write a page with players: what ears perceive, with and without an aid",
+        ),
         "live": ("live", "run a hearing aid or a simulated hearing loss with a microphone"),
         "demo": ("demo", "train a compensator for one ear on bundled speech"),
     },
@@ -107,8 +112,11 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     Raises:
         SystemExit: Help was printed, or the command or an option is not valid.
     """
-    if arguments and arguments[0] in COMMANDS:
-        return make_parser(arguments[0]).parse_args(arguments[1:])
+    words = [*arguments] or ["--help"]
+    if words[0] == "help":
+        words = [*words[1:2], "--help"]
+    if words[0] in COMMANDS:
+        return make_parser(words[0]).parse_args(words[1:])
     lines = []
     for group, commands in GROUPS.items():
         lines.append(f"\n{group}:")
@@ -120,10 +128,11 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         epilog="\n".join(lines) + "\n\nhlsim COMMAND --help describes the options of a command.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
-    text = "one of the commands below"
-    parser.add_argument("command", metavar="COMMAND", choices=[*COMMANDS], help=text)
-    return parser.parse_args(arguments or ["--help"])
+    parser.add_argument("-V", "--version", action="version", version=f"hlsim {__version__}")
+    parser.add_argument("command", metavar="COMMAND", help="one of the commands below")
+    command = parser.parse_args(words).command
+    suggestion = suggest(command, COMMANDS)
+    parser.error(f"there is no command {command!r}{suggestion}")
 
 
 def make_parser(command: str) -> Parser:

@@ -15,6 +15,7 @@ import soundfile
 import torch
 from torch import Tensor
 
+import hlsim
 from compensators import NALR, MappingCompensator, MappingConfig, load_compensator
 from hlsim import MSBG, Audiogram, Listener
 from hlsim.audio import read_audio, write_audio
@@ -22,7 +23,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.evaluation import _read_labels
-from hlsim.cli.main import main
+from hlsim.cli.main import main, make_parser
 from tests.helpers import write_table
 
 N3 = Audiogram.standard("N3")
@@ -54,7 +55,10 @@ def check_output(path: Path, expected: Tensor, atol: float = 1e-6) -> None:
     torch.testing.assert_close(read_audio(path)[0], expected, atol=atol, rtol=1e-4)
 
 
-ERRORS = """simulat | COMMAND
+ERRORS = """simulat | did you mean simulate?
+loud | there is no command 'loud'; see
+compensate {speech} {out} --audiogram N3 --compensator nal-r | did you mean nalr?
+simulate {speech} {out} --audiogram N3 --simulator neuro-msgb | did you mean neuro-msbg?
 simulate | hlsim simulate
 simulate {speech} b --audiogram N3 --loud | --loud
 simulate {speech} {out} --audiogram N3 --full-scale-spl nan | --full-scale-spl
@@ -289,6 +293,28 @@ def test_notes_about_clipping_and_a_missing_upper_band(
     text = capsys.readouterr().out
     for note in ("players will clip", "no band above 8 kHz"):
         assert (note in text) == (note == expected)
+
+
+@pytest.mark.parametrize(
+    ("call", "beginning"),
+    [
+        ("help", "usage: hlsim COMMAND"),
+        ("help simulate", "usage: hlsim simulate"),
+        ("-V", f"hlsim {hlsim.__version__}"),
+    ],
+)
+def test_help_and_the_version_are_printed(
+    capsys: pytest.CaptureFixture[str], call: str, beginning: str
+) -> None:
+    assert run(*call.split()) == 0
+    assert capsys.readouterr().out.startswith(beginning)
+
+
+def test_n7_is_offered_where_it_is_accepted() -> None:
+    for command in ("simulate", "listen", "demo", "train-compensator"):
+        assert "N1 to N6" in " ".join(make_parser(command).format_help().split())
+    for command in ("compensate", "haspi-report", "live"):
+        assert "N1 to N7" in " ".join(make_parser(command).format_help().split())
 
 
 def test_a_missing_extra_names_the_command_that_installs_it(

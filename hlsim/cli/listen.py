@@ -1,0 +1,137 @@
+"""The command ``listen``, which writes a page with players for some recordings."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hlsim.cli.inputs import (
+    check_extras,
+    load_compensator,
+    read_named_ears,
+    read_sliders,
+    warn_of_other_ears,
+)
+from hlsim.cli.options import Parser, input_path, positive_number
+from hlsim.progress import ProgressLine
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from hlsim.report.page import Section
+
+
+def listen(parser: Parser) -> None:
+    """Declare the options of the command ``listen``."""
+    parser.set_command(
+        _listen,
+        "speech.wav --audiogram N2 --audiogram N4 --out page.html",
+        "speech.wav noisy.wav --audiogram N3 --compensator hearing-aid --spl 65 --out page.html",
+    )
+    option = parser.option
+    option("files", input_path, "audio files of 16 to 48 kHz", nargs="+")
+    group = parser.add_mutually_exclusive_group(required=True)
+    text = "; repeat the option for several ears"
+    parser.audiogram(text=text, group=group, action="append")
+    parser.listener("both ears, for stereo files, left first", group=group)
+    text = "also play what each ear perceives with an aid: nalr, wdrc, or a name or folder"
+    option("--compensator", str, text)
+    parser.sliders()
+    text = "msbg (exact), or a checkpoint's name or folder"
+    option("--simulator", str, text, "msbg")
+    parser.levels("each file")
+    text = "duration in seconds from the beginning of each file that is played"
+    option("--seconds", positive_number, text, 8.0)
+    option("--out", Path, "HTML file to write, which a browser opens offline", required=True)
+
+
+def _listen(options: argparse.Namespace) -> None:
+    sliders = read_sliders(options)
+    if sliders and not options.compensator:
+        raise ValueError(
+            "--noise-reduction and --amplification have no effect without --compensator; add it, "
+            "or leave them out"
+        )
+    check_extras("eval")
+    from hlsim.files import write_atomically
+    from hlsim.report.page import Page
+    from hlsim.simulators import load_simulator
+
+    ears = read_named_ears(options)
+    for ear in ears.values() if options.compensator else ():
+        warn_of_other_ears({options.compensator: options.compensator}, ear)
+
+    @cache
+    def simulator(rate: int) -> Any:
+        return load_simulator(
+            options.simulator, sample_rate=rate, full_scale_spl=options.full_scale_spl
+        )
+
+    @cache
+    def aid(rate: int) -> Any:
+        return load_compensator(options, rate)
+
+    def perceive(waveform: Tensor, rate: int) -> dict[str, Tensor]:
+        sounds = {"original": waveform}
+        for name, ear in ears.items():
+            sounds[f"{name} unaided" if options.compensator else name] = simulator(rate)(
+                waveform, ear
+            )
+            if options.compensator:
+                output = aid(rate)(waveform, ear, **sliders)
+                sounds[f"{name} with {options.compensator}"] = simulator(rate)(output, ear)
+        return sounds
+
+    sections = []
+    with ProgressLine("files") as progress:
+        for number, file in enumerate(options.files):
+            progress(number, len(options.files))
+            sections.append(_make_section(options, file, perceive))
+    thresholds = [
+        f"{name}: {', '.join(f'{level:g}' for level in ear.thresholds)} dB HL."
+        for name, ear in ears.items()
+        if hasattr(ear, "thresholds")
+    ]
+    title = "What is perceived by " + ", ".join(ears)
+    text = (
+        "All sounds of a file have one gain, so that what is soft for an ear is soft here. "
+        "Switch between them while one plays: the position stays the same. "
+    )
+    page = Page(title, text + " ".join(thresholds), sections)
+    write_atomically(options.out, page.html())
+    print(f"The page: {options.out.resolve().as_uri()}")
+
+
+def _make_section(options: argparse.Namespace, file: Path, perceive: Any) -> Section:
+    """Return the section of a file, with its player.
+
+    Args:
+        options: Options of the command.
+        file: Audio file.
+        perceive: Function from samples at the scale of the file and their rate in Hz to the sounds
+            by their labels.
+    """
+    import torch
+
+    from hlsim.audio import read_parts, scan_audio
+    from hlsim.calibration import gain_to_pascals
+    from hlsim.report.page import Section
+    from hlsim.report.players import make_player
+
+    recording = scan_audio(file)
+    rate = recording.sample_rate
+    level = 10.0 * math.log10(recording.power) + options.full_scale_spl
+    target_level = level if options.spl is None else options.spl
+    stop = min(recording.samples, round(options.seconds * rate))
+    (waveform,) = read_parts(recording, [(0, stop)])
+    with torch.no_grad():
+        sounds = perceive(waveform * 10.0 ** ((target_level - level) / 20.0), rate)
+    gain = gain_to_pascals(options.full_scale_spl)
+    player = make_player({"": {label: gain * sound for label, sound in sounds.items()}}, rate)
+    text = f"{file}, {target_level:.0f} dB SPL, {stop / rate:.1f} s"
+    if stop < recording.samples:
+        text += f" of {recording.samples / rate:.1f} s"
+    return Section(file.name, [f"{text}."], player=player)
