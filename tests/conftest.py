@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from tests.pyclarity import PyclarityOutputs, write_outputs
+from tests.sign_of_life import SignOfLife
 
 SPEECH_DIR = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
 
@@ -37,6 +38,9 @@ def pytest_configure(config: pytest.Config) -> None:
     torch.set_num_threads(1)
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     config.stash[NEW_OUTPUTS] = {}
+    distributes_tests = bool(config.getoption("numprocesses", None))
+    if distributes_tests and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SignOfLife(config))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
