@@ -109,6 +109,8 @@ def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
 
     names = ("noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms", "workers")
     sources = {name: getattr(options, name) for name in names}
+    if options.root and not options.manifest:
+        raise ValueError("--root has no effect without --manifest; leave it out")
     if options.manifest:
         data = TrainingData.from_manifest(options.manifest, options.root, **sources)
     else:

@@ -85,8 +85,8 @@ def prepare(
         Name of the layout, a table of the splits, and the number of files that are left out.
 
     Raises:
-        ValueError: The layout is unknown or contradictory, the share is not from 0 to below 1, or
-            the manifest cannot be written.
+        ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
+            file, the share is not from 0 to below 1, or the manifest cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -104,8 +104,13 @@ def prepare(
         layout, utterances = find_corpus(source, folders)
         listed_files = {file for row in utterances for file in (row.path, row.noisy)}
         noise_files = [file for file in _relative_files(source) if file not in listed_files]
-    else:
+    elif folders is None:
         layout, utterances = "CSV file", read_manifest(source)
+    else:
+        raise ValueError(
+            f"{source}: expected a folder, because levels of folders are named; leave them out "
+            "(--folders), or pass the folder"
+        )
     if valid_share:
         utterances = hold_out_speakers(utterances, valid_share)
     write_manifest(out, utterances)

@@ -48,8 +48,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
 
     Args:
         path: CSV file with a column ``path`` and optional columns ``noisy`` (path of the noisy
-            version), ``speaker`` and ``split``. Without the column ``split``, all utterances are in
-            the split ``train``.
+            version), ``speaker`` and ``split``, in upper or lower case. Without the column
+            ``split``, all utterances are in the split ``train``.
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
@@ -66,7 +66,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     folder = Path(path).parent if root is None else Path(root)
     utterances = []
     for line, row in read_table(path, "the manifest"):
-        values = {name: row[name] for name in COLUMNS if name in row}
+        values = {name.lower(): text for name, text in row.items() if name.lower() in COLUMNS}
         if not values.get("path") or values.get("split", "train") not in SPLITS:
             raise ValueError(
                 f"{path}, line {line}: expected a file in the column 'path', and train, valid or "

@@ -55,7 +55,7 @@ class CompensatorTraining(TrainingModule):
         self.loss = HearingLossLoss(simulator=simulator, criterion=weights or "coherent-bands")
         if not self.trains_amplification:
             network.correct.requires_grad_(False)
-        elif isinstance(network, HearingAid) and not (self.denoising or self.intelligibility):
+        elif isinstance(network, HearingAid) and not recipe.trains_noise_reduction():
             network.noise_reduction_network.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:
@@ -69,7 +69,7 @@ class CompensatorTraining(TrainingModule):
             loss = loss + self.intelligibility * missing.mean()
         if not self.trains_amplification:
             return loss
-        if not isinstance(self.network, HearingAid):
+        if "noise_reduction" not in batch:
             return loss + self.loss(self.network(signal, ears), clean, ears)
         slider = batch["noise_reduction"]
         # An ear without noise reduction should perceive the noisy speech.

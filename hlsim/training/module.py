@@ -100,6 +100,11 @@ class TrainingModule(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         self.validation = self.summarise(torch.cat(self._measured_values))
+        if math.isnan(self.validation["score"]):  # which would count as the best score
+            raise ValueError(
+                f"the validation score is NaN at step {self.global_step}; lower learning_rate in "
+                "the recipe"
+            )
         self.log_dict(self.validation, prog_bar=True, batch_size=1, sync_dist=True)
         if self.trainer.progress_bar_callback is None:  # a progress bar shows the measures
             texts = [f"{name} {value:.3f}" for name, value in self.validation.items()]

@@ -108,6 +108,7 @@ compensate {speech} {out} --listener {ears}:b | expected two ears
 compensate {speech} {out} --listener {ears}:a | (..., 2, time) for two ears
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
+train-simulator --speech {folder} --root {folder} --out o | no effect without --manifest
 evaluate-compensator nalr a=nalr a=wdrc --speech {folder} --out {out} | LABEL=NAME"""
 
 

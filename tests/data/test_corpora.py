@@ -159,6 +159,8 @@ def test_prepare_writes_what_training_reads(tmp_path: Path) -> None:
     (corpus / "own.csv").write_text((tmp_path / "m.csv").read_text().replace("path,", "path, "))
     prepare(corpus / "own.csv", corpus / "manifest.csv")
     assert read_manifest(corpus / "manifest.csv") == rows
+    with pytest.raises(ValueError, match="levels of folders are named"):
+        prepare(corpus / "own.csv", corpus / "manifest.csv", folders=["speaker"])
     with pytest.raises(ValueError, match=r"ends in \.csv"):
         prepare(corpus / "own.csv", corpus / "clean_testset_wav_16k")
 
@@ -182,8 +184,8 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert read_manifest(tmp_path / "a" / "m.csv", tmp_path) == UTTERANCES
     with pytest.raises(ValueError, match="--root"):
         read_manifest(tmp_path / "a" / "m.csv")
-    (tmp_path / "m.csv").write_text("seconds,path\n2.5,a/1.wav\n")
-    assert read_manifest(tmp_path / "m.csv") == [Utterance("a/1.wav")]
+    (tmp_path / "m.csv").write_text("seconds,Path,SPLIT\n2.5,a/1.wav,test\n")
+    assert read_manifest(tmp_path / "m.csv") == [Utterance("a/1.wav", split="test")]
     with pytest.raises(ValueError, match="no manifest; choose another name"):
         write_manifest(tmp_path / "m.csv", UTTERANCES)
 

@@ -251,6 +251,13 @@ def test_an_unusable_device_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_validation_without_a_score_ends_the_training(tmp_path: Path) -> None:
+    scores = {0: 1.0, 2: 2.0, 4: math.nan}
+    with pytest.raises(ValueError, match="validation score is NaN at step 4"):
+        run(VectorTraining(scores=scores), tmp_path)
+    assert saved_step(tmp_path) == 2
+
+
 @pytest.mark.parametrize("factor", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_ends_the_training(tmp_path: Path, factor: float) -> None:
     with pytest.raises(ValueError, match="step 3"):
