@@ -17,9 +17,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audiogram.prescription import nalr_gains_db
-from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths, check_number
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics.ear import alignment, fine_structure
@@ -28,7 +25,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS, HairCells
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.pair import Equalisation, Noise
+from hlsim.metrics.pair import Noise
 from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import Audio, Samples, as_type_of, constant
 
@@ -122,30 +119,6 @@ class QualityReference(Reference):
 
     split_by_rate: ClassVar[Any] = None
     """Function that divides fluctuations of envelopes into bands of modulation."""
-
-    def __init__(
-        self,
-        clean: Samples,
-        audiogram: AudiogramLike,
-        *,
-        sample_rate: int = 16000,
-        full_scale_spl: float = PASCAL_SPL,
-        lengths: Lengths | None = None,
-        whole_khz: bool = False,
-        equalisation: Equalisation = 1,
-        keep: bool = True,
-    ) -> None:
-        check_number("equalisation", equalisation, 1, 2, whole=True)
-        self._is_amplified = equalisation == 2
-        super().__init__(
-            clean,
-            audiogram,
-            sample_rate=sample_rate,
-            full_scale_spl=full_scale_spl,
-            lengths=lengths,
-            whole_khz=whole_khz,
-            keep=keep,
-        )
 
     def score(self, output: Audio, *, noise: Noise = "expected", seed: int = 0) -> Audio:
         """Return the score of each output of an aid.

@@ -29,7 +29,7 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
-from hlsim.metrics.pair import SHORTEST_SECONDS, Noise, check_finite, check_pair
+from hlsim.metrics.pair import SHORTEST_SECONDS, Equalisation, Noise, check_finite, check_pair
 from hlsim.torchtools import Samples, as_samples, broadcast_shape, on_host
 
 Argument = TypeVar("Argument")
@@ -67,6 +67,8 @@ class Reference(ABC):
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
+        equalisation: Mode of pyclarity for HASQI and HAAQI: 1 amplifies the clean signals by NAL-R,
+            2 takes signals that are amplified already.
         keep: Store the clean signals' features; otherwise they are computed for each score, which
             takes less memory.
 
@@ -90,8 +92,11 @@ class Reference(ABC):
         full_scale_spl: float = PASCAL_SPL,
         lengths: Lengths | None = None,
         whole_khz: bool = False,
+        equalisation: Equalisation = 1,
         keep: bool = True,
     ) -> None:
+        check_number("equalisation", equalisation, 1, 2, whole=True)
+        self._is_amplified = equalisation == 2
         rate = check_rate(sample_rate)
         self._rate = 1000 * round(rate / 1000) if whole_khz else rate
         self._full_scale_spl = check_full_scale(full_scale_spl)

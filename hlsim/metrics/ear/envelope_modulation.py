@@ -211,6 +211,7 @@ def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Co
     waves = extent.centred(clean), extent.centred(output)
     a, b = (torch.fft.rfft(wave, points) for wave in waves)
     responses = _responses(points, like=clean)
+    # On a CPU, one filter at a time fits into the caches; a GPU needs large tensors.
     filters_at_once = 1 if clean.device.type == "cpu" else len(responses)
     sums = []
     for part in responses.split(filters_at_once):

@@ -95,6 +95,8 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
     counts = segments_of(extent, segment)
     half = segment // 2
     window = _half_windows(segment, like=levels)
+    # Each half belongs to two segments, the end of one and the start of the next. Both weighted
+    # sums come from one product, so that no sample is copied.
     halves = levels[..., : counts.longest * half].unflatten(-1, (counts.longest, half))
     rising, falling = (halves @ window).unbind(-1)
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
@@ -140,6 +142,8 @@ def envelope_correlation(
     is_audible = _audible_segments(clean, counts)
     audible = tuple(is_audible.sum(-1).tolist())
     extent = Extent(tuple(max(1, count) for count in audible))
+    # Audible segments are moved to the front, in their order, because silence between them does not
+    # count; the rest of a shorter item is cut by ``extent``.
     order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
     basis = _cosines(like=clean)
     waves = []

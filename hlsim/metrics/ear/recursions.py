@@ -85,6 +85,7 @@ class Recursion(NamedTuple):
             Output in blocks. Shape: (..., time / 64, outputs).
         """
         blocks = signal.unflatten(-1, (-1, BLOCK))
+        # Three matrix products for all blocks at once replace a loop over samples.
         states = _accumulate(blocks @ self.inward, self.step, self.memory // BLOCK)
         before = functional.pad(states[..., :-1, :], (0, 0, 1, 0))
         # These are the largest tensors of a score, therefore the addition is in place.
@@ -109,6 +110,7 @@ def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
     Returns:
         States. Shape: (..., blocks, states).
     """
+    # A loop over blocks would need hundreds of small products; doubling needs a few large ones.
     states, reach = inputs, 1
     while reach < min(inputs.shape[-2], memory + 1):
         later = states[..., reach:, :] + states[..., :-reach, :] @ step
@@ -134,11 +136,15 @@ def _recursion(
     With the input u, the output is y = c x + d u, and the next state is a x + b u. The state is
     balanced, so that single precision suffices.
     """
+    # Balancing makes all states equally large. Otherwise a large and a small state of a slow
+    # filter, such as adaptation, would cancel in single precision.
     root = scipy.linalg.cholesky(scipy.linalg.solve_discrete_lyapunov(a, b @ b.T), lower=True)
     observability = scipy.linalg.solve_discrete_lyapunov(a.T, c.T @ c)
     rotation, singular_values, _ = np.linalg.svd(root.T @ observability @ root)
     basis = root @ rotation / singular_values**0.25
     a, b, c = np.linalg.solve(basis, a @ basis), np.linalg.solve(basis, b), c @ basis
+    # Sample i of a block reaches sample j of the output by the impulse response at j - i, and the
+    # state after the block by a^(63 - i) b.
     powers = [np.eye(len(a))]
     for _ in range(BLOCK):
         powers.append(powers[-1] @ a)
