@@ -124,7 +124,10 @@ def evaluate_compensators(
     ears = read_ears(audiograms)
     if audiogram is not None:
         if audiograms is not None:
-            raise ValueError("expected one ear or a file of ears, got both; leave out one of them")
+            raise ValueError(
+                "audiogram and audiograms (--audiogram, --audiograms) exclude each other; pass one "
+                "of them"
+            )
         ears_of_aids = {ear_name(audiogram): audiogram}
         ears = list(ears_of_aids.items())
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)

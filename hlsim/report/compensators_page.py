@@ -94,7 +94,10 @@ _WEARING = (
 
 
 def compensators_page(evaluation: Evaluation) -> Page:
-    """Return the page about compensators: verdicts, scores, sounds, gains, details.
+    """Return the page about compensators.
+
+    Its sections are scores, sounds, gains, "Could it be worn?" and details. The players have items
+    of the first group, which is clean speech if there is any.
 
     Args:
         evaluation: Evaluation of ``evaluate_compensators``.
