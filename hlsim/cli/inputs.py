@@ -6,6 +6,7 @@ Functions import what needs torch only when they are called.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,14 @@ PACKAGES = {
     "eval": ("joblib", "pandas", "matplotlib", "jinja2", "pystoi"),
 }
 """Packages that the commands need from each extra."""
+
+
+def use_one_thread() -> None:
+    """Let a command that has not imported torch run it in one thread, unless a user chose a number.
+
+    On a busy machine, threads wait for each other for longer than their short computations last.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def check_extras(*extras: str) -> None:

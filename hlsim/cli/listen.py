@@ -13,6 +13,7 @@ from hlsim.cli.inputs import (
     load_compensator,
     read_named_ears,
     read_sliders,
+    use_one_thread,
     warn_of_other_ears,
 )
 from hlsim.cli.options import Parser, input_path, positive_number
@@ -55,6 +56,7 @@ def _listen(options: argparse.Namespace) -> None:
             "--noise-reduction and --amplification have no effect without --compensator; add it, "
             "or leave them out"
         )
+    use_one_thread()
     check_extras("eval")
     from hlsim.files import write_atomically
     from hlsim.report.page import Page

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +11,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hlsim.cli.inputs import load_compensator, read_named_ears, read_sliders, warn_of_other_ears
+from hlsim.cli.inputs import (
+    load_compensator,
+    read_named_ears,
+    read_sliders,
+    use_one_thread,
+    warn_of_other_ears,
+)
 from hlsim.cli.options import ALL_EARS, SIMULATED_EARS, Parser, input_path
 from hlsim.progress import ProgressLine
 
@@ -91,10 +96,12 @@ def _simulate(options: argparse.Namespace) -> None:
             options.simulator, sample_rate=rate, full_scale_spl=options.full_scale_spl
         )
 
+    use_one_thread()
     _process(options, read_named_ears(options), build, {})
 
 
 def _compensate(options: argparse.Namespace) -> None:
+    use_one_thread()
     ears = read_named_ears(options)
     for ear in ears.values():
         warn_of_other_ears({options.compensator: options.compensator}, ear)
@@ -115,9 +122,6 @@ def _process(
         build: Function from a sample rate in Hz to a simulator or compensator.
         sliders: Further arguments of the simulator or compensator, each under its name.
     """
-    # Threads of OpenMP spin while they wait. On a busy machine that triples the time of the many
-    # short computations here.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hlsim.checks import LOWEST_RATE
 
     tasks = _plan_outputs(options.input, options.output, [*ears])

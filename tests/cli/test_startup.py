@@ -78,3 +78,29 @@ def test_nothing_heavy_is_imported_without_need(tmp_path: Path, script: str) -> 
     ended = subprocess.run(command, capture_output=True, text=True, cwd=root)
     assert ended.returncode == 0, ended.stderr[-2000:]
     assert not paths["out"].exists()
+
+
+ONE_THREAD = """
+import sys
+from hlsim.cli.main import main
+from hlsim.data.bundled import EXAMPLE_FILE
+options = ["--audiogram", "N3", "--compensator", "nalr"]
+assert "torch" not in sys.modules
+assert main(["compensate", str(EXAMPLE_FILE), sys.argv[1], *options]) == 0
+import torch
+print(torch.get_num_threads())
+"""
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, "1"), ("2", "2")])
+def test_a_command_runs_in_one_thread_unless_a_user_chooses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chosen: str | None, expected: str
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if chosen:
+        monkeypatch.setenv("OMP_NUM_THREADS", chosen)
+    call = [sys.executable, "-c", ONE_THREAD, str(tmp_path / "out.wav")]
+    root = Path(hlsim.__file__).parents[1]
+    ended = subprocess.run(call, capture_output=True, text=True, cwd=root)
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert ended.stdout.split()[-1] == expected
