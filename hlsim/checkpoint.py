@@ -29,6 +29,9 @@ Settings = Mapping[str, Any]
 WEIGHTS = "model.safetensors"
 OLDER_WEIGHTS = "model.older.safetensors"
 CONFIG = "config.json"
+
+_WITHOUT_CHECKPOINT = ("msbg", "attenuation", "nalr", "wdrc")
+"""Names of simulators and aids that have no checkpoint."""
 CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
@@ -167,10 +170,10 @@ def _find_folder(name: str | Path) -> Path:
     for folder in (path, checkpoints_folder() / path, path / "checkpoint"):
         if (folder / CONFIG).is_file():
             return folder
-    suggestion = suggest(str(name), [*list_pretrained(), "msbg", "nalr", "wdrc"])
+    suggestion = suggest(str(name), [*list_pretrained(), *_WITHOUT_CHECKPOINT])
     raise ValueError(
         f"no checkpoint {str(name)!r}{suggestion}; expected {', '.join(list_pretrained())}, or a "
-        f"folder with {CONFIG}; models without a checkpoint are msbg, nalr and wdrc"
+        f"folder with {CONFIG}; models without a checkpoint are {', '.join(_WITHOUT_CHECKPOINT)}"
     )
 
 

@@ -81,3 +81,11 @@ def test_rooms_and_files_form_no_circle() -> None:
 def test_folder_holds_at_most_16_files(room: Path) -> None:
     files = [path for path in room.iterdir() if path.is_file() and path.name != "py.typed"]
     assert len(files) <= MOST_FILES
+
+
+def test_contributing_draws_these_floors() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    picture = text.split("```text\n")[1].split("```")[0].splitlines()
+    assert len(picture) == len(FLOORS)
+    for line, rooms in zip(picture, FLOORS, strict=True):
+        assert set(rooms.split()) - {"__main__"} <= set(line.split())

@@ -1,4 +1,4 @@
-"""Thresholds as tensors, at eight frequencies: converted, validated, stored and interpolated."""
+"""Thresholds as tensors, at eight frequencies: converted, validated and stored."""
 
 from __future__ import annotations
 

@@ -257,6 +257,7 @@ def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor,
     """Return speech in noise at an SNR in dB, and this SNR, which is NaN without noise."""
     if noise is None:
         return clean, math.nan
+    # By RMS level. Trainings mix by active speech level, at which the same number is less noise.
     return mix(clean, noise, snr, sample_rate=None), snr
 
 

@@ -296,7 +296,7 @@ def _files_by_name(folder: str | Path) -> dict[str, Path]:
     return files
 
 
-def read_manifest(
+def read_recordings(
     manifest: str | Path | DataFrame,
     root: str | Path | None = None,
     audiogram: Audiogram | None = None,
@@ -322,7 +322,7 @@ def read_manifest(
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "m.csv"
     ...     _ = path.write_text("condition,clean,processed,audiogram\\nmine,c/1.wav,p/1.wav,N3\\n")
-    ...     [recording.name for recording in read_manifest(path)]
+    ...     [recording.name for recording in read_recordings(path)]
     ['c/1']
     """
     is_file = isinstance(manifest, (str, Path))

@@ -17,8 +17,8 @@ from hlsim.evaluation.recorded_items import (
     Recording,
     join_name,
     read_folders,
-    read_manifest,
     read_named_ears,
+    read_recordings,
 )
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.sounds import perceive_items
@@ -110,7 +110,7 @@ def haspi_report(
     folders_of_outputs = {name: folder for name, folder in folders.items() if folder is not None}
     if manifest is not None:
         _check_manifest_is_alone(clean, folders_of_outputs)
-        recordings = read_manifest(manifest, root, audiogram, audiograms, **settings)
+        recordings = read_recordings(manifest, root, audiogram, audiograms, **settings)
     else:
         _check_folders(clean, before, after, conditions, root)
         assert clean is not None

@@ -2,7 +2,7 @@
 
 An item is speech for an ear, a condition processes it (no aid, a hearing aid, a simulator), and a
 measure scores the output. ``haspi-report``, ``evaluate-compensator``, ``evaluate-simulator``,
-``clarity`` and the demo are studies that differ in these three and in nothing else.
+``clarity`` and the demo are such studies.
 """
 
 from __future__ import annotations

@@ -105,17 +105,20 @@ class HearingLossLoss(nn.Module):
         full_scale_spl: Level in dB SPL of RMS 1.0.
         reference: Signal with which ``"paper"``, a function and ``heard`` compare: ``"clean"``, the
             clean speech (the default for ``"paper"``), or ``"normal-hearing"``, the output of a
-            normal ear for it (the default otherwise). The other criteria always compare with a
-            normal ear. The reference gets the phase of MSBG's filter bank for the severity of the
-            ear (``hlsim.msbg.response``), unless ``normal`` is passed or the simulator does not
-            emulate MSBG. Without this phase, speech of the opposite sign could have a lower loss.
+            normal ear for it (the default otherwise). ``"coherent-bands"`` and ``"bands"`` always
+            compare with a normal ear, and scores and ``"interaural"`` with clean speech as it is.
+            Except for ``"bands"``, which has no phase, the reference gets the phase of MSBG's
+            filter bank for the severity of the ear (``hlsim.msbg.response``), unless ``normal`` is
+            passed or the simulator does not emulate MSBG. Without this phase, speech of the
+            opposite sign could have a lower loss.
         criterion: Criterion, as listed above.
         weights: Weight under the name of each part of ``parts``; other parts are ignored.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"`` for one value
             per item.
         normal: Normal ear that belongs to the simulator: a module, which is frozen too, or a
-            function, (..., time) -> (..., time). By default, it is MSBG at 0 dB HL for a simulator
-            that emulates MSBG, and the simulator itself at 0 dB HL otherwise. Changes that the
+            function, (..., time) -> (..., time). By default, it is the filter of MSBG's normal ear
+            for a simulator that emulates MSBG, and the simulator itself at 0 dB HL otherwise, and
+            for ``"bands"``. Changes that the
             simulator makes for every ear, such as a low-pass, then apply to the reference, too. A
             network that emulates another teacher needs the normal ear of that teacher.
         ears: Reduction of two ears, (..., 2, time): ``"mean"``, or ``"better"`` for a smooth choice

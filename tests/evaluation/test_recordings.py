@@ -13,7 +13,7 @@ from torch import Tensor
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
-from hlsim.evaluation.recorded_items import read_manifest
+from hlsim.evaluation.recorded_items import read_recordings
 from hlsim.files import sha256
 from hlsim.metrics import haspi
 from hlsim.shortcuts import example_speech
@@ -180,7 +180,7 @@ def test_the_line_of_an_invalid_row_is_named(
     corpus: Path, old: str, new: str, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
+        read_recordings(write_manifest(corpus, MANIFEST.replace(old, new)))
 
 
 def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> None:
@@ -188,10 +188,10 @@ def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> N
     unused = LEVELS.replace("80", "NR")  # Only ears that are used are validated.
     manifest = write_manifest(corpus, MANIFEST.replace(",audiogram\n", ",remark\n"))
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,R,{LEVELS}\nL3,left,{unused}\n")
-    assert {r.audiogram for r in read_manifest(manifest, audiograms=ears)} == {N4}
+    assert {r.audiogram for r in read_recordings(manifest, audiograms=ears)} == {N4}
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,left,{LEVELS}\n")
     with pytest.raises(ValueError, match="line 4: there is no audiogram of listener 'L2'"):
-        read_manifest(manifest, audiograms=ears)
+        read_recordings(manifest, audiograms=ears)
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_items_are_not_identified_by_joined_or_rounded_texts(tmp_path: Path) -> 
     path = tmp_path / "study.csv"
     lines = [f"{a},{item},{snr},aid,c.wav,p.wav,N3" for a, item, snr in rows]
     path.write_text("listener,item,snr,condition,clean,processed,audiogram\n" + "\n".join(lines))
-    assert len(read_manifest(path)) == 4
+    assert len(read_recordings(path)) == 4
 
 
 @pytest.mark.parametrize(
@@ -330,7 +330,7 @@ def test_items_are_not_identified_by_joined_or_rounded_texts(tmp_path: Path) -> 
 def test_texts_of_an_snr(tmp_path: Path, text: str, snr: float) -> None:
     path = tmp_path / "study.csv"
     path.write_text(f"condition;clean;processed;snr;audiogram\naid;c.wav;p.wav;{text};N3\n")
-    (recording,) = read_manifest(path)
+    (recording,) = read_recordings(path)
     assert recording.snr == pytest.approx(snr, nan_ok=True)
 
 
@@ -359,7 +359,7 @@ def test_both_channels_of_a_file_have_one_gain(tmp_path: Path) -> None:
 def test_thresholds_of_a_manifest_have_the_names_of_a_table_of_ears(tmp_path: Path) -> None:
     path = tmp_path / "study.csv"
     path.write_text("Condition,CLEAN,Processed,500 Hz,4k\naid,c.wav,p.wav,60,80\n")
-    (recording,) = read_manifest(path, audiogram=N4)
+    (recording,) = read_recordings(path, audiogram=N4)
     assert recording.audiogram == Audiogram([60, 80], [500, 4000])
 
 
@@ -402,15 +402,15 @@ def test_a_frame_of_pandas_is_a_manifest(corpus: Path) -> None:
     path = write_manifest(corpus, MANIFEST)
     frame = pandas.read_csv(path)
     frame["snr"] = [5.0, 5.0, math.nan, math.nan, math.nan]
-    recordings = read_manifest(frame, corpus)
+    recordings = read_recordings(frame, corpus)
     assert [r.snr for r in recordings] == pytest.approx([5.0, math.nan], nan_ok=True)
     assert [list(r.outputs) for r in recordings] == [
         ["unaided", "aided"],
         ["unaided", "aided", "loud"],
     ]
     frame["listener"] = None
-    assert {r.listener for r in read_manifest(frame, corpus)} == {""}
+    assert {r.listener for r in read_recordings(frame, corpus)} == {""}
     with pytest.raises(ValueError, match="the manifest: expected a table with rows"):
-        read_manifest(frame[:0])
+        read_recordings(frame[:0])
     with pytest.raises(ValueError, match="the manifest, row 1: expected a value"):
-        read_manifest(frame.assign(condition=["a", "", "b", "c", "d"]), corpus)
+        read_recordings(frame.assign(condition=["a", "", "b", "c", "d"]), corpus)

@@ -44,14 +44,14 @@ def code_version() -> str:
 
 @cache
 def _hash_sources(*folders: Path) -> str:
-    """Compute the SHA-256 of all source files in which scores may be computed.
+    """Compute the SHA-256 of all source files and tables by which scores may be computed.
 
     Args:
         folders: Folders of the packages.
     """
     digest = hashlib.sha256()
     for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
+        for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.json")]):
             place = path.relative_to(folder)
             if place.parts[0] not in _ROOMS_WITHOUT_SCORES:
                 digest.update(f"{folder.name}/{place.as_posix()}\n".encode())
