@@ -80,6 +80,9 @@ class Recording:
         channels: Number of channels.
         samples: Number of samples per channel.
         power: Mean square of all samples of all channels, where 1.0 is full scale.
+
+    >>> Recording(Path("noise.wav"), sample_rate=16000, channels=2, samples=320, power=0.01).samples
+    320
     """
 
     path: Path
