@@ -326,7 +326,8 @@ class Wearable(Aid):
                 check_number(name, slider, 0.0, 1.0)
                 slider = like.new_full((), slider)
             in_range = (slider >= 0.0) & (slider <= 1.0)
-            if slider.device.type == "cpu" and not bool(in_range.all()):
+            is_known = slider.device.type == "cpu" and not torch.compiler.is_compiling()
+            if is_known and not bool(in_range.all()):
                 raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
             values[:, column] = torch.where(in_range, slider, torch.nan).expand(batch).flatten()
         return values

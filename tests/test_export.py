@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from compensators import load_compensator
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.export import (
     export_aid,
@@ -144,3 +145,16 @@ BAD_CALLS: list[Callable[[], object]] = [
 def test_what_cannot_be_exported_is_a_value_error(call: Callable[[], object]) -> None:
     with pytest.raises(ValueError):
         call()
+
+
+@pytest.mark.parametrize("name", ["neuro-msbg-light", "compensator-general", "hearing-aid"])
+def test_torch_exports_a_network_by_itself(name: str) -> None:
+    """Levels that are out of range give NaN, because a program cannot raise an error."""
+    model: Any = load_pretrained(name) if "msbg" in name else load_compensator(name)
+    signal = 0.02 * torch.randn(2, 1600)
+    call = torch.export.export(model, (signal, EARS)).module()
+    assert_close(call(signal, EARS), model(signal, EARS), 1e-4)
+    too_high = EARS.clone()
+    too_high[1, 3] = 130.0
+    output = call(signal, too_high)
+    assert bool(output[0].isfinite().all()) and bool(output[1].isnan().all())

@@ -34,8 +34,9 @@ def as_thresholds(
     the ``FREQUENCIES``. An ``Audiogram`` with other frequencies is interpolated over log frequency
     (``Audiogram.thresholds``).
 
-    A tensor on a GPU is not validated, because the CPU would have to wait for its values: instead,
-    an ear with a level out of range becomes NaN, and so do the outputs that are computed with it.
+    A tensor on a GPU is not validated, because the CPU would have to wait for its values, and no
+    tensor is in a compiled or exported program: instead, an ear with a level out of range becomes
+    NaN, and so do the outputs that are computed with it.
 
     Args:
         audiogram: One or more ears: an ``Audiogram``, a name such as ``"N3"``, a ``Listener``, a
@@ -244,7 +245,7 @@ def _check_tensor(levels: Any, highest: float) -> Tensor:
     if not levels.is_floating_point():
         levels = levels.float()
     known = known_on_host(levels)
-    if known is None:
+    if known is None or torch.compiler.is_compiling():
         in_range = (levels >= LOWEST_LEVEL) & (levels <= highest)
         return torch.where(in_range.all(-1, keepdim=True), levels, math.nan)
     in_range = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
