@@ -191,7 +191,8 @@ def load_simulator(
         simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name of a
             checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or the folder of a
             checkpoint; ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
-            (``PluginSimulator``); or a module, which is validated and returned.
+            (``PluginSimulator``); or a module, which is returned. Those of its attributes
+            ``sample_rate``, ``full_scale_spl`` and ``aligned`` that exist are validated.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 

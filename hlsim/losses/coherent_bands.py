@@ -167,11 +167,13 @@ def _average_segments(frames: Tensor) -> Tensor:
 
 
 def _audibility(powers: Tensor, threshold: Tensor) -> Tensor:
+    """Compute weights from 0 to 1, which carry no gradient, from powers in Pa^2."""
     powers = powers.detach()
     return powers / (powers + threshold)
 
 
 def _decibels(powers: Tensor) -> Tensor:
+    """Convert powers in Pa^2 to levels in dB re 1 Pa, at least -220."""
     return 10.0 * torch.log10(powers + _POWER_FLOOR)
 
 

@@ -77,7 +77,7 @@ class _GradientLimiter(torch.autograd.Function):
         powers = _split(waveform, ctx.block).square().mean(-1)
         sizes = _split(gradient.abs(), ctx.block)
         sounding = powers >= SOUNDING * powers.amax(-1, keepdim=True)
-        # Samples behind the end of an item have no gradient, and are left out.
+        # Samples after the end of an item have no gradient, and do not count.
         counted = sounding.unsqueeze(-1) & (sizes > 0.0)
         candidates = torch.where(counted, sizes, math.nan).flatten(-2)
         usual = _usual_sizes(candidates, time, ctx.lengths).nan_to_num(nan=math.inf)

@@ -136,6 +136,7 @@ class _FadedPhaseDifference(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         estimate, target = ctx.saved_tensors
+        # The difference is that of the target minus that of the estimate, hence the sign.
         return (
             _times_i(estimate, -gradient * _fade_weight(estimate, target)),
             _times_i(target, gradient * _fade_weight(target, estimate)),
@@ -159,5 +160,7 @@ def _times_i(spectrum: Tensor, factor: Tensor) -> Tensor:
 
 
 def _fade_weight(spectrum: Tensor, other: Tensor) -> Tensor:
+    """Compute the faded 1 / |z|^2 of a spectrum z, faded by the level of the other one, too."""
+    # 1 / |z|^2, times |z|^2 / (|z|^2 + faint), times the same factor of the other spectrum
     level = power(other)
     return level / ((level + FAINT_POWER) * (power(spectrum) + FAINT_POWER))

@@ -108,9 +108,12 @@ class BandCorrection(nn.Module):
 
 
 class _Block(nn.Module):
-    """Residual convolution along time in each channel, and residual layers across channels.
+    """A depthwise convolution over time and a two-layer network over features, each with a skip.
 
-    Shape: (items, channels, steps) -> (items, channels, steps).
+    Features are those of the network, not the channels of MSBG's filter bank. The convolution sees
+    as much of the future as of the past.
+
+    Shape: (items, features, steps) -> (items, features, steps).
     """
 
     def __init__(self, config: NeuroConfig) -> None:
@@ -131,6 +134,8 @@ class _Block(nn.Module):
 
 def _interpolate_steps(values: Tensor, step: int) -> Tensor:
     """Interpolate values at the first frame of each step linearly to all frames.
+
+    After the first frame of the last step, values are constant.
 
     Shape: (items, steps, ...) -> (items, steps * step, ...).
 

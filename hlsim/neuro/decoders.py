@@ -78,11 +78,11 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
 
 
 class _PhaseFactor(torch.autograd.Function):
-    """exp(a) z / |z| for z = 1 + x + j y, with a gradient that takes a third of torch's steps.
+    """exp(a) z / |z| for z = 1 + x + j y, with a hand-written backward pass.
 
-    Let f be the result, g the gradient with respect to f, and q = g conj(f). The gradient is Re q
-    with respect to a, -y Im q / |z|^2 with respect to x, and (1 + x) Im q / |z|^2 with respect to
-    y.
+    It needs a third of autograd's operations. Let f be the result, g the gradient with respect to
+    f, and q = g conj(f). The gradient is Re q with respect to a, -y Im q / |z|^2 with respect to x,
+    and (1 + x) Im q / |z|^2 with respect to y. Shape of a, x and y: (items, time, frequency).
     """
 
     @staticmethod
@@ -100,6 +100,7 @@ class _PhaseFactor(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, y, factor = ctx.saved_tensors
+        # Re q changes the magnitude, and Im q turns the angle, of which d/dx is -y / |z|^2.
         q = gradient * factor.conj()
         real = x + 1.0
         square = torch.addcmul(real.square(), y, y).clamp_min(EPS_SQUARE)

@@ -84,6 +84,9 @@ class Unit(nn.Sequential):
 class DenseBlock(nn.Module):
     """Convolutions with dilations 1, 2, 4, ... in time, each of which reads all earlier outputs.
 
+    Each has a kernel of 3 by 3 points and a PReLU. They are not causal: they see as much of the
+    future as of the past.
+
     Shape: (items, channels, time, frequency) -> (items, channels, time, frequency).
 
     Args:
