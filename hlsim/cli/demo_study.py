@@ -31,7 +31,7 @@ class DurationEstimate(Callback):
 
     first_step = 10  # the steps before are slower, because they reserve memory
     last_step = 60
-    scoring_steps = 900  # as long as scores and page take, with as many processes as cores
+    scoring_steps = 900  # take as long as validations, scores and page on two cores
 
     def on_train_batch_end(self, trainer: Any, module: Any, *arguments: Any) -> None:
         step = trainer.global_step
