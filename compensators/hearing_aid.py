@@ -224,7 +224,9 @@ class HearingAid(Wearable):
         return fade * gain, {"levels": memory}
 
     def _attenuation(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the gain of noise reduction in dB, 0 or less, and its state.
+        """Return the gain of noise reduction in dB, 0 or less, and its state after these frames.
+
+        ``levels`` are in dB SPL, as ``_levels`` returns them.
 
         Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands).
         """

@@ -187,6 +187,6 @@ def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
 
 @constant
 def _into_bands(count: int, fft: int) -> NDArray[np.float64]:
-    """Return weights from frequencies to bands, which are means, (frequencies, count)."""
+    """Return weights that average frequencies into bands. Shape: -> (fft // 2 + 1, count)."""
     weights = _out_of_bands(count, fft)
     return (weights / weights.sum(1, keepdims=True).clip(1e-6)).T

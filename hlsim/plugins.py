@@ -156,13 +156,18 @@ class WaveformPlugin:
             arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: The call fails, or the output is not time-aligned.
+            ValueError: The call fails, or the output is silent or not time-aligned.
         """
         output = self(waveform, *arguments)
         channels = [
             signal.reshape(-1, signal.shape[-1])[0].resolve_neg().numpy()
             for signal in (output, waveform)
         ]
+        if not channels[0].any():
+            raise ValueError(
+                f"{self.kind} {self.name} returned silence for sound, expected an output that is "
+                "time-aligned with the input"
+            )
         correlation = np.abs(correlate(*channels, method="fft"))
         delay = int(correlation.argmax()) - (waveform.shape[-1] - 1)
         if abs(delay) > MAX_DELAY_SECONDS * sample_rate:

@@ -104,15 +104,18 @@ def simulate(
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
         audiogram: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
-            mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
+            mapping of frequencies in Hz to thresholds, a ``Listener`` for ``(..., 2, time)``, or a
+            sequence with one ear per item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name or folder
             of a checkpoint such as ``"neuro-msbg"``; ``package.module:name``, a simulator of your
-            own; or a module.
-        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+            own; or a module that was built for this rate and level.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0, by default 94, so that samples
+            are in pascals.
 
     Returns:
-        The perceived signal, of the type and shape of ``audio``.
+        The perceived signal, of the type and shape of ``audio``. For several ears and one signal,
+        one output per ear.
 
     Raises:
         ValueError: The audio, the ear, the rate or the simulator is not valid.

@@ -217,13 +217,14 @@ class Audiogram:
 
         Args:
             row: Texts by column. Columns of thresholds have the names that ``threshold_columns``
-                describes.
+                describes; other columns are ignored. A text that is empty, ``NA``, ``null``,
+                ``None`` or ``nan`` was not measured.
             highest: Highest level allowed, in dB HL.
 
         Raises:
             ValueError: The row has no measured threshold, those of both ears, two of one frequency,
-                one that is not a number from -10 to ``highest``, or a column that is not
-                understood.
+                one that is not a number from -10 to ``highest``, or a column whose name looks like
+                thresholds but is not understood.
 
         >>> Audiogram.from_row({"hl_500": "20", "1k": "30"})
         Audiogram({500: 20, 1000: 30})
@@ -306,7 +307,7 @@ def find_audiogram(ear: Any) -> Audiogram | None:
 
 
 def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
-    """Convert a mapping of frequencies, in any order, to thresholds."""
+    """Convert a mapping from frequencies in Hz to thresholds in dB HL into an audiogram."""
     try:
         frequencies = sorted(levels, key=float)
     except (TypeError, ValueError):
@@ -337,7 +338,8 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     """Compute the degree of hearing loss of each ear: 0 none, 1 mild, 2 moderate, 3 severe.
 
     The mean threshold from 2 to 8 kHz decides, as in pyclarity: a loss is mild above 15 dB HL,
-    moderate above 35 dB HL and severe above 56 dB HL.
+    moderate above 35 dB HL and severe above 56 dB HL. It is 0 if there is no frequency from 2 to
+    8 kHz.
 
     Shape: (..., frequencies) -> int64 (...), indices into ``SEVERITIES``.
 

@@ -143,10 +143,13 @@ def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
     """Divide a recording into overlapping blocks that a model can process one by one.
 
     Args:
-        model: Simulator or aid whose output depends on a limited part of its input; for any other,
-            the recording is one block.
+        model: ``MSBG``, ``Attenuation``, ``NALR`` or a network of ``cnn`` blocks; for any other, the
+            recording is one block.
         samples: Length of the recording.
         rate: Sample rate in Hz.
+
+    Returns:
+        Blocks with bounds in samples, each with about 8 s of output (4 s for MSBG above 22.05 kHz).
 
     >>> [block.output_start for block in divide_recording(NALR(), 320000, 16000)]
     [0, 128000]

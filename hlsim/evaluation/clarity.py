@@ -117,8 +117,10 @@ def evaluate_scenes(
         scenes_listeners: JSON file with the names of the listeners of each scene; by default all
             scenes and listeners are combined.
         stride: Use every n-th pair of scene and listener. 15 gives the challenges' small test.
-        enhancers: ``package.module:name`` of functions that reduce noise before each aid.
-        measures: Measures in addition to HASPI and HASQI.
+        enhancers: ``package.module:name`` of functions ``(waveform, sample_rate) -> waveform`` that
+            reduce noise, for signals in pascals with shape (..., time). Each adds a condition
+            before NAL-R and before each aid.
+        measures: Further measures: names of hlsim's own, or ``package.module:name`` of yours.
         linked: Whether one level sets the gains of both ears, in compensators that support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI and HASQI add.
@@ -133,8 +135,9 @@ def evaluate_scenes(
         the measured look-ahead by condition, and None for an aid that fails on the first pair.
 
     Raises:
-        ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, or
-            nothing could be scored.
+        ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, an
+            aid, enhancer or measure does not exist, two conditions have one name, or nothing could
+            be scored.
         MissingExtraError: A package is not installed.
     """
     names = ["haspi", "hasqi", *measures]

@@ -228,7 +228,8 @@ def read_folders(
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: The names differ.
+        ValueError: The names differ, two files of a folder differ only in their extension, or a
+            folder does not exist or has no audio.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ears = EXAMPLE_FILE.parent, [("L1", "left", Audiogram.standard("N3"))]

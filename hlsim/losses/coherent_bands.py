@@ -12,9 +12,10 @@ perceives, and ``R`` those of what a normal ear perceives. Each band and segment
   signal is the reference times any gain and any fixed phase. It rises with noise, late
   reverberation and distortion, however soft: noise in a band that is perceived too softly does not
   lower it.
-- ``misalignment``, the part of the square root of the coherence that is lost to a phase shift. It
-  has a small weight, as nobody hears the sign or a delay of one millisecond; it leads a model with
-  an arbitrary phase shift to one without.
+- ``misalignment``, the part of the coherence that is lost to a phase shift, plus a tenth of the
+  same part of its square root, which distinguishes a signal from its negative. It has a small
+  weight, as nobody hears the sign or a delay of one millisecond; it leads a model with an arbitrary
+  phase shift to one without.
 - ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope
   falls with the difference, so that a severe ear, which perceives 100 dB too little and 2.5 dB more
   per dB of gain, counts like a mild one.
@@ -93,9 +94,11 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Four parts, (items,) each: ``incoherence``, from 0 for filtered speech to 1 for
-        noise; ``misalignment``, the effect of a phase shift; ``levels``, the level error in dB,
-        compressed; ``louder``, the excess level in dB.
+        Four parts, (items,) each, which are means over audible bands and segments:
+        ``incoherence``, 0 for the reference with any gain and phase per band, about 0.9 for
+        unrelated noise; ``misalignment``, the part of the coherence that a phase shift costs;
+        ``levels``, ``10 log(1 + d / 10)`` of the error d of the level in dB; ``louder``, the level
+        in dB by which a band exceeds both the reference and the threshold of audibility.
 
     >>> speech = torch.randn(1, 16000)
     >>> parts = coherent_band_parts(0.1 * speech, speech, sample_rate=16000)  # 20 dB too low

@@ -339,16 +339,20 @@ def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: 
 def _threshold_noise(
     noise: Noise, seed: int, extent: Extent, like: Tensor
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the noise at the threshold of hearing for the motion of clean signal and of output.
+    """Draw the noise that is added to the motion of the basilar membrane, for clean and output.
+
+    Its standard deviation is 1. ``_segment_spectra`` scales it to 10 dB below the threshold of
+    hearing.
 
     Args:
         noise: Kind of the noise.
-        seed: Seed of each item.
+        seed: Seed of the noise, the same for every item.
         extent: Number of samples of each item.
         like: Tensor whose device the noise has, and for ``"seeded"`` its dtype.
 
     Returns:
-        Noise of both, (items, 32, longest) or (32, longest), or None where there is none.
+        Noise of clean signal and output: (items, 32, longest) twice for ``"seeded"``; None and
+        (32, longest) for ``"expected"``; None twice for ``"none"``.
     """
     longest = extent.longest
     if noise == "seeded":

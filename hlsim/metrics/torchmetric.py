@@ -205,7 +205,7 @@ class _MeanScore(_Metric):
 
     @property
     def level(self) -> Tensor:
-        """Mean level in dB SPL of the scored signals in this process, NaN if nothing was scored."""
+        """Mean level in dB SPL of the outputs that were scored in this process; NaN if none was."""
         return self.total_level / self.count
 
 

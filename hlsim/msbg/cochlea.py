@@ -230,8 +230,9 @@ def simulate_delayed_cochlea(
 def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
     """Simulate the cochlea of impaired ears with pyclarity's treatment of the end of a signal.
 
-    ``simulate_cochlea`` is faster and gives nearly the same samples, except near the end of a
-    signal, because it treats signals as periodic.
+    ``simulate_cochlea`` is faster. The inverse transform of its result is nearly the same signal,
+    except near the end: it treats signals as periodic, whereas this function, as pyclarity, fills
+    the end of each channel with zeros.
 
     A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
     each channel by a gain that follows its envelope, and the channels are added up. All channels

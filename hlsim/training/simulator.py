@@ -28,10 +28,14 @@ _POWER_FLOOR = 1e-18
 class SimulatorTraining(TrainingModule):
     """Lightning module that trains a Neuro-MSBG on the output of a teacher.
 
-    Batches contain the output of the teacher as ``impaired``.
+    A batch (``hlsim.training.batches.Batch``) has ``signal`` and ``impaired``, the teacher's output
+    for it, (items, time) in pascals at 16 kHz, and ``thresholds``, (items, 8) in dB HL.
 
     Args:
-        recipe: Settings of the network and of the training.
+        recipe: Settings of the network and of the training run.
+
+    Raises:
+        ValueError: The network with which the recipe starts does not exist or has other settings.
 
     >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
     >>> signal, ears = 0.02 * torch.randn(1, 4000), torch.full((1, 8), 40.0)

@@ -85,7 +85,12 @@ def test_objects_that_cannot_be_described_need_an_attribute(thing: Any) -> None:
 
 @pytest.mark.parametrize(
     ("file", "counts"),
-    [("metrics/new.py", True), ("metrics/table.json", True), ("cli/new.py", False), ("notes.md", False)],
+    [
+        ("metrics/new.py", True),
+        ("metrics/table.json", True),
+        ("cli/new.py", False),
+        ("notes.md", False),
+    ],
 )
 def test_the_hash_of_the_code_covers_all_that_scores_depend_on(
     tmp_path: Path, file: str, counts: bool
