@@ -167,7 +167,7 @@ def read_record(name: str | Path) -> dict[str, Any]:
 def _find_folder(name: str | Path) -> Path:
     """Return the folder of a checkpoint, also if the name is that of the folder of a training."""
     path = Path(str(name))
-    for folder in (path, checkpoints_folder() / path, path / "checkpoint"):
+    for folder in (path, path / "checkpoint", checkpoints_folder() / path):
         if (folder / CONFIG).is_file():
             return folder
     suggestion = suggest(str(name), [*list_pretrained(), *_WITHOUT_CHECKPOINT])

@@ -127,8 +127,13 @@ class WaveformPlugin:
         """
         if isinstance(self.function, nn.Module):
             self.function.to(waveform.device)
+        # Code that changes its arguments in place must not change those of the caller.
+        copies = [
+            value.clone() if isinstance(value, Tensor) else value
+            for value in (waveform, *arguments)
+        ]
         try:
-            output = self.function(waveform, *arguments)
+            output = self.function(*copies)
         except Exception as error:  # because code of a plug-in may raise anything
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
         is_real = isinstance(output, Tensor) and not output.is_complex()

@@ -141,6 +141,12 @@ class PluginSimulator(nn.Module):
         function = self.plugin.function
         if isinstance(function, nn.Module):
             function.requires_grad_(False)
+        scale = getattr(function, "full_scale_spl", PASCAL_SPL)
+        if scale != PASCAL_SPL:
+            raise ValueError(
+                f"expected the simulator {name} to take pascals, full_scale_spl={PASCAL_SPL:g}, got "
+                f"{scale:g}; build it without another scale"
+            )
         self.plugin_rate: int = getattr(function, "sample_rate", NEURO_RATE)
         self.emulates_msbg: bool = getattr(function, "emulates_msbg", False)
         self.needs_exact_lengths: bool = getattr(function, "needs_exact_lengths", False)

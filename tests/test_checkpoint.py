@@ -34,6 +34,16 @@ def folder(tmp_path: Path) -> Path:
     return save(tmp_path / "small", model)
 
 
+def test_the_folder_of_a_training_is_preferred_to_a_shipped_name(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "neuro-msbg").mkdir()
+    folder.rename(tmp_path / "neuro-msbg" / "checkpoint")
+    monkeypatch.chdir(tmp_path)
+    for name in ("neuro-msbg", "./neuro-msbg"):
+        assert load_pretrained(name).config == SMALL
+
+
 def change(folder: Path, **changes: Any) -> None:
     """Change the record; a changed configuration gets its hash."""
     path = folder / "config.json"

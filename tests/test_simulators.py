@@ -22,6 +22,15 @@ def late(waveform, audiogram):
 
 def broken(waveform, audiogram):
     return waveform / 0.0
+
+def in_place(waveform, audiogram):
+    audiogram /= 100.0
+    return waveform.mul_(0.5)
+
+class Scaled:
+    full_scale_spl = 120.0
+    def __call__(self, waveform, audiogram):
+        return waveform
 """
 
 
@@ -71,7 +80,10 @@ def test_a_plug_in_is_the_ear_of_simulate(plugin: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("late", "delays by"), ("nobody", "nobody"), ("broken", "NaN or infinite")],
+    [
+        *(("late", "delays by"), ("nobody", "nobody"), ("broken", "NaN or infinite")),
+        ("Scaled", "full_scale_spl=94, got 120"),
+    ],
 )
 def test_invalid_plug_ins_are_rejected(plugin: str, name: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
@@ -113,6 +125,22 @@ def test_linear_ear_is_linear_and_takes_ears_as_other_simulators_do() -> None:
     for bad in ("N7", [0.0] * 7):
         with pytest.raises(ValueError):
             ear(speech, bad)
+
+
+def test_a_simulator_that_changes_its_arguments_changes_nothing_of_the_caller(plugin: str) -> None:
+    ear, clean = torch.full((8,), 40.0), hlsim.example_speech()[:16000]
+    before = clean.clone()
+
+    class InPlace(torch.nn.Module):
+        def forward(self, waveform: torch.Tensor, thresholds: torch.Tensor) -> torch.Tensor:
+            thresholds /= 100.0
+            return waveform.mul_(0.5)
+
+    for simulator in (f"{plugin}:in_place", InPlace()):
+        loss = HearingLossLoss(ear, simulator=simulator, criterion="bands")
+        assert float(loss(2.0 * clean, clean)) == float(loss(2.0 * clean, clean))
+    hlsim.simulate(clean, ear, simulator=f"{plugin}:in_place")
+    assert torch.equal(clean, before) and float(ear.mean()) == 40.0
 
 
 def test_unknown_names_and_modules_of_another_rate_are_rejected() -> None:

@@ -14,7 +14,11 @@ _USUAL_HZ = {
 }
 """Frequencies of audiometry, which may stand alone in the name of a column."""
 
-_KNOWN_WORDS = {*EAR_NAMES, "ac", "air", "conduction", "ear", "hl", "hz", "threshold"}
+_KNOWN_WORDS = {
+    *EAR_NAMES,
+    *("ac", "air", "conduction", "ear", "freq", "frequency", "hl", "htl", "hz"),
+    *("pt", "t", "thr", "threshold"),
+}
 
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}
 """Words of columns that do not hold measured thresholds of air conduction."""

@@ -9,9 +9,11 @@ EARS: tuple[EarName, EarName] = ("left", "right")
 EAR_NAMES: dict[str, EarName] = {
     "l": "left",
     "le": "left",
+    "lt": "left",
     "left": "left",
     "r": "right",
     "re": "right",
+    "rt": "right",
     "right": "right",
 }
 """Texts for an ear in a table, in lower case."""

@@ -220,7 +220,14 @@ def read_rows(table: str | Path | Any, contents: str) -> list[tuple[str, dict[st
 def _read_rows(table: str | Path | Any) -> list[_Row]:
     """Read the rows of a table of ears, and join those of a long one."""
     rows = read_rows(table, "audiograms")
-    columns = {_without_units(column): column for column in rows[0][1]}
+    columns: dict[str, str] = {}
+    for column in rows[0][1]:
+        other = columns.setdefault(_without_units(column), column)
+        if other != column and _without_units(column) in ("frequency", "threshold"):
+            raise ValueError(
+                f"{rows[0][0]}: expected one column of each kind, got {other} and {column}; remove "
+                "one of them"
+            )
     is_long = {"frequency", "threshold"} <= columns.keys() and not threshold_columns(rows[0][1])
     return _widen(rows, columns["frequency"], columns["threshold"]) if is_long else rows
 
@@ -252,6 +259,11 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         _, wide = ears.setdefault(tuple(ear.values()), (place, ear))
         text = row[frequency]
         column = text if re.search("k|hz", text.lower()) else f"{text} Hz"
+        if not threshold_columns([column]):
+            raise ValueError(
+                f"{place}: expected a frequency in the column {frequency}, got {text!r}; correct or "
+                "remove the row"
+            )
         if column in wide:
             raise ValueError(
                 f"{place}: expected one threshold at {column} for this ear, got a second one; "

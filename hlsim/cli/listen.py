@@ -127,7 +127,7 @@ def _make_section(options: argparse.Namespace, file: Path, perceive: Any) -> Sec
     rate = recording.sample_rate
     level = 10.0 * math.log10(recording.power) + options.full_scale_spl
     target_level = level if options.spl is None else options.spl
-    stop = min(recording.samples, round(options.seconds * rate))
+    stop = min(recording.samples, max(1, round(options.seconds * rate)))
     (waveform,) = read_parts(recording, [(0, stop)])
     with torch.no_grad():
         sounds = perceive(waveform * 10.0 ** ((target_level - level) / 20.0), rate)

@@ -66,6 +66,10 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     folder = Path(path).parent if root is None else Path(root)
     utterances = []
     for line, row in read_table(path, "the manifest"):
+        names = [name.lower() for name in row]
+        twice = [name for name in COLUMNS if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"{path}: the column {twice[0]} appears twice; remove one of the two")
         values = {name.lower(): text for name, text in row.items() if name.lower() in COLUMNS}
         if not values.get("path") or values.get("split", "train") not in SPLITS:
             raise ValueError(

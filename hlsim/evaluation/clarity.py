@@ -184,11 +184,13 @@ def _read_pairs(
         ValueError: There is no scene, a scene lacks its reference, a file is broken or names an
             unknown scene or listener, or a listener who is used lacks an ear.
     """
-    mixes = {
-        mix.name.removesuffix(ending): mix
-        for ending in _MIX_ENDINGS
-        for mix in folder.glob(f"*{ending}")
-    }
+    mixes: dict[str, Path] = {}
+    for ending in _MIX_ENDINGS:
+        for mix in sorted(folder.glob(f"*{ending}")):
+            scene = mix.name.removesuffix(ending)
+            if scene in mixes:
+                raise ValueError(f"{mixes[scene]} and {mix} are one scene; remove one of the two")
+            mixes[scene] = mix
     if scenes_listeners is None:
         people = read_listeners(listeners)
         names = list(product(sorted(mixes), people))

@@ -117,7 +117,7 @@ class Recording:
         """Return a hash of both files, the ear, the level and the seed."""
         files = [_file_hash(self.clean), _file_hash(self._output_file(condition))]
         level = [self.full_scale_spl, self.spl]
-        return value_hash([files, level, self.ear, self.audiogram.thresholds, self.seed])
+        return value_hash([files, level, self.ear, self.audiogram.to_dict(), self.seed])
 
     def load(self) -> Item:
         """Read the clean speech. Outputs are read when they are measured.
@@ -399,7 +399,7 @@ def _read_row(
         row: Texts by column.
         root: Folder to which the paths are relative.
         listeners: Listeners by their name.
-        audiogram: The ear if neither the row nor ``listeners`` has an audiogram.
+        audiogram: The ear if the row has no audiogram and ``listeners`` does not have its listener.
         settings: Further arguments of the recording.
     """
     for column in _REQUIRED_COLUMNS:
@@ -409,13 +409,18 @@ def _read_row(
     ear = EAR_NAMES.get(text.lower(), "")
     if text and not ear:
         raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
-    if any(row[column] for column in threshold_columns(row)):
+    has_thresholds = any(row[column] for column in threshold_columns(row))
+    if has_thresholds and row.get("audiogram"):
+        raise ValueError(
+            "expected either thresholds or a name in the column audiogram, got both; remove one"
+        )
+    if has_thresholds:
         ears = {str(name or ""): ear_of_row for name, ear_of_row in ears_in_row(row).items()}
         audiogram = ears.get("") or ears.get(ear)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
     elif listener in listeners:
-        audiogram = getattr(listeners[listener], ear, None) or audiogram
+        audiogram = getattr(listeners[listener], ear, None)
     if audiogram is None:
         raise ValueError(
             f"there is no audiogram of listener {listener!r}, ear {text!r}; add columns hl_250, "

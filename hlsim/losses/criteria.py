@@ -137,7 +137,14 @@ def _score(name: str, signals: Comparison) -> dict[str, Tensor]:
 def _interaural(signals: Comparison) -> dict[str, Tensor]:
     output = signals.limited_output.unflatten(0, (-1, 2))
     clean = signals.clean.unflatten(0, (-1, 2))
-    changes = interaural_loss(output, clean, signals.sample_rate)
+    ends = [max(pair) for pair in zip(signals.lengths[::2], signals.lengths[1::2], strict=True)]
+    if set(ends) == {output.shape[-1]}:
+        changes = interaural_loss(output, clean, signals.sample_rate)
+    else:
+        # Means over frames would contain the silence after the end of an item.
+        pairs = zip(output, clean, ends, strict=True)
+        values = [interaural_loss(o[..., :n], c[..., :n], signals.sample_rate) for o, c, n in pairs]
+        changes = torch.stack(values)
     return {"interaural": changes.repeat_interleave(2)}
 
 

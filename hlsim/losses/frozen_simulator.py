@@ -106,6 +106,9 @@ class FrozenSimulator:
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
         """
+        if not type(self.simulator).__module__.startswith("hlsim."):
+            # A module that changes its arguments in place must not change the ears of the loss.
+            waveform, thresholds = waveform.clone(), thresholds.clone()
         time = waveform.shape[-1]
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         if lengths is None or not self._needs_exact_lengths:

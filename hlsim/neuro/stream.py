@@ -53,9 +53,14 @@ class SimulatedStream:
     def __call__(self, chunk: Tensor) -> Tensor:
         """Return what is perceived. Shape: (time,), or (2, time) for a listener -> the same.
 
-        The number of samples must be a multiple of ``block``.
+        Raises:
+            ValueError: The number of samples is no multiple of ``block``.
         """
         samples = chunk.shape[-1]
+        if samples % self.block:
+            raise ValueError(
+                f"expected a chunk whose length is a multiple of {self.block} samples, got {samples}"
+            )
         window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
         self._past = window[..., samples:]
         with torch.no_grad():

@@ -38,13 +38,13 @@ def write_results(page: Page, evaluation: Evaluation, out: str | Path) -> Path:
     >>> with tempfile.TemporaryDirectory() as out:
     ...     _ = write_results(Page("Aids", "", []), Evaluation([], [], [], table), out)
     ...     print((Path(out) / "scores.csv").read_text().splitlines()[1])
-    0,aid,0.500000
+    0,aid,0.5
     """
     data = evaluation.to_dict()
     data["comparisons"] = _add_words(evaluation, data["comparisons"])
     for name, group in evaluation.groups.items():
         data["groups"][name] = _add_words(group, data["groups"][name])
-    scores = scores_table(evaluation).to_csv(index=False, float_format="%.6f")
+    scores = scores_table(evaluation).to_csv(index=False, float_format="%.9g")
     return write_page(page, data, out, {"scores.csv": scores})
 
 

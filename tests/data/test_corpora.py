@@ -199,6 +199,7 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         "path,split\n1.wav,dev\n",
         "path\n1.wav\n../2.wav\n",
         "path,noisy\n1.wav,/2.wav\n",
+        "path,split,Split\n1.wav,train,valid\n",
         "path,noisy\n1.wav,1.wav\n",
         "path,split\n1.wav,train\na/.././1.wav,test\n",
         "path,noisy,split\n1.wav,2.wav,train\n1.wav,3.wav,test\n",

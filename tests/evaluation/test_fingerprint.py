@@ -14,6 +14,7 @@ import hlsim
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import list_pretrained
+from hlsim.evaluation.conditions import AtLevelOf
 from hlsim.evaluation.running.fingerprint import _hash_sources, fingerprint
 from hlsim.plugins import WaveformPlugin
 
@@ -49,6 +50,21 @@ class Foreign(nn.Module):
         super().__init__()
         self.setting = setting
         self.weight = nn.Parameter(torch.ones(1))
+
+
+class Amplifier(nn.Module):
+    """An aid of another package, without weights."""
+
+
+def test_aids_within_conditions_count_as_they_do_alone() -> None:
+    aid = Amplifier()
+    assert fingerprint(AtLevelOf(NALR(), aid)) is None
+    fingerprints = []
+    for version in ("1", "2"):
+        Amplifier.fingerprint = version  # type: ignore[attr-defined]
+        fingerprints.append(fingerprint(AtLevelOf(NALR(), aid)))
+    del Amplifier.fingerprint  # type: ignore[attr-defined]
+    assert None not in fingerprints and len(set(fingerprints)) == 2
 
 
 def test_settings_of_any_describable_type_count() -> None:

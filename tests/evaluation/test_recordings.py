@@ -13,7 +13,7 @@ from torch import Tensor
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
-from hlsim.evaluation.recorded_items import read_recordings
+from hlsim.evaluation.recorded_items import Recording, read_recordings
 from hlsim.files import sha256
 from hlsim.metrics import haspi
 from hlsim.shortcuts import example_speech
@@ -190,8 +190,18 @@ def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> N
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,R,{LEVELS}\nL3,left,{unused}\n")
     assert {r.audiogram for r in read_recordings(manifest, audiograms=ears)} == {N4}
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,left,{LEVELS}\n")
-    with pytest.raises(ValueError, match="line 4: there is no audiogram of listener 'L2'"):
-        read_recordings(manifest, audiograms=ears)
+    # The default is for listeners that the table does not have.
+    for default in (None, N4):
+        with pytest.raises(ValueError, match="line 4: there is no audiogram of listener 'L2'"):
+            read_recordings(manifest, audiogram=default, audiograms=ears)
+
+
+def test_thresholds_between_the_eight_frequencies_are_in_the_key(corpus: Path) -> None:
+    files = corpus / "clean" / "a.b.flac"
+    ears = [Audiogram((20.0, 20.0), (500.0, 4000.0))]
+    ears.append(Audiogram((20.0, 90.0, 20.0), (500.0, 1500.0, 4000.0)))
+    keys = {Recording("a", files, {"x": files}, ear).digest("x") for ear in ears}
+    assert len(keys) == 2
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,8 @@ def fingerprint(processing: Any) -> str | None:
     Returns:
         The SHA-256 in hexadecimal, or None if the outputs could change without notice: for a
         function without the attribute, for a module outside hlsim without tensors and ``config``,
-        and for a module with a public attribute that cannot be described, such as a lambda.
+        for a module with a public attribute that cannot be described, such as a lambda, and for a
+        module of hlsim that contains one of these.
 
     >>> fingerprint(nn.Linear(2, 2)) == fingerprint(nn.Linear(2, 2))  # random weights
     False
@@ -86,11 +87,19 @@ def fingerprint(processing: Any) -> str | None:
     if not isinstance(processing, nn.Module):
         return None
     tensors = dict([*processing.named_parameters(), *processing.named_buffers()])
-    is_from_hlsim = type(processing).__module__.startswith(("hlsim.", "compensators."))
-    if not (is_from_hlsim or tensors or hasattr(processing, "config")):
+    if not (_is_from_hlsim(processing) or tensors or hasattr(processing, "config")):
         return None
-    modules = processing.named_modules()
-    parts = {name: [_name(module), _public_attributes(module)] for name, module in modules}
+    parts = {}
+    for place, module in processing.named_modules():
+        parts[place] = [
+            _name(module),
+            _public_attributes(module),
+            str(getattr(module, "fingerprint", None)),
+        ]
+        # A condition of hlsim, such as an aid at another's level, contains the aids of a user.
+        contained = module.children() if _is_from_hlsim(module) else ()
+        if any(fingerprint(child) is None for child in contained if not _is_known(child)):
+            return None
     try:
         return value_hash([parts, tensors])
     except TypeError:
@@ -112,6 +121,16 @@ def value_hash(value: Any) -> str:
     """
     text = json.dumps(value, sort_keys=True, default=_describe)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _is_from_hlsim(module: nn.Module) -> bool:
+    """Return whether the class of a module belongs to hlsim, whose code has a hash of its own."""
+    return type(module).__module__.startswith(("hlsim.", "compensators."))
+
+
+def _is_known(module: nn.Module) -> bool:
+    """Return whether the class of a module belongs to hlsim or torch."""
+    return _is_from_hlsim(module) or type(module).__module__.startswith("torch.")
 
 
 def _public_attributes(module: nn.Module) -> dict[str, Any]:
