@@ -144,8 +144,8 @@ class PluginSimulator(nn.Module):
         scale = getattr(function, "full_scale_spl", PASCAL_SPL)
         if scale != PASCAL_SPL:
             raise ValueError(
-                f"expected the simulator {name} to take pascals, full_scale_spl={PASCAL_SPL:g}, got "
-                f"{scale:g}; build it without another scale"
+                f"expected the simulator {name} to take pascals, full_scale_spl={PASCAL_SPL:g}, "
+                f"got {scale:g}; build it without another scale"
             )
         self.plugin_rate: int = getattr(function, "sample_rate", NEURO_RATE)
         self.emulates_msbg: bool = getattr(function, "emulates_msbg", False)

@@ -69,7 +69,8 @@ def test_all_modules_and_functions_have_the_same_default_rate() -> None:
     for name in hlsim.__all__:
         value = getattr(hlsim, name)
         if callable(value):
-            parameter = inspect.signature(value).parameters.get("sample_rate")
+            constructor = value.__init__ if value is hlsim.NeuroMSBG else value
+            parameter = inspect.signature(constructor).parameters.get("sample_rate")
             if parameter is not None and isinstance(parameter.default, int):
                 defaults[name] = parameter.default
     assert {"MSBG", "NALR", "HearingLossLoss", "NeuroMSBG", "simulate"} <= defaults.keys()

@@ -1,11 +1,12 @@
 """The examples of training through the loss run as they stand, a few steps."""
 
+import importlib
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.helpers import EXAMPLES, load_example, load_figure
+from tests.helpers import EXAMPLES, ROOT, load_example, load_figure
 
 TRAINING = EXAMPLES / "training"
 
@@ -52,7 +53,8 @@ def test_saved_networks_are_judged_at_the_level_of_nalr(
 ) -> None:
     pytest.importorskip("pandas")
     monkeypatch.syspath_prepend(TRAINING)
-    listener = load_example("machine_listener.py")
+    monkeypatch.syspath_prepend(ROOT)
+    listener = importlib.import_module("examples.machine_listener")
     networks = load_figure("networks.py")
     sentence = listener.Sentence("flite-rms-01.flac", 0.0, 1.0, "a b")
     monkeypatch.setattr(listener, "Whisper", lambda folder: lambda waveform: "a")

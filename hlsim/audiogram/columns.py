@@ -39,6 +39,9 @@ class ThresholdColumn(NamedTuple):
         ear: Ear that the column's name mentions, or None.
         hz: Frequency in Hz.
         is_remark: Whether the column holds a remark on another column of this frequency.
+
+    >>> ThresholdColumn("left", 500.0).is_remark
+    False
     """
 
     ear: EarName | None

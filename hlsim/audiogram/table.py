@@ -197,6 +197,10 @@ def read_rows(table: str | Path | Any, contents: str) -> list[tuple[str, dict[st
 
     Raises:
         ValueError: The file cannot be read, there are no rows, or a column appears twice.
+
+    >>> import pandas
+    >>> read_rows(pandas.DataFrame({"hl_500": [20]}), "the ears")[0][1]
+    {'hl_500': '20'}
     """
     if isinstance(table, str | Path):
         return [(f"{table}, line {line}", row) for line, row in read_table(table, contents)]
@@ -259,10 +263,10 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         _, wide = ears.setdefault(tuple(ear.values()), (place, ear))
         text = row[frequency]
         column = text if re.search("k|hz", text.lower()) else f"{text} Hz"
-        if not threshold_columns([column]):
+        if not convert_at(place, threshold_columns, [column]):
             raise ValueError(
-                f"{place}: expected a frequency in the column {frequency}, got {text!r}; correct or "
-                "remove the row"
+                f"{place}: expected a frequency in the column {frequency}, got {text!r}; correct "
+                "or remove the row"
             )
         if column in wide:
             raise ValueError(

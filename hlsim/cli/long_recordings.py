@@ -143,8 +143,8 @@ def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
     """Divide a recording into overlapping blocks that a model can process one by one.
 
     Args:
-        model: ``MSBG``, ``Attenuation``, ``NALR`` or a network of ``cnn`` blocks; for any other, the
-            recording is one block.
+        model: ``MSBG``, ``Attenuation``, ``NALR`` or a network of ``cnn`` blocks; for any other,
+            the recording is one block.
         samples: Length of the recording.
         rate: Sample rate in Hz.
 

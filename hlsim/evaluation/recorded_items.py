@@ -233,8 +233,8 @@ def read_folders(
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ears = EXAMPLE_FILE.parent, [("L1", "left", Audiogram.standard("N3"))]
-    >>> [recording.name for recording in read_folders(folder, {"mine": folder}, ears)]
-    ['L1 left example']
+    >>> [recording.name for recording in read_folders(folder, {"mine": folder}, ears)][:1]
+    ['L1 left espeak-scotland-m7-01']
     """
     speech = _files_by_name(clean)
     outputs = {condition: _files_by_name(folder) for condition, folder in folders.items()}

@@ -263,6 +263,14 @@ def run_measures(
     Args:
         items, conditions, measures, store, progress: See ``run_study``.
         running: Arguments ``jobs`` and ``dask`` of ``run_study``.
+
+    >>> speech = 0.02 * torch.ones(16000)
+    >>> item = Item("item 0", speech, speech, Audiogram.standard("N3"))
+    >>> count = Measure("count", lambda item, output: float(len(output)))
+    >>> unaided = Condition("unaided", lambda signal, ear: signal)
+    >>> table, measures = run_measures([item], [unaided], [count], jobs=1)
+    >>> list(measures[0].scores)
+    ['count']
     """
     pandas = require("pandas", "eval")
     store = store or ScoreStore()

@@ -50,6 +50,12 @@ class Comparison:
         ears: Thresholds of the impaired ear of each item in dB HL. Shape: (items, 8).
         lengths: Number of samples of each item before padding.
         sample_rate: Sample rate in Hz.
+
+    >>> signals = dict.fromkeys(_SIGNALS, torch.zeros(1, 800))
+    >>> further = {"ears": torch.zeros(1, 8), "lengths": [500], "sample_rate": 16000}
+    >>> comparison = Comparison(**signals, **further)
+    >>> comparison.without_padding(0).output.shape
+    torch.Size([1, 500])
     """
 
     output: Tensor

@@ -31,6 +31,9 @@ class Reference:
             ``"simulator"``, the simulator itself at 0 dB HL.
         bank_phase: Whether the reference gets the phase of MSBG's filter bank for the impaired ear,
             if the simulator emulates MSBG.
+
+    >>> Reference("clean").bank_phase
+    True
     """
 
     signal: ReferenceName = "normal-hearing"
@@ -53,8 +56,8 @@ class FrozenSimulator:
         simulator: Name, folder or module, see ``load_simulator``.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
-        normal: Normal ear that belongs to the simulator. By default, the filter of MSBG's normal ear
-            or the simulator at 0 dB HL, see ``HearingLossLoss``.
+        normal: Normal ear that belongs to the simulator. By default, the filter of MSBG's normal
+            ear or the simulator at 0 dB HL, see ``HearingLossLoss``.
         choice: Reference of the criteria that have a choice: ``"clean"`` speech, or
             ``"normal-hearing"``, what the normal ear perceives of it. By default, each criterion
             has its own.

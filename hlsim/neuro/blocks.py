@@ -26,6 +26,7 @@ class ConvPath(nn.Module):
         kernel: Length of the convolution, an odd number.
         expansion: Factor by which the linear expansion increases the number of channels.
 
+    >>> import torch
     >>> ConvPath(8, axis=0, kernel=7, expansion=2)(torch.randn(1, 20, 5, 8)).shape
     torch.Size([1, 20, 5, 8])
     """
@@ -54,6 +55,7 @@ class DualPathBlock(nn.Sequential):
         time_alone: Leave out the layers along frequency, as in the paper's monolithic baselines.
 
     >>> from hlsim.neuro.config import NeuroConfig
+    >>> import torch
     >>> DualPathBlock(NeuroConfig(channels=8))(torch.randn(1, 20, 5, 8)).shape
     torch.Size([1, 20, 5, 8])
     """

@@ -59,7 +59,7 @@ class SimulatedStream:
         samples = chunk.shape[-1]
         if samples % self.block:
             raise ValueError(
-                f"expected a chunk whose length is a multiple of {self.block} samples, got {samples}"
+                f"expected a chunk of a multiple of {self.block} samples, got {samples} samples"
             )
         window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
         self._past = window[..., samples:]

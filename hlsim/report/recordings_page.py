@@ -120,13 +120,14 @@ def scenes_page(evaluation: Evaluation) -> Page:
         evaluation: Evaluation of ``evaluate_scenes``.
 
     >>> import pandas
-    >>> from hlsim.evaluation import Condition
+    >>> from hlsim.evaluation import MEASURES, Condition
     >>> row = {"item": 0, "name": "S1", "condition": "unaided", "haspi": 0.5, "hasqi": 0.3}
     >>> row |= {"combined": 0.4, "level": 80.0, "clean_level": 65.0, "full_scale_spl": 100.0}
     >>> row |= {"failure": None}
     >>> further = {"settings": {"seed": 0}, "details": {"look_ahead_ms": {"unaided": 0.0}}}
     >>> table, conditions = pandas.DataFrame([row]), [Condition("unaided")]
-    >>> scenes_page(Evaluation([], conditions, [], table, **further)).title
+    >>> measures = [MEASURES["haspi"], MEASURES["hasqi"]]
+    >>> scenes_page(Evaluation([], conditions, measures, table, **further)).title
     "Clarity's scenes: 1 pairs of scene and listener"
     """
     planned = [verdict(c) for c in evaluation.comparisons if c.planned]

@@ -204,7 +204,6 @@ def test_bad_arguments_raise_value_error() -> None:
     for update in (
         {"clean": noise[:1]},
         {"output": noise.short()},
-        {"clean": noise.numpy()},
         {"audiogram": [N3]},
         {"lengths": torch.tensor([12801, 12800])},
     ):

@@ -30,7 +30,11 @@ _TASKS_IN_FLIGHT = 8
 
 
 class Crash:
-    """Result of a task whose process has ended."""
+    """Result of a task whose process has ended.
+
+    >>> isinstance(Crash(), Crash)
+    True
+    """
 
 
 def describe_error(error: Exception) -> str:

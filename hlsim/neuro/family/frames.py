@@ -13,6 +13,7 @@ class FrameEncoder(nn.Module):
         frequencies: Number of frequencies.
         channels: Length of the vectors.
 
+    >>> import torch
     >>> FrameEncoder(3, 65, 8)(torch.randn(1, 3, 20, 65)).shape
     torch.Size([1, 8, 20, 1])
     """
