@@ -266,7 +266,7 @@ def run_measures(
 
     >>> speech = 0.02 * torch.ones(16000)
     >>> item = Item("item 0", speech, speech, Audiogram.standard("N3"))
-    >>> count = Measure("count", lambda item, output: float(len(output)))
+    >>> count = Measure("count", lambda item, output: {"count": len(output)})
     >>> unaided = Condition("unaided", lambda signal, ear: signal)
     >>> table, measures = run_measures([item], [unaided], [count], jobs=1)
     >>> list(measures[0].scores)
