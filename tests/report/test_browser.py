@@ -114,8 +114,8 @@ def check_images(page: Any, count: int) -> None:
 
 
 def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(report: Any) -> None:
-    # one of the scores, and for each of two items a normal ear and three conditions
-    check_images(report, 1 + 2 * 4)
+    # two of the scores, and for each of two items a normal ear and three conditions
+    check_images(report, 2 + 2 * 4)
     # the first table is whole even on a phone
     assert report.locator(".scroll").first.evaluate("e => e.scrollWidth <= e.clientWidth")
     size = "parseFloat(getComputedStyle(document.querySelector('td')).fontSize)"
