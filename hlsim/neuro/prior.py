@@ -18,6 +18,7 @@ bank and the smearing.
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ from torch.nn import functional
 from hlsim.audiogram import SEVERITIES
 from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
+from hlsim.dsp.fft import power
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
@@ -35,7 +37,7 @@ from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
-from hlsim.msbg.smearing import BROADENING, roex_filters, smear_spectrum, smearing_from_filters
+from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
@@ -57,11 +59,17 @@ POWER_FLOOR = 1e-14
 MIN_ENVELOPE = 1e-7
 """Smallest value of an envelope in Pa."""
 
-SMEARING_GRADIENT_FLOOR = 1e-4
-"""Smallest factor of smearing on a power, -40 dB, that gradients take into account."""
+MIN_SMEARING = 1e-3
+"""Factor of smearing on a power, -30 dB, below which the smoothed factor hardly falls."""
+
+MAX_SMEARING = 1e4
+"""Factor of smearing on a power, 40 dB, above which the smoothed factor hardly rises."""
 
 MAX_POWER_RATIO = 1e16
 """Largest factor of smearing on a power."""
+
+_SILENCE = 1e-24
+"""Power in Pa^2 that is added to powers before and after smearing, so that silence stays silent."""
 
 _FLUCTUATION_DB = {"none": 0.0, "mild": 1.0, "moderate": 2.2, "severe": 3.3}
 """Level in dB by which MSBG's envelope of speech is below that of a tone of the same power.
@@ -181,7 +189,8 @@ class Prior(nn.Module):
 
         Returns: The smeared spectrogram and its power in Pa^2, which may be negative.
         """
-        return smear_spectrum(spectrum, self._smearing()[severity], SMEARING_GRADIENT_FLOOR)
+        smeared, smeared_power, *_ = SmoothSmearing.apply(spectrum, self._smearing()[severity])
+        return smeared, smeared_power
 
     def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
         """Compute the RMS pressure of each channel of MSBG's filter bank in each frame.
@@ -259,6 +268,87 @@ class Prior(nn.Module):
         smearing = self._corrected("smearing") * ear_ratio
         identity = torch.eye(smearing.shape[-1], dtype=smearing.dtype, device=smearing.device)
         return torch.cat((identity.unsqueeze(0), smearing))
+
+
+def _smooth_factor(
+    spectrum_power: Tensor, smeared_power: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Compute the complex square root of the ratio of two powers, with a bounded derivative.
+
+    The ratio r is at most ``MAX_SMEARING``. The factor is the square root of r + i e, where e is
+    ``MIN_SMEARING``. It passes smoothly from the root of a positive ratio to the imaginary root of
+    a negative one, whose derivatives have no bound.
+
+    Args:
+        spectrum_power: Power of the spectrum, above 0.
+        smeared_power: Power of the smeared spectrum, which may be negative.
+
+    Returns:
+        Real and imaginary part of the factor, its squared magnitude, and the divisor of the ratio.
+    """
+    divisor = torch.add(spectrum_power, smeared_power.abs(), alpha=1.0 / MAX_SMEARING)
+    ratio = smeared_power / divisor
+    square = (ratio.square() + MIN_SMEARING**2).sqrt()
+    larger = (0.5 * (square + ratio.abs())).sqrt()
+    smaller = 0.5 * MIN_SMEARING / larger
+    is_positive = ratio > 0.0
+    real = torch.where(is_positive, larger, smaller)
+    imaginary = torch.where(is_positive, smaller, larger)
+    return real, imaginary, square, divisor
+
+
+class SmoothSmearing(torch.autograd.Function):
+    """Smearing of spectra as MSBG's, with bounded derivatives and few steps for the gradient.
+
+    Let x be the spectrum, p = |x|^2 its power, A the matrix, s = A p the smeared power, d the
+    divisor and f the factor of ``_smooth_factor``, and z = f x the smeared spectrum. Let h be the
+    gradient with respect to s, G the one with respect to z, and q = G conj(x). The gradient with
+    respect to the ratio s / d is u = Re(q f) / (2 |f|^2). Then, with t = u p / d^2 + h,
+
+    - the gradient with respect to x is G conj(f) + 2 x (A^T t - u s / d^2);
+    - the gradient with respect to A is t p^T.
+    """
+
+    @staticmethod
+    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, ...]:
+        spectrum_power = power(spectrum)
+        smeared_power = (spectrum_power @ matrix.mT).add_(_SILENCE)
+        spectrum_power = spectrum_power + _SILENCE
+        real, imaginary, square, divisor = _smooth_factor(spectrum_power, smeared_power)
+        smeared = spectrum * torch.complex(real, imaginary)
+        return smeared, smeared_power, spectrum_power, real, imaginary, square, divisor
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output[2:])
+        ctx.save_for_backward(*inputs, *output[1:])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, power_gradient: Tensor, *_: Tensor) -> Any:
+        spectrum, matrix, *saved = ctx.saved_tensors
+        smeared_power, spectrum_power, real, imaginary, square, divisor = saved
+        if torch.is_grad_enabled():
+            # This gradient is itself differentiated, so it must depend on the spectrum.
+            spectrum_power = power(spectrum)
+            smeared_power = spectrum_power @ matrix.mT + _SILENCE
+            spectrum_power = spectrum_power + _SILENCE
+            real, imaginary, square, divisor = _smooth_factor(spectrum_power, smeared_power)
+        # Real and imaginary parts are computed separately, because torch would first convert the
+        # real factors of a complex product to complex numbers.
+        g, x = torch.view_as_real(gradient).unbind(-1), torch.view_as_real(spectrum).unbind(-1)
+        q_real = torch.addcmul(g[0] * x[0], g[1], x[1])
+        q_imag = torch.addcmul(g[1] * x[0], g[0], x[1], value=-1.0)
+        u = torch.addcmul(q_real * real, q_imag, imaginary, value=-1.0) / (2.0 * square * divisor)
+        t = torch.addcmul(power_gradient, u, spectrum_power / divisor)
+        weight = 2.0 * torch.addcmul(t @ matrix, u, smeared_power / divisor, value=-1.0)
+        matrix_gradient = None
+        if ctx.needs_input_grad[1]:
+            matrix_gradient = t.mT @ spectrum_power
+        spectrum_gradient = torch.complex(
+            torch.addcmul(torch.addcmul(g[0] * real, g[1], imaginary), x[0], weight),
+            torch.addcmul(torch.addcmul(g[1] * real, g[0], imaginary, value=-1.0), x[1], weight),
+        )
+        return spectrum_gradient, matrix_gradient
 
 
 def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:

@@ -82,8 +82,12 @@ class SimulatorRecipe(TrainingRecipe):
 
     Attributes:
         model: Settings of ``NeuroConfig``.
-        weights: Weights of ``snr`` and ``log_spectrum``, both in dB / 10, and of the paper's
-            ``magnitude``, ``phase``, ``complex`` and ``time``.
+        weights: Weights of ``snr``, ``log_spectrum`` and ``levels``, all in dB / 10; of
+            ``gradient``, 1 minus the cosine of the gradients that a loss has through the network
+            and through the exact MSBG; and of the paper's ``magnitude``, ``phase``, ``complex``
+            and ``time``.
+        gradient_every: Number of steps from one comparison of gradients to the next. A step with
+            the comparison takes three times as long.
         unit_power: Signal by whose power all signals are divided before the criteria, ``truth`` or
             ``input``. ``truth`` is the target, with which soft items count as much as loud ones.
             ``input`` is the choice of MP-SENet. The paper's criteria require ``input`` for networks
@@ -103,15 +107,26 @@ class SimulatorRecipe(TrainingRecipe):
     """
 
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
+    gradient_every: int = 3
     unit_power: Literal["truth", "input"] = "truth"
     treated: bool = True
     precision: Literal["float32", "bfloat16"] = "float32"
     average: float = 0.99
 
-    criteria = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
+    criteria = (
+        "complex",
+        "gradient",
+        "levels",
+        "log_spectrum",
+        "magnitude",
+        "phase",
+        "snr",
+        "time",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._require("gradient_every", self.gradient_every >= 1, "1 or more")
         self._require("average", 0.0 <= self.average < 1.0, "a weight from 0 to below 1")
 
 

@@ -13,11 +13,16 @@ from torch import Tensor
 from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
-from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
+from hlsim.losses.waveform import (
+    band_level_distance_db,
+    log_spectral_distance_db,
+    noise_to_signal_db,
+)
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.batches import Batch, TrainingData, simulator_data
+from hlsim.training.gradients import gradient_error
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.teacher import find_teacher
@@ -52,18 +57,30 @@ class SimulatorTraining(TrainingModule):
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, target = batch["signal"], batch["impaired"]
+        compares_gradients = "gradient" in batch
+        if compares_gradients:
+            signal = signal.detach().requires_grad_()
         perceived = self.network(signal, batch["thresholds"])
+        parts = {}
+        if compares_gradients:
+            parts["gradient"] = gradient_error(
+                perceived, signal, batch["cotangent"], batch["gradient"]
+            )
+            signal = signal.detach()
         unit = target if self.recipe.unit_power == "truth" else signal
         scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
+        weights = self.recipe.weights
+        if weights.get("levels"):
+            parts["levels"] = band_level_distance_db(perceived, target, signal) / 10.0
         target = target * scale
         perceived = perceived * scale
-        weights = self.recipe.weights
-        parts = {"snr": noise_to_signal_db(perceived, target) / 10.0}
+        parts["snr"] = noise_to_signal_db(perceived, target) / 10.0
         if weights.get("log_spectrum"):
             parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
-        if set(weights) - {"snr", "log_spectrum"}:
+        if set(weights) - {"snr", "log_spectrum", "levels", "gradient"}:
             parts |= paper_parts(perceived, target)
-        return weighted_sum(parts, weights).mean()
+        present = {name: weight for name, weight in weights.items() if name in parts}
+        return weighted_sum(parts, present).mean()
 
     def evaluate(self, batch: Batch) -> Tensor:
         """Compute the ratio of the teacher's output to the network's error in dB for each item."""
