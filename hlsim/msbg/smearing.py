@@ -180,13 +180,12 @@ def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
     return _overlap_add(smeared_frames, hop)
 
 
-def smear_spectrum(
-    spectrum: Tensor, matrix: Tensor, gradient_floor: float = 0.0
-) -> tuple[Tensor, Tensor]:
+def smear_spectrum(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Spread the power of spectra over neighbouring frequencies, and keep their phase.
 
     Smearing can give a negative power. Its square root is imaginary, so that the phase turns by 90
-    degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is.
+    degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is. The gradient has no bound
+    where smearing changes the sign of a power or fills an empty frequency.
 
     Shape: complex (..., bins), (bins, bins) or (items, bins, bins) -> complex (..., bins),
         (..., bins).
@@ -194,9 +193,6 @@ def smear_spectrum(
     Args:
         spectrum: Spectra of pressures in Pa.
         matrix: Matrix by which power spectra are multiplied: one for all items, or one per item.
-        gradient_floor: Bound of the gradients, which are computed as if smearing multiplied each
-            power by this factor at least and by its reciprocal at most. With 0, gradients have no
-            bound where smearing changes the sign of a power or fills an empty frequency.
 
     Returns:
         The smeared spectrum and its power.
@@ -206,7 +202,7 @@ def smear_spectrum(
     >>> smear_spectrum(spectrum, mixing)[1]
     tensor([1.2500e+01, 1.0000e-24])
     """
-    smeared, smeared_power, *_ = _SmearSpectrum.apply(spectrum, matrix, gradient_floor)
+    smeared, smeared_power, *_ = _SmearSpectrum.apply(spectrum, matrix)
     return smeared, smeared_power
 
 
@@ -244,40 +240,25 @@ class _SmearSpectrum(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(spectrum: Tensor, matrix: Tensor, gradient_floor: float) -> tuple[Tensor, ...]:
+    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, ...]:
         return _smear_spectrum(spectrum, matrix)
 
     @staticmethod
-    def setup_context(
-        ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, ...]
-    ) -> None:
-        spectrum, matrix, ctx.gradient_floor = inputs
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
         ctx.mark_non_differentiable(*output[2:])
-        ctx.save_for_backward(spectrum, matrix, *output[1:])
+        ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
     def backward(
         ctx: Any, gradient: Tensor, power_gradient: Tensor, *_: Tensor
-    ) -> tuple[Tensor | None, Tensor | None, None]:
+    ) -> tuple[Tensor, Tensor | None]:
         spectrum, matrix, *outputs = ctx.saved_tensors
         if torch.is_grad_enabled():
             # This gradient is itself differentiated, so it must depend on the spectrum.
             outputs = list(_smear_spectrum(spectrum, matrix)[1:])
         smeared_power, real, imaginary, spectrum_power = outputs
-        floor = ctx.gradient_floor
-        if floor:
-            magnitude = smeared_power.abs()
-            bounded = torch.maximum(magnitude, floor * spectrum_power)
-            divisor = torch.copysign(bounded, smeared_power)
-            # Where smearing amplifies by more than 1 / floor, the factor counts as 1 / floor.
-            limit = spectrum_power / (floor * magnitude + _DIVISION_EPS)
-            limit = limit.clamp_max(1.0).sqrt()
-            divisor = divisor * limit
-            real = real * limit
-            imaginary = imaginary * limit
-        else:
-            eps = smeared_power.new_full((), _DIVISION_EPS)
-            divisor = smeared_power + torch.copysign(eps, smeared_power)
+        eps = smeared_power.new_full((), _DIVISION_EPS)
+        divisor = smeared_power + torch.copysign(eps, smeared_power)
 
         # Real and imaginary parts are computed separately, because torch would first convert the
         # real factors of a complex product to complex numbers.
@@ -294,7 +275,7 @@ class _SmearSpectrum(torch.autograd.Function):
             torch.addcmul(g_real, spectrum.real, weight),
             torch.addcmul(g_imag, spectrum.imag, weight),
         )
-        return spectrum_gradient, matrix_gradient, None
+        return spectrum_gradient, matrix_gradient
 
 
 def _window(rate_divisor: int) -> Tensor:

@@ -127,9 +127,7 @@ class _Block(nn.Module):
         self.time_bias = nn.Parameter(torch.zeros(severities, width))
         # These are matrix products, because convolutions of length 1 take twice as long.
         self.widen = nn.Parameter(torch.randn(severities, inner, width) / math.sqrt(width))
-        self.narrow = nn.Parameter(
-            torch.randn(severities, width, inner) / (2.0 * math.sqrt(inner))
-        )
+        self.narrow = nn.Parameter(torch.randn(severities, width, inner) / (2.0 * math.sqrt(inner)))
         self.bias = nn.Parameter(torch.zeros(severities, inner, 1))
 
     def forward(self, features: Tensor, severity: Tensor) -> Tensor:

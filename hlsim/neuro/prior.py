@@ -270,9 +270,7 @@ class Prior(nn.Module):
         return torch.cat((identity.unsqueeze(0), smearing))
 
 
-def _smooth_factor(
-    spectrum_power: Tensor, smeared_power: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _smooth_factor(spectrum_power: Tensor, smeared_power: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the complex square root of the ratio of two powers, with a bounded derivative.
 
     The ratio r is at most ``MAX_SMEARING``. The factor is the square root of r + i e, where e is
@@ -284,26 +282,31 @@ def _smooth_factor(
         smeared_power: Power of the smeared spectrum, which may be negative.
 
     Returns:
-        Real and imaginary part of the factor, its squared magnitude, and the divisor of the ratio.
+        Real and imaginary part of the factor.
     """
-    divisor = torch.add(spectrum_power, smeared_power.abs(), alpha=1.0 / MAX_SMEARING)
-    ratio = smeared_power / divisor
-    square = (ratio.square() + MIN_SMEARING**2).sqrt()
-    larger = (0.5 * (square + ratio.abs())).sqrt()
+    ratio = smeared_power / _ratio_divisor(spectrum_power, smeared_power)
+    size = (ratio.square() + MIN_SMEARING**2).sqrt()
+    # The difference of size and ratio would lose its digits, so the smaller part is a quotient.
+    larger = (size + ratio.abs()).mul(0.5).sqrt()
     smaller = 0.5 * MIN_SMEARING / larger
-    is_positive = ratio > 0.0
-    real = torch.where(is_positive, larger, smaller)
-    imaginary = torch.where(is_positive, smaller, larger)
-    return real, imaginary, square, divisor
+    # The larger part is the real one for positive ratios.
+    half_sum = 0.5 * (larger + smaller)
+    half_difference = torch.copysign(0.5 * (larger - smaller), ratio)
+    return half_sum + half_difference, half_sum - half_difference
+
+
+def _ratio_divisor(spectrum_power: Tensor, smeared_power: Tensor) -> Tensor:
+    """Return the power by which the smeared power is divided, so that the ratio has a limit."""
+    return torch.add(spectrum_power, smeared_power.abs(), alpha=1.0 / MAX_SMEARING)
 
 
 class SmoothSmearing(torch.autograd.Function):
     """Smearing of spectra as MSBG's, with bounded derivatives and few steps for the gradient.
 
     Let x be the spectrum, p = |x|^2 its power, A the matrix, s = A p the smeared power, d the
-    divisor and f the factor of ``_smooth_factor``, and z = f x the smeared spectrum. Let h be the
-    gradient with respect to s, G the one with respect to z, and q = G conj(x). The gradient with
-    respect to the ratio s / d is u = Re(q f) / (2 |f|^2). Then, with t = u p / d^2 + h,
+    divisor of the ratio, f the factor and z = f x the smeared spectrum. Let h be the gradient with
+    respect to s, G the one with respect to z, and q = G conj(x). The gradient with respect to the
+    ratio s / d is u = Re(q f) / (2 |f|^2). Then, with t = u p / d^2 + h,
 
     - the gradient with respect to x is G conj(f) + 2 x (A^T t - u s / d^2);
     - the gradient with respect to A is t p^T.
@@ -311,12 +314,10 @@ class SmoothSmearing(torch.autograd.Function):
 
     @staticmethod
     def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, ...]:
-        spectrum_power = power(spectrum)
-        smeared_power = (spectrum_power @ matrix.mT).add_(_SILENCE)
-        spectrum_power = spectrum_power + _SILENCE
-        real, imaginary, square, divisor = _smooth_factor(spectrum_power, smeared_power)
-        smeared = spectrum * torch.complex(real, imaginary)
-        return smeared, smeared_power, spectrum_power, real, imaginary, square, divisor
+        powers = power(spectrum)
+        smeared_power = (powers @ matrix.mT).add_(_SILENCE)
+        real, imaginary = _smooth_factor(powers.add_(_SILENCE), smeared_power)
+        return spectrum * torch.complex(real, imaginary), smeared_power, real, imaginary
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
@@ -324,29 +325,32 @@ class SmoothSmearing(torch.autograd.Function):
         ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, power_gradient: Tensor, *_: Tensor) -> Any:
-        spectrum, matrix, *saved = ctx.saved_tensors
-        smeared_power, spectrum_power, real, imaginary, square, divisor = saved
+    def backward(
+        ctx: Any, gradient: Tensor, power_gradient: Tensor, *_: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        spectrum, matrix, smeared_power, real, imaginary = ctx.saved_tensors
+        # Real and imaginary parts are separate and contiguous, because torch would convert the real
+        # factors of a complex product to complex numbers, and is slow on every other number.
+        x_real, x_imag = spectrum.real.contiguous(), spectrum.imag.contiguous()
+        g_real, g_imag = gradient.real.contiguous(), gradient.imag.contiguous()
+        powers = torch.addcmul(x_real.square() + _SILENCE, x_imag, x_imag)
         if torch.is_grad_enabled():
             # This gradient is itself differentiated, so it must depend on the spectrum.
-            spectrum_power = power(spectrum)
-            smeared_power = spectrum_power @ matrix.mT + _SILENCE
-            spectrum_power = spectrum_power + _SILENCE
-            real, imaginary, square, divisor = _smooth_factor(spectrum_power, smeared_power)
-        # Real and imaginary parts are computed separately, because torch would first convert the
-        # real factors of a complex product to complex numbers.
-        g, x = torch.view_as_real(gradient).unbind(-1), torch.view_as_real(spectrum).unbind(-1)
-        q_real = torch.addcmul(g[0] * x[0], g[1], x[1])
-        q_imag = torch.addcmul(g[1] * x[0], g[0], x[1], value=-1.0)
-        u = torch.addcmul(q_real * real, q_imag, imaginary, value=-1.0) / (2.0 * square * divisor)
-        t = torch.addcmul(power_gradient, u, spectrum_power / divisor)
+            smeared_power = power(spectrum) @ matrix.mT + _SILENCE
+            real, imaginary = _smooth_factor(powers, smeared_power)
+        divisor = _ratio_divisor(powers, smeared_power)
+        q_real = torch.addcmul(g_real * x_real, g_imag, x_imag)
+        q_imag = torch.addcmul(g_imag * x_real, g_real, x_imag, value=-1.0)
+        squared_factor = torch.addcmul(real.square(), imaginary, imaginary)
+        u = torch.addcmul(q_real * real, q_imag, imaginary, value=-1.0)
+        u = 0.5 * u / (squared_factor * divisor)
+        t = torch.addcmul(power_gradient, u, powers / divisor)
         weight = 2.0 * torch.addcmul(t @ matrix, u, smeared_power / divisor, value=-1.0)
-        matrix_gradient = None
-        if ctx.needs_input_grad[1]:
-            matrix_gradient = t.mT @ spectrum_power
+        matrix_gradient = t.mT @ powers if ctx.needs_input_grad[1] else None
+        direct_real = torch.addcmul(g_real * real, g_imag, imaginary)
+        direct_imag = torch.addcmul(g_imag * real, g_real, imaginary, value=-1.0)
         spectrum_gradient = torch.complex(
-            torch.addcmul(torch.addcmul(g[0] * real, g[1], imaginary), x[0], weight),
-            torch.addcmul(torch.addcmul(g[1] * real, g[0], imaginary, value=-1.0), x[1], weight),
+            torch.addcmul(direct_real, x_real, weight), torch.addcmul(direct_imag, x_imag, weight)
         )
         return spectrum_gradient, matrix_gradient
 

@@ -29,7 +29,6 @@ from hlsim.training.augment import (
 from hlsim.training.clips import Clips, Source
 from hlsim.training.corpora.manifest import read_manifest
 from hlsim.training.ears import draw_thresholds
-from hlsim.training.gradients import ExactGradients
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 from hlsim.training.tones_and_clicks import draw_sounds
 
@@ -40,7 +39,6 @@ Batch = dict[str, Tensor]
 - ``thresholds``: ears in dB HL with shape (items, 8)
 - ``impaired`` (simulators): output of the teacher in pascals with shape (items, time)
 - ``clean``: clean speech in pascals with shape (items, time)
-- ``cotangent``, ``gradient`` (simulators, in some steps): gradients of ``ExactGradients``
 - ``noise_reduction`` (hearing aids): strength of noise reduction, 0 or 1, with shape (items,)
 """
 
@@ -56,8 +54,8 @@ _VALIDATION_SECONDS = 2.0
 _VALIDATION_BATCH = 4
 """Number of items in a batch for validation."""
 
-_HIGHEST_SPEECH = 80.0
-"""Highest level in dB SPL of the clean speech that belongs to the signal of a simulator."""
+_HIGHEST_CLEAN_LEVEL = 80.0
+"""Highest level in dB SPL of the clean speech that belongs to an input of a simulator."""
 
 _MEASURED_SHARE = 0.5
 """Share of measured ears, if there are any. The others are random."""
@@ -202,8 +200,8 @@ class _SimulatorBatches(_RandomBatches):
         clips = self.replace_by_sounds(self.speech.draw(count, generator), generator)
         levels, treated = self.recipe.levels, self.recipe.treated
         signal = augment_speech(clips, noise, ears, generator, levels=levels, treated=treated)
-        clean = set_level(clips, level_spl(signal).clamp_max(_HIGHEST_SPEECH))
-        return {"signal": signal, "thresholds": ears, "clean": clean}
+        clean = set_level(clips, level_spl(signal).clamp_max(_HIGHEST_CLEAN_LEVEL))
+        return {"signal": signal, "clean": clean, "thresholds": ears}
 
 
 class _CompensatorBatches(_RandomBatches):
@@ -267,8 +265,6 @@ class BatchData(L.LightningDataModule):
         training: Data set that returns a batch for each index.
         validation: Batches for validation.
         teacher: Simulator that is called on the training device; None leaves batches as they are.
-        gradients: Gradients through the exact MSBG, which then is the teacher; None for none.
-        gradient_every: Number of steps from one batch with gradients to the next.
         workers: Number of processes that draw batches, in addition to the one that trains.
 
     >>> data = BatchData([], validation=[{"clean": Tensor([1.0])}])
@@ -282,16 +278,12 @@ class BatchData(L.LightningDataModule):
         validation: Sequence[Batch],
         *,
         teacher: Teacher | None = None,
-        gradients: ExactGradients | None = None,
-        gradient_every: int = 1,
         workers: int = 0,
     ) -> None:
         super().__init__()
         self.training = training
         self.validation = validation
         self.teacher = teacher
-        self.gradients = gradients
-        self.gradient_every = gradient_every
         self.workers = workers
 
     def train_dataloader(self) -> DataLoader[Any]:
@@ -307,11 +299,6 @@ class BatchData(L.LightningDataModule):
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         if self.teacher is None:
             return batch
-        trainer: Any = self.trainer
-        is_due = trainer.training and trainer.global_step % self.gradient_every == 0
-        if self.gradients is not None and is_due:
-            tensors = self.gradients(batch["signal"], batch["clean"], batch["thresholds"])
-            return batch | dict(zip(("impaired", "cotangent", "gradient"), tensors, strict=True))
         return batch | {"impaired": self.teacher(batch["signal"], batch["thresholds"])}
 
 
@@ -335,16 +322,12 @@ def simulator_data(data: TrainingData, recipe: SimulatorRecipe, teacher: Teacher
     >>> speech = Path(__file__).parents[1] / "data" / "speech" / "train"
     >>> batches = simulator_data(TrainingData(speech), SimulatorRecipe(), MSBG())
     >>> list(batches.training[0])
-    ['signal', 'thresholds']
+    ['signal', 'clean', 'thresholds']
     """
     levels = (50.0, 80.0) if recipe.treated else recipe.levels
     plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False)
     validation = _SimulatorBatches(plain, data.validation())
-    batches = _make_data(data, _SimulatorBatches(recipe, data), validation, teacher)
-    if recipe.weights.get("gradient"):
-        batches.gradients = ExactGradients()
-        batches.gradient_every = recipe.gradient_every
-    return batches
+    return _make_data(data, _SimulatorBatches(recipe, data), validation, teacher)
 
 
 def compensator_data(

@@ -1,94 +1,100 @@
-"""Gradients of a loss through the exact MSBG, with which those through a network are compared."""
+"""Comparison of the gradients through a network with those through the exact MSBG.
+
+A simulator serves to train aids, so its gradient matters as much as its output. Networks with
+nearly the same output may have different gradients, above all where the output is soft.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.coherent_bands import DEFAULT_WEIGHTS, coherent_band_parts, limit_gradient_spikes
 from hlsim.losses.criteria import weighted_sum
+from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 
-_SMALLEST = 1e-30
-"""Magnitude from which a gradient is not 0."""
+_SMALLEST_GRADIENT = 1e-30
+"""Magnitude below which a gradient counts as 0."""
 
 
-class ExactGradients:
-    """Gradients of two criteria of ``HearingLossLoss`` through the exact MSBG.
+class ExactGradients(NamedTuple):
+    """Gradients of a loss through the exact MSBG.
+
+    Shape: (items, time) each.
+
+    Attributes:
+        output: Gradient with respect to what the ears perceive, up to a factor for each item.
+        input: Gradient with respect to the input of the simulator, with limited spikes.
+    """
+
+    output: Tensor
+    input: Tensor
+
+
+@torch.enable_grad()
+def exact_gradients(signal: Tensor, clean: Tensor, ears: Tensor) -> ExactGradients:
+    """Compute gradients of two criteria of ``HearingLossLoss`` through the exact MSBG.
 
     The first half of the items has the criterion ``coherent-bands``, the others ``bands``.
 
+    Shape: (items, time), (items, time), (items, 8).
+
+    Args:
+        signal: Inputs of the simulator in pascals.
+        clean: Clean speech in pascals.
+        ears: Thresholds in dB HL.
+
     >>> signal = 0.02 * torch.randn(2, 8000)
-    >>> _, _, gradient = ExactGradients()(signal, signal, torch.full((2, 8), 40.0))
-    >>> gradient.shape
+    >>> exact_gradients(signal, signal, torch.full((2, 8), 40.0)).input.shape
     torch.Size([2, 8000])
     """
-
-    def __init__(self) -> None:
-        self._loss = HearingLossLoss(simulator="msbg")
-
-    @torch.enable_grad()
-    def __call__(self, signal: Tensor, clean: Tensor, ears: Tensor) -> tuple[Tensor, ...]:
-        """Compute what the ears perceive, and two gradients of the loss.
-
-        Shape: (items, time), (items, time), (items, 8) -> three times (items, time).
-
-        Args:
-            signal: Outputs of an aid in pascals.
-            clean: Clean speech in pascals.
-            ears: Thresholds in dB HL.
-
-        Returns:
-            What the ears perceive; the gradient with respect to it; and the gradient with respect
-            to ``signal``, with limited spikes.
-        """
-        signal = signal.detach().requires_grad_()
-        perceived, reference = self._loss.heard(signal, clean, ears)
-        leaf = perceived.detach().requires_grad_()
-        half = len(signal) // 2
-        parts = coherent_band_parts(leaf[:half], reference[:half], NEURO_RATE)
-        values = weighted_sum(parts, {name: DEFAULT_WEIGHTS[name] for name in parts}).sum()
-        values = values + band_level_loss(leaf[half:], reference[half:], NEURO_RATE).sum()
-        (cotangent,) = torch.autograd.grad(values, leaf)
-        # Its scale does not matter, and gradients of speech that is hardly perceived are extreme.
-        cotangent = functional.normalize(cotangent, dim=-1, eps=_SMALLEST)
-        (gradient,) = torch.autograd.grad(perceived, signal, cotangent)
-        return perceived.detach(), cotangent, limit_spikes(gradient, signal)
+    signal = signal.detach().requires_grad_()
+    perceived, reference = HearingLossLoss(simulator="msbg").heard(signal, clean, ears)
+    output = perceived.detach().requires_grad_()
+    half = len(signal) // 2
+    parts = coherent_band_parts(output[:half], reference[:half], NEURO_RATE)
+    weights = {name: DEFAULT_WEIGHTS[name] for name in parts}
+    errors = band_level_loss(output[half:], reference[half:], NEURO_RATE)
+    total = weighted_sum(parts, weights).sum() + errors.sum()
+    (output_gradient,) = torch.autograd.grad(total, output)
+    # For speech that is hardly perceived, the gradient would exceed single precision.
+    output_gradient = functional.normalize(output_gradient, dim=-1, eps=_SMALLEST_GRADIENT)
+    (input_gradient,) = torch.autograd.grad(perceived, signal, output_gradient)
+    return ExactGradients(output_gradient, _limit_spikes(input_gradient, signal))
 
 
-def limit_spikes(gradient: Tensor, signal: Tensor) -> Tensor:
-    """Limit the spikes of gradients as ``HearingLossLoss`` does.
+def gradient_error(perceived: Tensor, signal: Tensor, expected: ExactGradients) -> Tensor:
+    """Compute 1 minus the cosine of a network's gradient with that through the exact MSBG.
 
-    The factors of the limitation count as constants.
-
-    Shape: (items, time), (items, time) -> (items, time).
-    """
-    with torch.enable_grad():
-        leaf = signal.detach().requires_grad_()
-        fixed = gradient.detach()
-        limited = limit_gradient_spikes(leaf, NEURO_RATE)
-        (limited,) = torch.autograd.grad(limited, leaf, fixed)
-    factor = torch.where(fixed.abs() > _SMALLEST, limited / fixed, 1.0)
-    return gradient * factor
-
-
-def gradient_error(
-    perceived: Tensor, signal: Tensor, cotangent: Tensor, expected: Tensor
-) -> Tensor:
-    """Compute 1 minus the cosine of a network's gradient with that of the exact MSBG.
-
-    Shape: four times (items, time) -> (items,).
+    Shape: (items, time) twice -> (items,).
 
     Args:
         perceived: Output of the network for ``signal``.
-        signal: Input, which requires a gradient.
-        cotangent: Gradient with respect to the output of the exact MSBG.
-        expected: Gradient of the exact MSBG from ``ExactGradients``.
+        signal: Input of the network, which requires a gradient.
+        expected: Gradients through the exact MSBG for the same input.
     """
-    (gradient,) = torch.autograd.grad(perceived, signal, cotangent, create_graph=True)
-    gradient = limit_spikes(gradient, signal)
-    scale = gradient.detach().square().mean(-1, keepdim=True).sqrt().clamp_min(_SMALLEST)
-    return 1.0 - functional.cosine_similarity(gradient / scale, expected, dim=-1, eps=_SMALLEST)
+    (gradient,) = torch.autograd.grad(perceived, signal, expected.output, create_graph=True)
+    limited = _limit_spikes(gradient, signal)
+    size = limited.detach().square().mean(-1, keepdim=True).sqrt().clamp_min(_SMALLEST_GRADIENT)
+    unit = limited / size
+    return 1.0 - functional.cosine_similarity(unit, expected.input, dim=-1, eps=_SMALLEST_GRADIENT)
+
+
+def _limit_spikes(gradient: Tensor, signal: Tensor) -> Tensor:
+    """Limit the spikes of gradients as ``HearingLossLoss`` does, by factors without a gradient.
+
+    Shape: (items, time) twice -> (items, time).
+    """
+    values = gradient.detach()
+    with torch.enable_grad():
+        leaf = signal.detach().requires_grad_()
+        limited = limit_gradient_spikes(leaf, NEURO_RATE)
+    (limited_values,) = torch.autograd.grad(limited, leaf, values)
+    is_zero = values.abs() < _SMALLEST_GRADIENT
+    factors = torch.where(is_zero, 1.0, limited_values / values)
+    return gradient * factors

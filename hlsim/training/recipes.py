@@ -82,12 +82,12 @@ class SimulatorRecipe(TrainingRecipe):
 
     Attributes:
         model: Settings of ``NeuroConfig``.
-        weights: Weights of ``snr``, ``log_spectrum`` and ``levels``, all in dB / 10; of
-            ``gradient``, 1 minus the cosine of the gradients that a loss has through the network
-            and through the exact MSBG; and of the paper's ``magnitude``, ``phase``, ``complex``
-            and ``time``.
-        gradient_every: Number of steps from one comparison of gradients to the next. A step with
-            the comparison takes three times as long.
+        weights: Weights of ``snr``, ``log_spectrum`` and ``levels`` (of bands, where the input is
+            audible), all in dB / 10; of ``gradient``, 1 minus the cosine of the gradients through
+            the network and through the exact MSBG; and of the paper's ``magnitude``, ``phase``,
+            ``complex`` and ``time``.
+        gradient_every: Number of steps from one comparison of gradients to the next. With it, a
+            step takes three times as long.
         unit_power: Signal by whose power all signals are divided before the criteria, ``truth`` or
             ``input``. ``truth`` is the target, with which soft items count as much as loud ones.
             ``input`` is the choice of MP-SENet. The paper's criteria require ``input`` for networks

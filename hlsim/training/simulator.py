@@ -22,7 +22,7 @@ from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.batches import Batch, TrainingData, simulator_data
-from hlsim.training.gradients import gradient_error
+from hlsim.training.gradients import exact_gradients, gradient_error
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.teacher import find_teacher
@@ -56,31 +56,29 @@ class SimulatorTraining(TrainingModule):
         super().__init__(network, recipe)
 
     def training_loss(self, batch: Batch) -> Tensor:
-        signal, target = batch["signal"], batch["impaired"]
-        compares_gradients = "gradient" in batch
-        if compares_gradients:
-            signal = signal.detach().requires_grad_()
-        perceived = self.network(signal, batch["thresholds"])
+        signal, target, ears = batch["signal"], batch["impaired"], batch["thresholds"]
+        weights = dict(self.recipe.weights)
+        if self.global_step % self.recipe.gradient_every:
+            weights.pop("gradient", None)
+        compares_gradients = bool(weights.get("gradient"))
+        network_input = signal.detach().requires_grad_(compares_gradients)
+        perceived = self.network(network_input, ears)
         parts = {}
         if compares_gradients:
-            parts["gradient"] = gradient_error(
-                perceived, signal, batch["cotangent"], batch["gradient"]
-            )
-            signal = signal.detach()
-        unit = target if self.recipe.unit_power == "truth" else signal
-        scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
-        weights = self.recipe.weights
+            expected = exact_gradients(signal, batch["clean"], ears)
+            parts["gradient"] = gradient_error(perceived, network_input, expected)
         if weights.get("levels"):
             parts["levels"] = band_level_distance_db(perceived, target, signal) / 10.0
+        unit = target if self.recipe.unit_power == "truth" else signal
+        scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
         target = target * scale
         perceived = perceived * scale
         parts["snr"] = noise_to_signal_db(perceived, target) / 10.0
         if weights.get("log_spectrum"):
             parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
-        if set(weights) - {"snr", "log_spectrum", "levels", "gradient"}:
+        if set(weights) - parts.keys() - {"log_spectrum"}:
             parts |= paper_parts(perceived, target)
-        present = {name: weight for name, weight in weights.items() if name in parts}
-        return weighted_sum(parts, present).mean()
+        return weighted_sum(parts, weights).mean()
 
     def evaluate(self, batch: Batch) -> Tensor:
         """Compute the ratio of the teacher's output to the network's error in dB for each item."""

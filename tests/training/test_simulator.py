@@ -13,6 +13,7 @@ from hlsim import MSBG
 from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
 from hlsim.training.batches import Batch, TrainingData, simulator_data
+from hlsim.training.gradients import exact_gradients, gradient_error
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
 from tests.helpers import write_ears
@@ -88,6 +89,21 @@ def test_all_criteria_train_with_noise_and_measured_ears(
     ears = write_ears(tmp_path / "ears.csv", "N5")
     sources = replace(data, noise=data.speech, audiograms=ears)
     check_gradients(SimulatorTraining(recipe), training_batch(sources, recipe))
+
+
+def test_the_cosine_of_gradients_is_one_for_the_exact_msbg_and_trains_a_network(
+    data: TrainingData,
+) -> None:
+    recipe = replace(SMALL, weights={"snr": 1.0, "levels": 1.0, "gradient": 1.0})
+    batch = training_batch(data, recipe)
+    signal = batch["signal"].requires_grad_()
+    expected = exact_gradients(signal, batch["clean"], batch["thresholds"])
+    perceived = MSBG()(signal, batch["thresholds"])
+    errors = gradient_error(perceived, signal, expected)
+    torch.testing.assert_close(errors, torch.zeros(2), atol=1e-4, rtol=0.0)
+    errors = gradient_error(-perceived, signal, expected)
+    torch.testing.assert_close(errors, torch.full((2,), 2.0), atol=1e-4, rtol=0.0)
+    check_gradients(SimulatorTraining(recipe), batch)
 
 
 def test_another_teacher_is_recorded_and_needs_another_folder(
