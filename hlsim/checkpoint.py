@@ -30,7 +30,7 @@ WEIGHTS = "model.safetensors"
 OLDER_WEIGHTS = "model.older.safetensors"
 CONFIG = "config.json"
 
-_WITHOUT_CHECKPOINT = ("msbg", "attenuation", "nalr", "wdrc")
+_WITHOUT_CHECKPOINT = ("msbg", "msbg-unsmeared", "attenuation", "nalr", "wdrc")
 """Names of simulators and aids that have no checkpoint."""
 CARD = "README.md"
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -36,6 +38,9 @@ EXACT = "msbg"
 
 LINEAR = "attenuation"
 """Name of ``Attenuation``."""
+
+UNSMEARED = "msbg-unsmeared"
+"""Name of the exact MSBG without spectral smearing."""
 
 _HALF_LENGTH_SECONDS = 0.064
 """Time in seconds that the filter of ``Attenuation`` covers before and after time 0."""
@@ -194,9 +199,10 @@ def load_simulator(
     """Return the simulator that a name, a folder or a module describes.
 
     Args:
-        simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name of a
-            checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or the folder of a
-            checkpoint; ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
+        simulator: ``"msbg"``, the exact model; ``"msbg-unsmeared"``, the exact model without
+            spectral smearing; ``"attenuation"``, a linear ear; the name of a checkpoint that ships
+            with hlsim, such as ``"neuro-msbg"``, or the folder of a checkpoint;
+            ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
             (``PluginSimulator``); or a module, which is returned. Those of its attributes
             ``sample_rate``, ``full_scale_spl`` and ``aligned`` that exist are validated.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
@@ -217,9 +223,13 @@ def load_simulator(
                 raise ValueError(f"expected a simulator with {attribute}={value}, got {setting}")
         return simulator
     name = str(simulator)
-    if name in (EXACT, LINEAR):
-        kind = MSBG if name == EXACT else Attenuation
-        return kind(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    kinds: dict[str, Callable[..., nn.Module]] = {
+        EXACT: MSBG,
+        UNSMEARED: partial(MSBG, smearing=False),
+        LINEAR: Attenuation,
+    }
+    if name in kinds:
+        return kinds[name](sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     if ":" in name and not Path(name).is_dir():
         return PluginSimulator(name, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)

@@ -127,6 +127,33 @@ def test_linear_ear_is_linear_and_takes_ears_as_other_simulators_do() -> None:
             ear(speech, bad)
 
 
+@pytest.mark.parametrize("ear", ["N2", "N3", "N4"])
+def test_exact_model_without_smearing_fills_a_spectral_notch_less(ear: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    spectrum = torch.fft.rfft(0.05 * torch.randn(16000, generator=generator))
+    notch = slice(1500, 2000)
+    spectrum[notch] = 0.0
+    noise = torch.fft.irfft(spectrum)
+    depths = []
+    for name in ("msbg", "msbg-unsmeared"):
+        powers = torch.fft.rfft(load_simulator(name)(noise, ear)).abs().square()
+        beside = torch.cat([powers[1300:1500], powers[2000:2200]])
+        depths.append(float(10.0 * (beside.mean() / powers[notch].mean()).log10()))
+    smeared, unsmeared = depths
+    assert unsmeared > smeared + 3.0
+
+
+def test_exact_model_without_smearing_is_the_exact_model_where_nothing_is_smeared() -> None:
+    speech = hlsim.example_speech()[:16000]
+    unsmeared = load_simulator("msbg-unsmeared")
+    assert torch.equal(unsmeared(speech, "NH"), MSBG()(speech, "NH"))
+    late = MSBG("N4", sample_rate=44100, aligned=False, smearing=False)
+    advanced = late(speech)[..., late.delay("severe") :]
+    aligned = MSBG("N4", sample_rate=44100, smearing=False)(speech)
+    difference = aligned[: len(advanced)] - advanced[: len(aligned)]
+    assert float(difference.norm()) < 2e-3 * float(aligned.norm())
+
+
 def test_a_simulator_that_changes_its_arguments_changes_nothing_of_the_caller(plugin: str) -> None:
     ear, clean = torch.full((8,), 40.0), hlsim.example_speech()[:16000]
     before = clean.clone()

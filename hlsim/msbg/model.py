@@ -107,6 +107,8 @@ class MSBG(nn.Module):
         rescale_active: Whether each signal is first scaled by the ratio of its overall RMS to the
             RMS of its active frames, 1 to 3 dB down depending on the utterance, as pyclarity does
             with one channel. (It scales two channels by one gain.)
+        smearing: Whether the wide auditory filters of an impaired ear smear spectra. Without
+            smearing, recruitment remains; the difference shows what depends on smearing.
 
     Attributes:
         thresholds: Thresholds of the constructor's ears at ``FREQUENCIES`` in dB HL, (..., 8), or
@@ -138,12 +140,14 @@ class MSBG(nn.Module):
         full_scale_spl: float = PASCAL_SPL,
         aligned: bool = True,
         rescale_active: bool = False,
+        smearing: bool = True,
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.aligned = aligned
         self.rescale_active = rescale_active
+        self.smearing = smearing
         self.checkpoint = False
         self.register_buffer("thresholds", store_thresholds(audiogram), persistent=False)
         self._two_ears = has_listeners(audiogram)
@@ -188,7 +192,11 @@ class MSBG(nn.Module):
         """
         if severity not in SEVERITIES:
             raise ValueError(f"expected a severity of {', '.join(SEVERITIES)}, got {severity!r}")
-        return STRUCTURAL_DELAY + (SMEARING_DELAY if severity in BROADENING else 0)
+        return STRUCTURAL_DELAY + (SMEARING_DELAY if self._smears(severity) else 0)
+
+    def _smears(self, severity: str) -> bool:
+        """Return whether the spectra of ears of a severity are smeared."""
+        return self.smearing and severity in BROADENING
 
     def extra_repr(self) -> str:
         return (
@@ -273,7 +281,7 @@ class MSBG(nn.Module):
         rate = self.sample_rate
         samples = signals.shape[-1]
         bank = BANKS[group.severity]
-        smears = group.severity in BROADENING
+        smears = self._smears(group.severity)
         rate_divisor = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
         delay = self.delay(group.severity) if self.aligned else 0
         highest = rate / 2 if rate_divisor == 2 else MSBG_RATE / 2
