@@ -114,7 +114,8 @@ class WaveformPlugin:
         """Call the plug-in, and validate its output.
 
         Shape: (..., time) -> (..., time), in the precision of the waveform; for an aid
-        (..., time) -> (..., samples) with any number of samples.
+        (time,), (2, time) or (microphones, 2, time) -> (samples,) or (2, samples) with any number
+        of samples.
 
         Args:
             waveform: First argument of the plug-in.
@@ -137,14 +138,16 @@ class WaveformPlugin:
         except Exception as error:  # because code of a plug-in may raise anything
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
         is_real = isinstance(output, Tensor) and not output.is_complex()
-        end = -1 if self.kind == "aid" else None  # An aid may change the duration.
-        has_shape = is_real and output.ndim == waveform.ndim
-        if not has_shape or output.shape[:end] != waveform.shape[:end]:
+        # An aid may change the duration, and its input may be that of several microphones.
+        is_aid = self.kind == "aid"
+        shape, end = (waveform.shape[-2:], -1) if is_aid else (waveform.shape, None)
+        has_shape = is_real and output.ndim == len(shape)
+        if not has_shape or output.shape[:end] != shape[:end]:
             kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
             raise ValueError(
                 f"{self.kind} {self.name} returned {kind} of shape "
                 f"{tuple(getattr(output, 'shape', ()))}, expected a real tensor of shape "
-                f"{tuple(waveform.shape)}"
+                f"{tuple(shape)}"
             )
         if not output.requires_grad and not bool(output.isfinite().all()):
             raise ValueError(f"{self.kind} {self.name} returned samples that are NaN or infinite")

@@ -6,7 +6,8 @@ import shutil
 import sys
 import threading
 import time
-from typing import TextIO
+from collections.abc import Iterable, Iterator
+from typing import TextIO, TypeVar
 
 _LINE_INTERVAL = 10.0
 """Longest time in seconds between two lines, if stderr is not a terminal."""
@@ -14,6 +15,8 @@ _LINE_INTERVAL = 10.0
 _TICK = 1.0
 """Time in seconds between two looks at the clock."""
 
+
+Part = TypeVar("Part")
 
 _active_lines: list[ProgressLine] = []
 """Lines of which the last one is shown."""
@@ -118,6 +121,36 @@ class ProgressLine:
         if is_due or sys.stderr.isatty() or now - self._last_line >= _LINE_INTERVAL:
             self._last_line = now
             show_line(text, sys.stderr)
+
+
+def track(parts: Iterable[Part], unit: str, total: int) -> Iterator[Part]:
+    """Yield the parts of a stage of long work, which the line that is shown, if any, counts.
+
+    Before and after the stage, the line shows what it showed before.
+
+    Args:
+        parts: Parts of the work.
+        unit: Plural noun for the parts, such as "pictures".
+        total: Number of the parts.
+
+    >>> list(track([1, 2], "pictures", 2))
+    [1, 2]
+    """
+    if not _active_lines:
+        yield from parts
+        return
+    line = _active_lines[-1]
+    state = line.unit, line._first, line._counts, line._details
+    start = time.time()
+    try:
+        for number, part in enumerate(parts):
+            with line._lock:
+                line.unit, line._first, line._details = unit, (0, start), ""
+                line._counts = number, total
+            yield part
+    finally:
+        with line._lock:
+            line.unit, line._first, line._counts, line._details = state
 
 
 def clear_line(file: TextIO) -> None:

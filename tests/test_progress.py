@@ -1,10 +1,30 @@
 """Progress and expected end of long work, on stderr."""
 
 import time
+from collections.abc import Callable
 
 import pytest
 
-from hlsim.progress import ProgressLine
+from hlsim.progress import ProgressLine, track
+
+
+@pytest.fixture
+def wait_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[[str], None]:
+    """Return a function that waits until a text appears on stderr, whose lines come often."""
+    monkeypatch.setattr("hlsim.progress._TICK", 0.01)
+    monkeypatch.setattr("hlsim.progress._LINE_INTERVAL", 0.02)
+
+    def wait(text: str) -> None:
+        printed = ""
+        end = time.monotonic() + 10.0
+        while text not in printed:
+            assert time.monotonic() < end, printed
+            time.sleep(0.02)
+            printed += capsys.readouterr().err
+
+    return wait
 
 
 def test_the_end_follows_from_the_pace_since_the_first_call(
@@ -55,20 +75,28 @@ def test_the_line_of_a_part_of_the_work_replaces_that_of_the_whole(
     assert "training, 0 s" in capsys.readouterr().err
 
 
-def test_there_is_a_sign_of_life_before_between_and_after_the_calls(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_parts_of_a_stage_are_counted_with_the_time_that_is_left(
+    wait_for: Callable[[str], None],
 ) -> None:
-    monkeypatch.setattr("hlsim.progress._TICK", 0.01)
-    monkeypatch.setattr("hlsim.progress._LINE_INTERVAL", 0.02)
+    with ProgressLine("scores", "reading", "drawing the page") as progress:
+        stage = track("ab", "aids", 2)
+        assert next(stage) == "a"
+        wait_for("0 of 2 aids (0%)")
+        assert next(stage) == "b"
+        wait_for("1 of 2 aids (50%), 0.0 min left")
+        assert [*stage] == []
+        wait_for("reading, ")
+        progress(4, 4)
+        pictures = track("abc", "pictures", 3)
+        assert [next(pictures), next(pictures)] == ["a", "b"]
+        wait_for("1 of 3 pictures (33%), 0.0 min left")
+        pictures.close()  # type: ignore[attr-defined]
+        wait_for("drawing the page, ")
 
-    def wait_for(text: str) -> None:
-        printed = ""
-        end = time.monotonic() + 10.0
-        while text not in printed:
-            assert time.monotonic() < end, printed
-            time.sleep(0.02)
-            printed += capsys.readouterr().err
 
+def test_there_is_a_sign_of_life_before_between_and_after_the_calls(
+    wait_for: Callable[[str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
     with ProgressLine("scores", "reading", "drawing the page") as progress:
         wait_for("reading, 0 s")
         progress(1, 4)

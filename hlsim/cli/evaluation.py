@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hlsim.cli.inputs import check_extras, read_ears, warn_of_other_ears
+from hlsim.cli.inputs import check_extras, parse_ear, warn_of_other_ears
 from hlsim.cli.options import (
     ALL_EARS,
     EARS_TABLE,
@@ -67,27 +67,16 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from hlsim.report.simulators_page import simulators_page
     from hlsim.simulators import load_simulator
 
-    simulators = {
-        label: load_simulator(name) for label, name in _read_labels(options.names).items()
-    }
-    with _progress() as progress:
-        evaluation = evaluate_simulators(
-            simulators,
-            speech=options.speech,
-            noise=options.noise,
-            audiograms=options.audiograms,
-            teacher=options.teacher,
-            items=options.items,
-            seconds=options.seconds,
-            levels=options.levels,
-            inputs=options.inputs,
-            compensator=load_compensator(options.compensator) if options.compensator else None,
-            measures=options.own_measures,
-            store=options.out / STORE,
-            **_run_settings(options, progress),
-        )
-        page = simulators_page(evaluation)
-    _finish(evaluation, page, options)
+    names = _read_labels(options.names)
+    compensator = load_compensator(options.compensator) if options.compensator else None
+    _run_study(
+        options,
+        evaluate_simulators,
+        simulators_page,
+        simulators={label: load_simulator(name) for label, name in names.items()},
+        compensator=compensator,
+        store=options.out / STORE,
+    )
 
 
 def evaluate_compensator(parser: Parser) -> None:
@@ -117,29 +106,16 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     from hlsim.report.compensators_page import compensators_page
 
     checkpoints = _read_labels(options.names)
-    ear: Any = read_ears(options)
-    notes = warn_of_other_ears(checkpoints, ear)
-    compensators = {label: load_compensator(name) for label, name in checkpoints.items()}
-    with _progress() as progress:
-        evaluation = evaluate_compensators(
-            compensators,
-            speech=options.speech,
-            noise=options.noise,
-            audiograms=options.audiograms,
-            audiogram=ear,
-            enhancers=options.enhancers,
-            simulator=options.simulator,
-            items=options.items,
-            seconds=options.seconds,
-            levels=options.levels,
-            gain_ears=options.gain_ears,
-            measures=options.own_measures,
-            store=options.out / STORE,
-            **_run_settings(options, progress),
-        )
-        evaluation = replace(evaluation, notes=notes)
-        page = compensators_page(evaluation)
-    _finish(evaluation, page, options)
+    ear: Any = parse_ear(options)
+    _run_study(
+        options,
+        evaluate_compensators,
+        compensators_page,
+        notes=warn_of_other_ears(checkpoints, ear),
+        compensators={label: load_compensator(name) for label, name in checkpoints.items()},
+        audiogram=ear,
+        store=options.out / STORE,
+    )
 
 
 def haspi_report(parser: Parser) -> None:
@@ -188,29 +164,14 @@ def _haspi_report(options: argparse.Namespace) -> None:
     from hlsim.evaluation.recordings import haspi_report
     from hlsim.report.recordings_page import report_page
 
-    ear: Any = read_ears(options)
-    if len(dict(options.conditions)) < len(options.conditions):
-        raise ValueError("two of --condition have the same name; rename one")
-    with _progress() as progress:
-        evaluation = haspi_report(
-            clean=options.clean,
-            before=options.before,
-            after=options.after,
-            conditions=dict(options.conditions) or None,
-            manifest=options.manifest,
-            root=options.root,
-            audiogram=ear,
-            audiograms=options.audiograms,
-            measures=[*options.measures, *options.own_measures],
-            baseline=options.baseline,
-            better_ear=options.better_ear,
-            full_scale_spl=options.full_scale_spl,
-            spl=options.spl,
-            store=options.out / STORE,
-            **_run_settings(options, progress),
-        )
-        page = report_page(evaluation)
-    _finish(evaluation, page, options)
+    _run_study(
+        options,
+        haspi_report,
+        report_page,
+        audiogram=parse_ear(options),
+        conditions=_by_name(options.conditions, "--condition") or None,
+        store=options.out / STORE,
+    )
 
 
 def clarity(parser: Parser) -> None:
@@ -231,11 +192,21 @@ def clarity(parser: Parser) -> None:
         "path/to/file.py:name, a callable (waveform, listener, sample_rate) -> waveform or its "
         "class, for (2, time) at the files' scale"
     )
-    option("names", str, text, nargs="+")
+    option("names", str, text, nargs="*")
+    text = (
+        "existing outputs of an aid as LABEL=FOLDER, in files SCENE_LISTENER_HA-output.wav with "
+        "two channels; repeat the option for several aids"
+    )
+    option("--outputs", _named_folder, text, [], action="append")
     text = "Clarity's listeners.json, or a CSV file with the columns listener, ear, hl_250, ..."
     option("--listeners", input_path, text, required=True)
     text = "JSON file with each scene's listeners; by default every listener in every scene"
     option("--scenes-listeners", input_path, text)
+    text = (
+        "numbers of the microphones whose mean is the input of the aids: 1 is the front one; "
+        "the baseline of the third challenge uses 1 2 3"
+    )
+    option("--microphones", count, text, [1], nargs="+")
     text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1, dest="stride")
     parser.enhancers("waveforms with shape (2, time) in pascals")
@@ -246,26 +217,20 @@ def clarity(parser: Parser) -> None:
 
 
 def _clarity(options: argparse.Namespace) -> None:
+    if not options.names and not options.outputs:
+        raise ValueError("expected the name of an aid, or --outputs; add one")
     check_extras("eval")
     from hlsim.evaluation.clarity import evaluate_scenes
     from hlsim.report.recordings_page import scenes_page
 
-    with _progress() as progress:
-        evaluation = evaluate_scenes(
-            _read_labels(options.names),
-            scenes=options.scenes,
-            listeners=options.listeners,
-            scenes_listeners=options.scenes_listeners,
-            stride=options.stride,
-            enhancers=options.enhancers,
-            linked=options.linked,
-            full_scale_spl=options.full_scale_spl,
-            measures=options.own_measures,
-            out=options.out,
-            **_run_settings(options, progress),
-        )
-        page = scenes_page(evaluation)
-    _finish(evaluation, page, options)
+    _run_study(
+        options,
+        evaluate_scenes,
+        scenes_page,
+        aids=_read_labels(options.names),
+        outputs=_by_name(options.outputs, "--outputs"),
+        out=options.out,
+    )
 
 
 def _read_labels(texts: Sequence[str]) -> dict[str, str]:
@@ -294,6 +259,14 @@ def _named_folder(text: str) -> tuple[str, Path]:
     if not name or not folder:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=FOLDER")
     return name, input_path(folder)
+
+
+def _by_name(named_folders: Sequence[tuple[str, Path]], option: str) -> dict[str, Path]:
+    """Return folders by their names, which must differ."""
+    folders = dict(named_folders)
+    if len(folders) < len(named_folders):
+        raise ValueError(f"two of {option} have the same name; rename one")
+    return folders
 
 
 def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int]) -> None:
@@ -331,27 +304,34 @@ def _declare_study(parser: Parser) -> None:
     parser.option("--out", Path, "folder for the results", required=True)
 
 
-def _progress() -> ProgressLine:
-    """Return the progress of an evaluation."""
-    return ProgressLine("scores", "reading the recordings", "drawing the page")
+def _run_study(
+    options: argparse.Namespace,
+    evaluate: Callable[..., Evaluation],
+    make_page: Callable[[Evaluation], Page],
+    *,
+    notes: Sequence[str] = (),
+    **changes: Any,
+) -> None:
+    """Run an evaluation, write its page, and print its verdict and its first table.
 
-
-def _run_settings(options: argparse.Namespace, progress: ProgressLine) -> dict[str, Any]:
-    """Return the arguments of all evaluations about processes, random draws and the page."""
-    return {
-        "seed": options.seed,
-        "jobs": options.jobs,
-        "dask": options.dask,
-        "progress": progress,
-        "listen": _PLAYED_ITEMS,
-    }
-
-
-def _finish(evaluation: Evaluation, page: Page, options: argparse.Namespace) -> None:
-    """Write the page of an evaluation, and print its verdict and its first table."""
+    Args:
+        options: Options of the command. Each is passed under its name, except the names of aids or
+            simulators, the folder of the results, and further measures, which join the others.
+        evaluate: Function that returns the evaluation.
+        make_page: Function that returns its page.
+        notes: Sentences with which the page begins.
+        changes: Arguments that replace options, and further ones.
+    """
     from hlsim.report.writing import write_results
 
-    path = write_results(page, evaluation, options.out)
+    settings = {**vars(options), "listen": _PLAYED_ITEMS}
+    settings["measures"] = [*settings.get("measures", []), *settings.pop("own_measures")]
+    arguments = {name: settings[name] for name in settings.keys() - {"run", "names", "out"}}
+    with ProgressLine("scores", "reading the recordings", "drawing the page") as progress:
+        evaluation = evaluate(**{**arguments, **changes}, progress=progress)
+        evaluation = replace(evaluation, notes=[*notes, *evaluation.notes])
+        page = make_page(evaluation)
+        path = write_results(page, evaluation, options.out)
     tables = [table for section in page.sections for table in section.tables]
     print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path.as_uri()}")
     failed = len(evaluation.failures)

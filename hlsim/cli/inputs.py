@@ -43,7 +43,7 @@ def check_extras(*extras: str) -> None:
             require(package, extra)
 
 
-def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
+def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
     """Return the ear of ``--audiogram``, or both ears of the listener that ``--listener`` names.
 
     Args:
@@ -62,11 +62,12 @@ def read_ears(options: argparse.Namespace) -> Audiogram | Listener | None:
     return as_audiogram(options.audiogram) if options.audiogram else None
 
 
-def read_named_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
+def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
     """Return the ears of a repeated ``--audiogram`` by their names, or the one of ``--listener``.
 
     The name of a standard ear is its own. That of others consists of the levels, such as
-    "10-20-30-40-50-60-70-80" or "500_30-4000_60".
+    "10-20-30-40-50-60-70-80" or "500_30-4000_60". A compensator that was trained for one other ear
+    causes a warning.
 
     Args:
         options: Parsed options of a command.
@@ -77,10 +78,10 @@ def read_named_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listen
     """
     from hlsim.audiogram import as_audiogram
 
-    if options.listener:
-        return {"listener": _read_listener(options.listener)}
     ears: dict[str, Audiogram | Listener] = {}
-    for value in options.audiogram:
+    if options.listener:
+        ears["listener"] = _read_listener(options.listener)
+    for value in options.audiogram or ():
         if isinstance(value, str):
             name = value.upper()
         elif isinstance(value, dict):
@@ -90,6 +91,9 @@ def read_named_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listen
         if name in ears:
             raise ValueError(f"--audiogram {name} appears twice; leave one out")
         ears[name] = as_audiogram(value)
+    if compensator := getattr(options, "compensator", ""):
+        for ear in ears.values():
+            warn_of_other_ears({compensator: compensator}, ear)
     return ears
 
 
@@ -141,7 +145,16 @@ def warn_of_other_ears(
     return warnings
 
 
-def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
+def build_simulator(options: argparse.Namespace, sample_rate: int) -> Any:
+    """Load the simulator that ``--simulator`` names, for signals at a sample rate in Hz."""
+    from hlsim.simulators import load_simulator
+
+    return load_simulator(
+        options.simulator, sample_rate=sample_rate, full_scale_spl=options.full_scale_spl
+    )
+
+
+def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
     """Load the compensator that ``--compensator`` names.
 
     Args:
@@ -151,9 +164,9 @@ def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
     Raises:
         ValueError: There is no such compensator, or it lacks a slider that is set.
     """
-    import compensators
+    from compensators import load_compensator
 
-    compensator = compensators.load_compensator(
+    compensator = load_compensator(
         options.compensator,
         sample_rate=sample_rate,
         full_scale_spl=options.full_scale_spl,
@@ -169,5 +182,5 @@ def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
     """Return ``noise_reduction`` and ``amplification``, if a user has set them, by name."""
-    values = {name: getattr(options, name) for name in ("noise_reduction", "amplification")}
+    values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}
     return {name: value for name, value in values.items() if value is not None}

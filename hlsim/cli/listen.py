@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import argparse
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import (
+    build_compensator,
+    build_simulator,
     check_extras,
-    load_compensator,
-    read_named_ears,
+    parse_ears,
     read_sliders,
     use_one_thread,
-    warn_of_other_ears,
 )
-from hlsim.cli.options import Parser, input_path, positive_number
-from hlsim.progress import ProgressLine
+from hlsim.cli.options import SIMULATED_EARS, Parser, input_path, positive_number
+from hlsim.progress import ProgressLine, track
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,15 +34,11 @@ def listen(parser: Parser) -> None:
     )
     option = parser.option
     option("files", input_path, "audio files of 16 to 48 kHz", nargs="+")
-    group = parser.add_mutually_exclusive_group(required=True)
-    text = "; repeat the option for several ears"
-    parser.audiogram(text=text, group=group, action="append")
-    parser.listener("both ears, for stereo files, left first", group=group)
+    parser.ears(SIMULATED_EARS, "")
     text = "also play what each ear perceives with an aid: nalr, wdrc, or a name or folder"
     option("--compensator", str, text)
     parser.sliders()
-    text = "msbg (exact), or a checkpoint's name or folder"
-    option("--simulator", str, text, "msbg")
+    parser.simulator("msbg")
     parser.levels("each file")
     text = "duration in seconds from the beginning of each file that is played"
     option("--seconds", positive_number, text, 8.0)
@@ -60,21 +56,10 @@ def _listen(options: argparse.Namespace) -> None:
     check_extras("eval")
     from hlsim.files import write_atomically
     from hlsim.report.page import Page
-    from hlsim.simulators import load_simulator
 
-    ears = read_named_ears(options)
-    for ear in ears.values() if options.compensator else ():
-        warn_of_other_ears({options.compensator: options.compensator}, ear)
-
-    @cache
-    def simulator(rate: int) -> Any:
-        return load_simulator(
-            options.simulator, sample_rate=rate, full_scale_spl=options.full_scale_spl
-        )
-
-    @cache
-    def aid(rate: int) -> Any:
-        return load_compensator(options, rate)
+    ears = parse_ears(options)
+    simulator = cache(partial(build_simulator, options))
+    aid = cache(partial(build_compensator, options))
 
     def perceive(waveform: Tensor, rate: int) -> dict[str, Tensor]:
         sounds = {"original": waveform}
@@ -87,11 +72,6 @@ def _listen(options: argparse.Namespace) -> None:
                 sounds[f"{name} with {options.compensator}"] = simulator(rate)(output, ear)
         return sounds
 
-    sections = []
-    with ProgressLine("files") as progress:
-        for number, file in enumerate(options.files):
-            progress(number, len(options.files))
-            sections.append(_make_section(options, file, perceive))
     thresholds = [
         f"{name}: {', '.join(f'{level:g}' for level in ear.thresholds)} dB HL."
         for name, ear in ears.items()
@@ -102,8 +82,11 @@ def _listen(options: argparse.Namespace) -> None:
         "All sounds of a file have one gain, so that what is soft for an ear is soft here. "
         "Switch between them while one plays: the position stays the same. "
     )
-    page = Page(title, text + " ".join(thresholds), sections)
-    write_atomically(options.out, page.html())
+    with ProgressLine("files", "starting", "writing the page"):
+        files = track(options.files, "files", len(options.files))
+        sections = [_make_section(options, file, perceive) for file in files]
+        page = Page(title, text + " ".join(thresholds), sections)
+        write_atomically(options.out, page.html())
     print(f"The page: {options.out.resolve().as_uri()}")
 
 

@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import Any
 
-from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ears
+from hlsim.cli.inputs import build_compensator, parse_ear, read_sliders, warn_of_other_ears
 from hlsim.cli.options import ALL_EARS, Parser, full_scale, positive_number
 
 
@@ -53,7 +53,7 @@ def _live(options: argparse.Namespace) -> None:
         raise ValueError(
             "--noise-reduction and --amplification have no effect with --simulate; leave them out"
         )
-    ears: Any = read_ears(options)
+    ears: Any = parse_ear(options)
     import torch
 
     from hlsim.calibration import NEURO_RATE
@@ -68,7 +68,7 @@ def _live(options: argparse.Namespace) -> None:
         block, latency = 12 * stream.block, stream.latency
     else:
         warn_of_other_ears({options.compensator: options.compensator}, ears)
-        aid = load_compensator(options, NEURO_RATE)
+        aid = build_compensator(options, NEURO_RATE)
         stream = aid.stream(ears, **sliders)
         block = latency = aid.latency
     play(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -25,6 +26,10 @@ SIMULATED_EARS = "NH, N1 to N6, S1 to S3"
 
 ALL_EARS = "NH, N1 to N7, S1 to S3"
 """Standard ears of commands that do not simulate a loss."""
+
+
+_EAR = re.compile(r"NH|[NS]\d|-?[\d.]+([,:]-?[\d.]+)+", re.IGNORECASE)
+"""Text of an ear on the command line: a name, levels, or frequencies with levels."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -63,6 +68,13 @@ class Parser(argparse.ArgumentParser):
         return text
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        words = sys.argv[1:] if args is None else args
+        for option, value, word in zip(words, words[1:], words[2:], strict=False):
+            if option == "--audiogram" and _EAR.fullmatch(word) and not Path(word).exists():
+                self.error(
+                    f"--audiogram takes one ear, got {value} and {word}; where several are "
+                    f"possible, repeat the option: --audiogram {value} --audiogram {word}"
+                )
         options, unknown = super().parse_known_args(args, namespace)
         if self.prefix and unknown and unknown[0].startswith(self.prefix):
             options.settings = [*options.settings, *unknown]
@@ -165,6 +177,22 @@ class Parser(argparse.ArgumentParser):
             "Clarity's listeners.json; write FILE:NAME if the file holds several listeners"
         )
         self.option("--listener", str, help_, group=group)
+
+    def ears(self, names: str, text: str) -> None:
+        """Declare ``--audiogram``, which users may repeat, and ``--listener`` instead of it.
+
+        Args:
+            names: Names of the standard ears that the command accepts, for the help text.
+            text: End of the help text of ``--audiogram``.
+        """
+        group = self.add_mutually_exclusive_group(required=True)
+        text = f"; repeat the option for several ears{text}"
+        self.audiogram(ears=names, text=text, group=group, action="append")
+        self.listener("both ears, for stereo files, left first", group=group)
+
+    def simulator(self, default: str) -> None:
+        """Declare ``--simulator``, the simulator of what an ear perceives."""
+        self.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", default)
 
     def levels(self, signal: str) -> None:
         """Declare ``--full-scale-spl`` and ``--spl``, of which a user sets at most one.

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.options import Parser, input_path, share
+from hlsim.progress import ProgressLine
 
 
 def prepare(parser: Parser) -> None:
@@ -43,6 +44,10 @@ def _prepare(options: argparse.Namespace) -> None:
     from hlsim.data.layouts import prepare
 
     folders = options.folders.split("/") if options.folders else None
-    print(prepare(options.corpus, options.out, folders=folders, valid_share=options.valid_share))
+    with ProgressLine("files", "reading the corpus"):
+        text = prepare(
+            options.corpus, options.out, folders=folders, valid_share=options.valid_share
+        )
+    print(text)
     root = options.corpus if options.corpus.is_dir() else options.corpus.parent
     print(f"written: {options.out}; train on it with --manifest {options.out} --root {root}")

@@ -6,17 +6,17 @@ import argparse
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import (
-    load_compensator,
-    read_named_ears,
+    build_compensator,
+    build_simulator,
+    parse_ears,
     read_sliders,
     use_one_thread,
-    warn_of_other_ears,
 )
 from hlsim.cli.options import ALL_EARS, SIMULATED_EARS, Parser, input_path
 from hlsim.progress import ProgressLine
@@ -38,8 +38,7 @@ def simulate(parser: Parser) -> None:
         "scenes perceived --audiogram N2 --audiogram N4 --simulator neuro-msbg",
         ears=SIMULATED_EARS,
     )
-    text = "msbg (exact), or a checkpoint's name or folder"
-    parser.option("--simulator", str, text, "msbg")
+    parser.simulator("msbg")
 
 
 def compensate(parser: Parser) -> None:
@@ -76,10 +75,7 @@ def _declare_files(
     parser.option("input", input_path, text)
     text = "wav file (32-bit float) to write, or a folder for such files if the input is a folder"
     parser.option("output", Path, text)
-    group = parser.add_mutually_exclusive_group(required=True)
-    text = "; repeat the option for several ears, whose names then end those of the outputs"
-    parser.audiogram(ears=ears, text=text, group=group, action="append")
-    parser.listener("both ears, for stereo files, left first", group=group)
+    parser.ears(ears, ", whose names then end those of the outputs")
     parser.levels("the input; the output keeps the scale of the file")
     text = (
         "make outputs that exceed full scale softer, to a peak of 0.9, so that players do not clip "
@@ -89,43 +85,30 @@ def _declare_files(
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    def build(rate: int) -> Any:
-        from hlsim.simulators import load_simulator
-
-        return load_simulator(
-            options.simulator, sample_rate=rate, full_scale_spl=options.full_scale_spl
-        )
-
-    use_one_thread()
-    _process(options, read_named_ears(options), build, {})
+    _process(options, build_simulator)
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    use_one_thread()
-    ears = read_named_ears(options)
-    for ear in ears.values():
-        warn_of_other_ears({options.compensator: options.compensator}, ear)
-    _process(options, ears, lambda rate: load_compensator(options, rate), read_sliders(options))
+    _process(options, build_compensator)
 
 
 def _process(
-    options: argparse.Namespace,
-    ears: Mapping[str, Audiogram | Listener],
-    build: Callable[[int], Any],
-    sliders: dict[str, float],
+    options: argparse.Namespace, build_model: Callable[[argparse.Namespace, int], Any]
 ) -> None:
     """Process the file or each file of the folder for each ear, and print a line per output.
 
     Args:
         options: Options of the command.
-        ears: Audiograms by their names, or one listener.
-        build: Function from a sample rate in Hz to a simulator or compensator.
-        sliders: Further arguments of the simulator or compensator, each under its name.
+        build_model: Function from the options and a sample rate in Hz to a simulator or
+            compensator.
     """
+    use_one_thread()
     from hlsim.checks import LOWEST_RATE
 
+    ears = parse_ears(options)
+    sliders = read_sliders(options)
     tasks = _plan_outputs(options.input, options.output, [*ears])
-    build = cache(build)
+    build = cache(partial(build_model, options))
     if options.input.is_dir():
         build(LOWEST_RATE)  # A model that cannot be loaded is reported before the first file.
     failures = 0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hlsim.cli.inputs import check_extras, read_ears
+from hlsim.cli.inputs import check_extras, parse_ear
 from hlsim.cli.options import Parser, count, input_path, minutes, workers
 from hlsim.cli.recipes import add_recipe, make_recipe
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
@@ -34,9 +34,7 @@ def train_compensator(parser: Parser) -> None:
         "--out runs/aid",
     )
     parser.audiogram(text="; without it, one compensator for all ears is trained")
-    parser.option(
-        "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
-    )
+    parser.simulator("neuro-msbg")
     _declare_common(parser)
     add_recipe(parser, CompensatorRecipe, "examples/compensator.yaml")
 
@@ -91,7 +89,7 @@ def _train_compensator(options: argparse.Namespace) -> None:
         )
     check_extras("train")
     recipe = make_recipe(CompensatorRecipe, options.recipe, options.settings)
-    ear: Any = read_ears(options)
+    ear: Any = parse_ear(options)
     from hlsim.training.compensator import train_compensator
 
     folder = train_compensator(

@@ -1,6 +1,6 @@
 """Studies of hearing aids and simulators: items, conditions and measures in, one table out."""
 
-from hlsim.evaluation.comparison import Comparison, compare
+from hlsim.evaluation.comparison import ConditionComparison, compare
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.recordings import haspi_report
 from hlsim.evaluation.result import Evaluation
@@ -9,7 +9,7 @@ from hlsim.evaluation.study import Condition, Item, Measure, run_study
 
 __all__ = [
     "MEASURES",
-    "Comparison",
+    "ConditionComparison",
     "Condition",
     "Evaluation",
     "Item",

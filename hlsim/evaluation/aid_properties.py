@@ -20,6 +20,7 @@ from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.running.parallel import describe_error, one_thread
 from hlsim.evaluation.study import cut_output
 from hlsim.metrics.band_levels import band_centres, band_levels, threshold_in_quiet
+from hlsim.progress import track
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """Frequencies of steady tones in Hz. All but 3001 Hz have the same phase in frames that are
@@ -80,7 +81,8 @@ def measure_aids(
     [{'aid': 'unaided', 'ear': 'N3', 'cost': 0}]
     """
     results = []
-    for (ear_name, ear), (name, aid) in product(ears.items(), aids.items()):
+    pairs = [*product(ears.items(), aids.items())]
+    for (ear_name, ear), (name, aid) in track(pairs, "measurements of aids", len(pairs)):
         try:
             values = measure(aid, ear, *arguments)
         except Exception as error:  # The aid may be code of a user.

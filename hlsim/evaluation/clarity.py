@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from compensators import load_compensator
-from hlsim.audio import read_audio, write_audio
+from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
@@ -29,7 +29,7 @@ from hlsim.checks import reject_duplicates
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.conditions import NAL_R, UNAIDED, Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.measures import find_measures
-from hlsim.evaluation.recorded_items import Recording
+from hlsim.evaluation.recorded_items import RecordedItem
 from hlsim.evaluation.recordings import score_recordings
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.running.parallel import (
@@ -41,6 +41,7 @@ from hlsim.evaluation.running.parallel import (
 )
 from hlsim.evaluation.study import Condition, cut_output
 from hlsim.metrics.pair import common_length
+from hlsim.progress import track
 
 FULL_SCALE_SPL = 100.0
 """Level in dB SPL of RMS 1.0 in the challenges' files."""
@@ -50,6 +51,9 @@ RULE_MS = 5.0
 
 _MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
 """Ends of the names of files with the signals of the front microphones."""
+
+_OTHER_MICROPHONES = (2, 3)
+"""Numbers of the middle and the rear microphone in the names of files, after ``CH``."""
 
 _REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
 """Ends of the names of references. The last one already has the target's level in the room."""
@@ -65,7 +69,7 @@ class _Pair(NamedTuple):
     """A scene for a listener.
 
     Attributes:
-        mix: File with the signals of the front microphones.
+        mix: File with the signals of the front microphones, whose name ends with ``CH1.wav``.
         reference: File with the target without its room.
         scene: Name of the scene.
         name: Name of the listener.
@@ -78,6 +82,15 @@ class _Pair(NamedTuple):
     name: str
     listener: Listener
 
+    def microphone(self, number: int) -> Path:
+        """Return the file with the signals of a microphone, of which 1 is the front one."""
+        return self.mix.with_name(f"{self.mix.name.removesuffix('1.wav')}{number}.wav")
+
+    @property
+    def output_name(self) -> str:
+        """Name of files with outputs of aids, that of the challenges."""
+        return f"{self.scene}_{self.name}_HA-output.wav"
+
 
 def evaluate_scenes(
     aids: Mapping[str, str],
@@ -85,7 +98,9 @@ def evaluate_scenes(
     scenes: str | Path,
     listeners: str | Path,
     out: str | Path,
+    outputs: Mapping[str, str | Path] | None = None,
     scenes_listeners: str | Path | None = None,
+    microphones: Sequence[int] = (1,),
     stride: int = 1,
     enhancers: Sequence[str] = (),
     measures: Sequence[str] = (),
@@ -114,8 +129,16 @@ def evaluate_scenes(
         listeners: Clarity's ``listeners.json``, or a CSV file, see ``read_listeners``. Only
             listeners that are used are validated.
         out: Folder of the results.
+        outputs: Folder of existing outputs of an aid, by the label of the aid in tables. The files
+            have the challenges' names, see above, two channels, and the sample rate of the scenes.
+            An output that is missing or broken is listed with the reason.
         scenes_listeners: JSON file with the names of the listeners of each scene; by default all
             scenes and listeners are combined.
+        microphones: Numbers of the microphones that are used: 1 is the front one, 2 and 3 are the
+            others, in ``SCENE_mix_CH2.wav`` and ``SCENE_mix_CH3.wav``. The input of aids is the
+            mean of these microphones, as in the baseline of the third challenge. An aid of your own
+            with the attribute ``takes_microphones = True`` receives all of them, with shape
+            (microphones, 2, time).
         stride: Use every n-th pair of scene and listener. 15 gives the challenges' small test.
         enhancers: ``package.module:name`` of functions ``(waveform, sample_rate) -> waveform`` that
             reduce noise, for signals in pascals with shape (..., time). Each adds a condition
@@ -130,9 +153,11 @@ def evaluate_scenes(
             and of all scores.
 
     Returns:
-        The evaluation of all conditions, ``unaided`` first. The column ``combined`` of its table is
+        The evaluation of all conditions, ``unaided`` first. Its ``notes`` count files of scenes
+        and of ``outputs`` that are not used. The column ``combined`` of its table is
         the mean of HASPI and HASQI. Its ``details["look_ahead_ms"]`` has
-        the measured look-ahead by condition, and None for an aid that fails on the first pair.
+        the measured look-ahead by condition, and None for ``outputs`` and for an aid that fails on
+        the first pair.
 
     Raises:
         ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, an
@@ -142,16 +167,25 @@ def evaluate_scenes(
     """
     names = ["haspi", "hasqi", *measures]
     find_measures(names)
-    pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)[::stride]
+    all_pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)
+    pairs = all_pairs[::stride]
+    _check_microphones(pairs, microphones)
+    notes = _describe_unused_microphones(pairs, microphones)
+    folders = {label: Path(folder) for label, folder in (outputs or {}).items()}
+    for label, folder in folders.items():
+        notes += _describe_unused_outputs(label, folder, pairs, all_pairs)
     rate = read_audio(pairs[0].mix)[1]
     levels = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
-    conditions = _make_conditions(aids, enhancers, linked, **levels)
-    look_ahead_ms = {c.name: _measure_look_ahead(c, pairs[0], rate) for c in conditions}
+    conditions = _make_conditions(aids, folders, enhancers, linked, **levels)
+    look_ahead_ms = {
+        c.name: _measure_look_ahead(c, pairs[0], rate, microphones) for c in conditions
+    }
     settings = {"full_scale_spl": full_scale_spl, "seed": seed}
-    write = partial(_write_signals, Path(out), conditions, rate, settings)
+    write = partial(_write_signals, Path(out), conditions, folders, microphones, rate, settings)
     parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
     recordings = []
-    for pair, ears in run_parallel(write, pairs, **parallel):
+    written = run_parallel(write, pairs, **parallel)
+    for pair, ears in track(written, "pairs of scene and listener", len(pairs)):
         if isinstance(ears, Crash):
             errors = {condition.name: ValueError(CRASH) for condition in conditions}
             ears = _make_recordings(Path(out), pair, errors, settings)
@@ -171,6 +205,7 @@ def evaluate_scenes(
     return replace(
         evaluation,
         table=evaluation.table.assign(combined=combined),
+        notes=[*notes, *evaluation.notes],
         details={"look_ahead_ms": look_ahead_ms},
     )
 
@@ -240,13 +275,75 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
     return pairs
 
 
+def _check_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> None:
+    """Raise ValueError unless all scenes have files of these microphones."""
+    if not numbers or len({*numbers}) < len(numbers):
+        raise ValueError(f"expected different numbers of microphones, got {[*numbers]}")
+    for pair, number in product(pairs, numbers):
+        path = pair.microphone(number)
+        if not path.is_file():
+            raise ValueError(
+                f"{path}: there is no such file; add it, or leave microphone {number} out "
+                "(microphones, --microphones)"
+            )
+
+
+def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> list[str]:
+    """Return a sentence about microphones that no aid receives, or none."""
+    unused = {n for n in (1, *_OTHER_MICROPHONES) if n not in numbers}
+    scenes = {
+        pair.scene for pair, n in product(pairs, sorted(unused)) if pair.microphone(n).is_file()
+    }
+    if not scenes:
+        return []
+    return [
+        f"{len(scenes)} of {len({pair.scene for pair in pairs})} scenes have signals of other "
+        f"microphones than {', '.join(map(str, numbers))}, which are not used. The baseline of the "
+        "third challenge uses the mean of microphones 1, 2 and 3 (--microphones 1 2 3)."
+    ]
+
+
+def _describe_unused_outputs(
+    label: str, folder: Path, pairs: Sequence[_Pair], all_pairs: Sequence[_Pair]
+) -> list[str]:
+    """Return a sentence about audio files of an aid that no pair uses, or none.
+
+    Args:
+        label: Label of the aid.
+        folder: Folder of its outputs.
+        pairs: Pairs that are evaluated.
+        all_pairs: These pairs, and those that a stride leaves out.
+
+    Raises:
+        ValueError: No pair has an output.
+    """
+    names = {path.relative_to(folder).as_posix() for path in find_audio(folder)}
+    if not names & {pair.output_name for pair in pairs}:
+        raise ValueError(
+            f"{folder}: no file is an output of {label} for a scene and a listener; expected names "
+            f"such as {pairs[0].output_name}"
+        )
+    unused = sorted(names - {pair.output_name for pair in all_pairs})
+    if not unused:
+        return []
+    return [
+        f"{len(unused)} files of {label} belong to no scene and listener and are not used, such as "
+        f"{unused[0]}."
+    ]
+
+
 def _make_conditions(
-    aids: Mapping[str, str], enhancers: Sequence[str], linked: bool, **levels: Any
+    aids: Mapping[str, str],
+    folders: Mapping[str, Path],
+    enhancers: Sequence[str],
+    linked: bool,
+    **levels: Any,
 ) -> list[Condition]:
-    """Return no aid, NAL-R and all aids, each of them also after every enhancer.
+    """Return no aid, NAL-R and all aids, each but recorded ones also after every enhancer.
 
     Args:
         aids: Aids by their label, see ``evaluate_scenes``.
+        folders: Folders of existing outputs, by the label of their aid.
         enhancers: Names of functions that reduce noise.
         linked: Whether one level sets the gains of both ears.
         levels: Arguments ``sample_rate`` and ``full_scale_spl`` of aids.
@@ -256,9 +353,10 @@ def _make_conditions(
             folder.
     """
     loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
+    for label in (*aids, *folders):
+        if label in (UNAIDED, NAL_R) or (label in aids and label in folders):
+            raise ValueError(f"{label} is already evaluated; give the aid another label")
     for label, name in aids.items():
-        if label in (UNAIDED, NAL_R):
-            raise ValueError(f"{label} is always evaluated; give the aid another label")
         if ":" in name and not Path(name).exists():
             loaded[label] = PluginAid(name, levels["sample_rate"])
         else:
@@ -271,11 +369,11 @@ def _make_conditions(
             conditions.append(Condition(f"{prefix} + {label}", process, "enhanced", label))
         kind = "prescription" if label == NAL_R else "aid"
         conditions.append(Condition(label, aid, kind))
-    folders = [_folder_name(condition) for condition in conditions]
-    for folder in folders:
-        if folders.count(folder) > 1:
+    names = [_folder_name(condition) for condition in conditions]
+    for folder in names:
+        if names.count(folder) > 1:
             raise ValueError(f"two labels would have the same folder, {folder}; rename one of them")
-    return conditions
+    return [*conditions, *(Condition(label) for label in folders)]
 
 
 def _folder_name(condition: Condition) -> str:
@@ -284,10 +382,17 @@ def _folder_name(condition: Condition) -> str:
 
 
 @torch.no_grad()
-def _measure_look_ahead(condition: Condition, pair: _Pair, rate: int) -> float | None:
-    """Measure the look-ahead in ms on the beginning of a scene, or None for an aid that fails."""
-    assert condition.process is not None
-    scene = _read_channels(pair.mix, rate)[:, : int(_LOOK_AHEAD_SECONDS * rate)]
+def _measure_look_ahead(
+    condition: Condition, pair: _Pair, rate: int, microphones: Sequence[int]
+) -> float | None:
+    """Measure the look-ahead in ms on the beginning of a scene.
+
+    It is None for existing outputs, and for an aid that fails.
+    """
+    if condition.process is None:
+        return None
+    scene = _input_of(condition, _read_microphones(pair, rate, microphones))
+    scene = scene[..., : int(_LOOK_AHEAD_SECONDS * rate)]
     noise = torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
     other = set_level(noise, level_spl(scene.flatten()))
     time = scene.shape[-1]
@@ -299,20 +404,34 @@ def _measure_look_ahead(condition: Condition, pair: _Pair, rate: int) -> float |
     return 1000.0 * samples / rate
 
 
+def _input_of(condition: Condition, signals: Tensor) -> Tensor:
+    """Return the mean of all microphones, or their signals for an aid that takes them.
+
+    Args:
+        condition: Condition with the aid.
+        signals: Signals of the microphones. Shape: (microphones, 2, time).
+    """
+    return signals if getattr(condition.process, "takes_microphones", False) else signals.mean(0)
+
+
 @one_thread()
 @torch.no_grad()
 def _write_signals(
     out: Path,
     conditions: Sequence[Condition],
+    folders: Mapping[str, Path],
+    microphones: Sequence[int],
     rate: int,
     settings: Mapping[str, Any],
     pair: _Pair,
-) -> list[Recording]:
+) -> list[RecordedItem]:
     """Write the reference and the outputs of a scene for a listener.
 
     Args:
         out: Folder of the results.
         conditions: Conditions with their aids.
+        folders: Folders of existing outputs, by the label of their aid.
+        microphones: Numbers of the microphones that are used.
         rate: Sample rate in Hz.
         settings: Further arguments of the recordings.
         pair: The scene and the listener.
@@ -322,20 +441,22 @@ def _write_signals(
     Raises:
         ValueError: A file of the scene is broken, or has another rate or length.
     """
-    mix, reference = _read_scene(pair, rate)
+    signals, reference = _read_scene(pair, rate, microphones)
     write_audio(_reference_file(out, pair), reference, rate)
     outputs: dict[str, Path | ValueError] = {}
     for condition in conditions:
-        assert condition.process is not None
-        folder = out / "signals" / _folder_name(condition)
-        path = folder / f"{pair.scene}_{pair.name}_HA-output.wav"
+        folder = folders.get(condition.name, out / "signals" / _folder_name(condition))
+        path = outputs[condition.name] = folder / pair.output_name
         try:
-            output = condition.process(mix, pair.listener)
-            write_audio(path, cut_output(output, mix, rate), rate)
-            outputs[condition.name] = path
+            if condition.process is None:
+                _read_channels(path, rate, [2])
+                continue
+            output = condition.process(_input_of(condition, signals), pair.listener)
+            write_audio(path, cut_output(output, signals[0], rate), rate)
         except Exception as error:  # A failure must not end the study.
             outputs[condition.name] = ValueError(describe_error(error))
-            path.unlink(missing_ok=True)  # It is the output of an earlier run.
+            if condition.process is not None:
+                path.unlink(missing_ok=True)  # It is the output of an earlier run.
     return _make_recordings(out, pair, outputs, settings)
 
 
@@ -348,7 +469,7 @@ def _make_recordings(
     pair: _Pair,
     outputs: Mapping[str, Path | ValueError],
     settings: Mapping[str, Any],
-) -> list[Recording]:
+) -> list[RecordedItem]:
     """Return one recording per ear of the listener.
 
     Args:
@@ -359,28 +480,46 @@ def _make_recordings(
     """
     reference = _reference_file(out, pair)
     return [
-        Recording(pair.scene, reference, outputs, ear, pair.name, side, **settings)
+        RecordedItem(pair.scene, reference, outputs, ear, pair.name, side, **settings)
         for side, ear in pair.listener.ears().items()
     ]
 
 
-def _read_scene(pair: _Pair, rate: int) -> tuple[Tensor, Tensor]:
+def _read_microphones(pair: _Pair, rate: int, numbers: Sequence[int]) -> Tensor:
+    """Return the signals of the microphones of a scene. Shape: (microphones, 2, time).
+
+    Raises:
+        ValueError: A file is broken, or has another rate or length than the first one.
+    """
+    signals = [_read_channels(pair.microphone(number), rate, [2]) for number in numbers]
+    lengths = {signal.shape[-1] for signal in signals}
+    if len(lengths) > 1:
+        raise ValueError(
+            f"{pair.mix}: expected the same length of all microphones, got {sorted(lengths)} "
+            "samples; replace the files"
+        )
+    return torch.stack(signals)
+
+
+def _read_scene(pair: _Pair, rate: int, microphones: Sequence[int]) -> tuple[Tensor, Tensor]:
     """Read the microphones' signals, and the reference at the level of the target in the room.
 
-    Returns: Both signals, for the left and the right ear. Shape: (2, time) each.
+    Returns: Signals for the left and the right ear: of the microphones, with shape (microphones, 2,
+        time), and of the reference, with shape (2, time).
 
     Raises:
         ValueError: A file is broken, or has another rate or length.
     """
-    mix, reference = _read_channels(pair.mix, rate, [2]), _read_channels(pair.reference, rate)
+    signals = _read_microphones(pair, rate, microphones)
+    reference = _read_channels(pair.reference, rate)
     in_room_file = pair.mix.with_name(f"{pair.scene}_target_CH1.wav")
     if pair.reference.name.endswith(_REFERENCE_ENDINGS[-1]) or not in_room_file.is_file():
-        return mix, reference
+        return signals, reference
     in_room = _read_channels(in_room_file, rate)
     names = str(pair.reference), str(in_room_file)
     samples = common_length((reference.shape[-1], in_room.shape[-1]), rate, names)
     reference, in_room = reference[:, :samples].double(), in_room[:, :samples].double()
-    return mix, set_level(reference, level_spl(in_room))
+    return signals, set_level(reference, level_spl(in_room))
 
 
 def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:

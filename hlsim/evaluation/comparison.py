@@ -22,7 +22,7 @@ PlannedComparison = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ConditionComparison:
     """Comparison of two conditions by one measure, over the items that have both scores.
 
     Attributes:
@@ -83,7 +83,7 @@ def compare(
     baseline: str | None = None,
     planned: Collection[PlannedComparison] = (),
     unit: str = "listener",
-) -> list[Comparison]:
+) -> list[ConditionComparison]:
     """Compare the conditions of a study in pairs, by one or more scores.
 
     Args:
@@ -118,8 +118,8 @@ def compare(
 
 
 def _adjust(
-    comparisons: Sequence[Comparison], planned: Collection[PlannedComparison]
-) -> list[Comparison]:
+    comparisons: Sequence[ConditionComparison], planned: Collection[PlannedComparison]
+) -> list[ConditionComparison]:
     """Mark the planned comparisons of a measure, and adjust the p values of all others."""
     marked = [
         replace(c, planned=len(comparisons) > 1 and (c.measure, c.before, c.after) in planned)
@@ -135,7 +135,7 @@ def _adjust(
 
 def _compare_pair(
     table: DataFrame, measure: str, before: str, after: str, unit: str
-) -> Comparison | None:
+) -> ConditionComparison | None:
     """Compare two conditions, or return None if no item has both scores."""
     scores = table.pivot(index="item", columns="condition", values=measure)[[before, after]]
     pairs = scores.dropna()
@@ -154,7 +154,7 @@ def _compare_pair(
         if name in degrees
     }
     overall = paired_comparison(first, second)
-    return Comparison(
+    return ConditionComparison(
         measure=measure,
         before=before,
         after=after,

@@ -156,6 +156,10 @@ class PluginAid(nn.Module):
             listener, sample_rate) -> waveform``.
         sample_rate: Sample rate in Hz with which the function is called.
 
+    Attributes:
+        takes_microphones: Whether the function has this attribute, set to True. It then receives
+            the signals of several microphones, with shape (microphones, 2, time).
+
     >>> PluginAid("builtins:max", 16000)
     PluginAid()
     """
@@ -164,6 +168,7 @@ class PluginAid(nn.Module):
         super().__init__()
         self.plugin = WaveformPlugin(name, "aid")
         self.sample_rate = sample_rate
+        self.takes_microphones = bool(getattr(self.plugin.function, "takes_microphones", False))
 
     def forward(self, waveform: Tensor, listener: Any) -> Tensor:
         """Call the user's function.

@@ -16,7 +16,7 @@ from hlsim.calibration import NEURO_RATE, set_level
 from hlsim.data import bundled
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aid_properties import mean_band_levels, measure_aids, measure_gain_curve
-from hlsim.evaluation.comparison import Comparison, compare
+from hlsim.evaluation.comparison import ConditionComparison, compare
 from hlsim.evaluation.conditions import (
     NAL_R,
     NAL_R_AT_LEVEL,
@@ -30,6 +30,7 @@ from hlsim.evaluation.measures import LEVELS, MEASURES, NORMAL, PERCEPTION, perc
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.evaluation.sounds import NORMAL_EAR
 from hlsim.evaluation.study import Condition, Item
+from hlsim.progress import track
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -123,7 +124,7 @@ def _process(
     perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
     outputs = {}
     with torch.no_grad():
-        for condition in conditions:
+        for condition in track(conditions, "conditions", len(conditions)):
             signals = [condition.output(item) for item in items]
             outputs[condition.name] = signals
             perceived[condition.name] = [
@@ -141,7 +142,7 @@ def _measure_gains(
     return measure_aids(aids, {ear_name: audiogram}, measure_gain_curve, utterances, INPUT_LEVELS)
 
 
-def _compare_voices(table: DataFrame) -> list[Comparison]:
+def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
     """Compare the aid with NAL-R at its level by the mean scores of each voice."""
     means = table.groupby(["voice", "condition"], sort=False)[["haspi", "level"]].mean()
     rows = means.reset_index().rename(columns={"voice": "item"})

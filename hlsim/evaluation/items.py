@@ -21,6 +21,7 @@ from hlsim.data.clips import Clips
 from hlsim.data.ears import MILDER, draw_thresholds
 from hlsim.data.mixing import mix
 from hlsim.evaluation.study import Item
+from hlsim.progress import track
 
 SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 """Levels of the input in dB SPL that items for simulators have in turn."""
@@ -206,7 +207,8 @@ def apply_treatments(
         functions["compensated"] = compensator
     check_names(treatments, functions, "inputs (compensated needs a compensator)")
     treated = []
-    for item, treatment in product(items, treatments):
+    pairs = [*product(items, treatments)]
+    for item, treatment in track(pairs, "inputs", len(pairs)):
         with torch.no_grad():
             signal = functions[treatment](item.signal, item.ear)
         facts = {**item.facts, "treatment": treatment}
@@ -231,7 +233,7 @@ def _draw_clips(
     noises = None
     if noise is not None:
         noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True)
-    for number in range(items):
+    for number in track(range(items), "items", items):
         clean = clips.draw(1, generator)[0]
         is_noisy = noises is not None and number % 2 == 1
         yield number, clean, noises.draw(1, generator)[0] if noises and is_noisy else None

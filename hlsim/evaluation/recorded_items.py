@@ -50,7 +50,7 @@ _Rows = Sequence[tuple[str, Mapping[str, str]]]
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedItem:
     """Recorded outputs of one or more conditions for one utterance and one ear, in files.
 
     Args:
@@ -70,7 +70,7 @@ class Recording:
             clean file.
 
     >>> ear = Audiogram.standard("N3")
-    >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
+    >>> RecordedItem("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
     'L1 left s01 5 dB'
     """
 
@@ -217,7 +217,7 @@ def read_folders(
     folders: Mapping[str, str | Path],
     ears: Sequence[tuple[str, str, Audiogram]],
     **settings: Any,
-) -> list[Recording]:
+) -> list[RecordedItem]:
     """Return one recording per ear and file of a folder of clean speech.
 
     Args:
@@ -251,7 +251,7 @@ def read_folders(
         for name, path in speech.items():
             files_of_name = {condition: files[name] for condition, files in outputs.items()}
             recordings.append(
-                Recording(name, path, files_of_name, audiogram, listener, ear, **settings)
+                RecordedItem(name, path, files_of_name, audiogram, listener, ear, **settings)
             )
     return recordings
 
@@ -303,7 +303,7 @@ def read_recordings(
     audiogram: Audiogram | None = None,
     audiograms: str | Path | None = None,
     **settings: Any,
-) -> list[Recording]:
+) -> list[RecordedItem]:
     """Return the recordings of a manifest, in the order of their first rows.
 
     Args:
@@ -346,7 +346,7 @@ def read_recordings(
     listeners: dict[str, Listener] = {}
     if audiograms is not None:
         listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})
-    recordings: dict[tuple[Any, ...], Recording] = {}
+    recordings: dict[tuple[Any, ...], RecordedItem] = {}
     for place, row in rows:
         recording = convert_at(place, _read_row, row, folder, listeners, audiogram, settings)
         key = (*recording.utterance_key, recording.ear, recording.clean)
@@ -367,7 +367,7 @@ def _known_columns(row: Mapping[str, str]) -> dict[str, str]:
     return known
 
 
-def _merge(earlier: Recording, recording: Recording) -> Recording:
+def _merge(earlier: RecordedItem, recording: RecordedItem) -> RecordedItem:
     """Return a recording with the outputs of an earlier one of the same item.
 
     Raises:
@@ -392,7 +392,7 @@ def _read_row(
     listeners: Mapping[str, Listener],
     audiogram: Audiogram | None,
     settings: Mapping[str, Any],
-) -> Recording:
+) -> RecordedItem:
     """Return the recording of a row of a manifest, which has one output.
 
     Args:
@@ -427,7 +427,7 @@ def _read_row(
             "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
             "ear"
         )
-    return Recording(
+    return RecordedItem(
         utterance=row.get("item") or str(Path(row["clean"]).with_suffix("")),
         clean=path_below(root, row["clean"]),
         outputs={row["condition"]: path_below(root, row["processed"])},

@@ -12,9 +12,9 @@ from hlsim.audiogram import Audiogram
 from hlsim.audiogram.scale import EARS
 from hlsim.evaluation.comparison import PlannedComparison, compare
 from hlsim.evaluation.conditions import AFTER, BEFORE
-from hlsim.evaluation.measures import ALIGNMENT, LEVELS, find_measures
+from hlsim.evaluation.measures import ALIGNMENT, LEVELS, find_lag, find_measures
 from hlsim.evaluation.recorded_items import (
-    Recording,
+    RecordedItem,
     join_name,
     read_folders,
     read_named_ears,
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 LATE_MS = 4.0
 """Lag of an output in ms above which a report warns."""
+
+_INTERAURAL_SECONDS = 0.002
+"""Lag of the speech at one ear behind that at the other above which they are not of one sound."""
 
 _EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level")
 """Columns of the table that describe the item of one ear."""
@@ -174,7 +177,7 @@ def _read_ears_of_folders(
 
 
 def score_recordings(
-    recordings: Sequence[Recording],
+    recordings: Sequence[RecordedItem],
     conditions: Sequence[Condition],
     measures: Sequence[str],
     *,
@@ -204,11 +207,12 @@ def score_recordings(
         The evaluation. With ``better_ear``, its table has one row per utterance and condition.
 
     Raises:
-        ValueError: Nothing could be scored, or ``better_ear`` is set and an utterance lacks an ear.
+        ValueError: Nothing could be scored, or ``better_ear`` is set and an utterance lacks an ear
+            or has different speech for both ears.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> outputs = {"unaided": EXAMPLE_FILE}
-    >>> recording = Recording("s01", EXAMPLE_FILE, outputs, Audiogram.standard("N3"))
+    >>> recording = RecordedItem("s01", EXAMPLE_FILE, outputs, Audiogram.standard("N3"))
     >>> evaluation = score_recordings(
     ...     [recording], [Condition("unaided")], ["stoi"], store=None, jobs=1
     ... )
@@ -231,36 +235,56 @@ def score_recordings(
     return replace(evaluation, sounds=perceive_items(evaluation, listen, played))
 
 
-def _pair_ears(recordings: Sequence[Recording]) -> list[int]:
+def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
     """Return the number of the utterance of each recording, which its two ears share.
 
     Ears of one utterance have the same listener, utterance and SNR, and, if these do not identify
     the utterance, the same clean file.
 
     Raises:
-        ValueError: An utterance has not one left and one right ear.
+        ValueError: An utterance has not one left and one right ear, or these have the clean speech
+            of different sentences.
     """
-    sides: dict[tuple[Any, ...], list[str]] = {}
+    groups: dict[Any, list[RecordedItem]] = {}
     for recording in recordings:
-        sides.setdefault(recording.utterance_key, []).append(recording.ear)
-    keys: list[tuple[Any, ...]] = []
+        groups.setdefault(recording.utterance_key, []).append(recording)
+    utterances: dict[tuple[Any, ...], list[RecordedItem]] = {}
     for recording in recordings:
-        key = recording.utterance_key
-        is_unique = all(sides[key].count(side) <= 1 for side in EARS)
-        keys.append(key if is_unique else (*key, recording.clean))
-    ears: dict[tuple[Any, ...], list[str]] = {}
-    for key, recording in zip(keys, recordings, strict=True):
-        ears.setdefault(key, []).append(recording.ear)
-    for key, recording in zip(keys, recordings, strict=True):
-        if sorted(ears[key]) != sorted(EARS):
+        is_pair = len(groups[recording.utterance_key]) <= len(EARS)
+        key = recording.utterance_key, None if is_pair else recording.clean
+        utterances.setdefault(key, []).append(recording)
+    numbers: dict[int, int] = {}
+    for number, pair in enumerate(utterances.values()):
+        if sorted(recording.ear for recording in pair) != sorted(EARS):
             raise ValueError(
                 "expected one left and one right ear of each utterance for the better ear, but "
-                f"{recording.both_ears_name} has the ears {', '.join(ears[key])}; add the missing "
-                "rows, give different utterances different values in the column item, or leave "
-                "out better_ear (--better-ear)"
+                f"{pair[0].both_ears_name} has the ears {', '.join(r.ear for r in pair)}; add the "
+                "missing rows, give different utterances different values in the column item, or "
+                "leave out better_ear (--better-ear)"
             )
-    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    return [numbers[key] for key in keys]
+        _check_same_speech(*pair)
+        numbers |= {id(recording): number for recording in pair}
+    return [numbers[id(recording)] for recording in recordings]
+
+
+def _check_same_speech(first: RecordedItem, second: RecordedItem) -> None:
+    """Raise ValueError if two ears have clean files of their own with different speech.
+
+    A file that cannot be read is not compared, because its item will be a failure.
+    """
+    if first.clean == second.clean:
+        return
+    try:
+        items = first.load(), second.load()
+    except ValueError:
+        return
+    lag = find_lag(items[0].clean, items[1].clean)
+    if lag is None or abs(lag) > _INTERAURAL_SECONDS * items[0].sample_rate:
+        raise ValueError(
+            f"expected the same speech for both ears of {first.both_ears_name}, but {first.clean} "
+            f"and {second.clean} are not similar or not aligned; give different utterances "
+            "different values in the column item, or write both ears to the channels of one file"
+        )
 
 
 def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[str]) -> DataFrame:

@@ -13,9 +13,9 @@ import numpy as np
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.running.store import ScoreStore
-from hlsim.evaluation.study import Condition, Measure, Source, run_measures
+from hlsim.evaluation.study import Condition, ItemSource, Measure, run_measures
 from hlsim.metrics.words import WordsChange, words_change
 from hlsim.version import __version__
 
@@ -80,11 +80,11 @@ class Evaluation:
     [0.5]
     """
 
-    items: Sequence[Source]
+    items: Sequence[ItemSource]
     conditions: Sequence[Condition]
     measures: Sequence[Measure]
     table: DataFrame
-    comparisons: Sequence[Comparison] = ()
+    comparisons: Sequence[ConditionComparison] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class Evaluation:
     @classmethod
     def run(
         cls,
-        items: Sequence[Source],
+        items: Sequence[ItemSource],
         conditions: Sequence[Condition],
         measures: Sequence[Measure],
         *,
@@ -148,7 +148,7 @@ class Evaluation:
         return [column for column in columns if column in self.table]
 
     @property
-    def headline(self) -> Comparison | None:
+    def headline(self) -> ConditionComparison | None:
         """Comparison with which a page begins: the first planned one, or else the first one.
 
         It is None if there is no comparison.

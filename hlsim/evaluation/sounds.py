@@ -13,6 +13,7 @@ from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.evaluation.running.parallel import describe_error
 from hlsim.evaluation.study import Condition, Item
+from hlsim.progress import track
 
 NORMAL_EAR = "normal ear (the goal)"
 """Label of clean speech as a normal ear perceives it."""
@@ -62,7 +63,7 @@ def perceive_items(
     names = conditions or evaluation.names
     chosen = [condition for condition in evaluation.conditions if condition.name in names]
     sounds = []
-    for place in places.tolist():
+    for place in track(places.tolist(), "items to play", len(places)):
         row = rows.loc[changes.index[place]]
         item = evaluation.items[int(row.get("source", row.name))].load()
         signals, failures = _perceive(item, chosen)

@@ -33,6 +33,7 @@ from hlsim.evaluation.running.parallel import (
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
+from hlsim.progress import track
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -47,12 +48,12 @@ _RESERVED_COLUMNS = ("item", "name", "condition", "failure", "source", "gap", "c
 """Columns of the table that hlsim writes, so that a measure may not return them."""
 
 
-class Source(Protocol):
+class ItemSource(Protocol):
     """An item that is loaded only when it is measured, such as recorded files.
 
     An ``Item`` is its own source.
 
-    >>> source: Source = Item("item 1", torch.ones(8), torch.ones(8), Audiogram.standard("N3"))
+    >>> source: ItemSource = Item("item 1", torch.ones(8), torch.ones(8), Audiogram.standard("N3"))
     >>> source.load().name
     'item 1'
     """
@@ -199,12 +200,12 @@ class _Task(NamedTuple):
     """One item with its missing scores: condition, measure, and key in the store."""
 
     number: int
-    source: Source
+    source: ItemSource
     missing: list[tuple[Condition, Measure, str]]
 
 
 def run_study(
-    items: Sequence[Source],
+    items: Sequence[ItemSource],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
     *,
@@ -251,7 +252,7 @@ def run_study(
 
 
 def run_measures(
-    items: Sequence[Source],
+    items: Sequence[ItemSource],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
     store: ScoreStore | None = None,
@@ -279,7 +280,7 @@ def run_measures(
     columns = _Columns([*_RESERVED_COLUMNS, *facts])
     results: _Results = {}
     tasks = []
-    for number, source in enumerate(items):
+    for number, source in track(enumerate(items), "items whose scores are looked up", len(items)):
         task = _Task(number, source, [])
         for condition in conditions:
             for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
@@ -351,7 +352,7 @@ class _Columns:
         ]
 
 
-def _keys(source: Source, condition: Condition, measures: Sequence[Measure]) -> list[str]:
+def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure]) -> list[str]:
     """Return the key of the stored values of each measure, empty if they cannot be stored."""
     try:
         digest = source.digest(condition.name)
@@ -433,7 +434,7 @@ def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
 
 
 def _make_rows(
-    items: Sequence[Source],
+    items: Sequence[ItemSource],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
     results: _Results,

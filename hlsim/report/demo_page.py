@@ -14,7 +14,14 @@ from hlsim.report.plots import (
     curves_picture,
     gain_picture,
 )
-from hlsim.report.results import Columns, score_details, split_rows, statistic, summary_table
+from hlsim.report.results import (
+    Columns,
+    mean_level,
+    score_details,
+    split_rows,
+    statistic,
+    summary_table,
+)
 from hlsim.report.verdict import verdict
 
 _COMPARISON = (
@@ -85,7 +92,7 @@ def result_table(evaluation: Evaluation) -> Table:
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),
         "Words understood": (lambda rows: predict_words(rows["haspi"]), ".0%"),
-        "Output level (dB SPL)": (statistic("level"), ".1f"),
+        "Output level (dB SPL)": (mean_level("haspi"), ".1f"),
         "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     }
     count = len(evaluation.items)

@@ -11,15 +11,16 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from hlsim.extras import require
 from hlsim.files import atomic_path
+from hlsim.progress import track
 
 SPECTROGRAM_LEVELS = (0.0, 90.0)
 """Lowest and highest level of all spectrograms in dB SPL, for a bin of 50 Hz."""
@@ -74,20 +75,25 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of a page.
+    """A picture of a page, which is drawn when it is needed.
 
     Attributes:
-        data: Contents of an SVG or PNG file.
+        draw: Function that returns the contents of an SVG or PNG file.
         title: Heading above the picture, and text for readers who do not see it.
         note: Sentence below the picture.
 
-    >>> Picture(b"<svg/>", "An empty picture").note
-    ''
+    >>> Picture(lambda: b"<svg/>", "An empty picture").data
+    b'<svg/>'
     """
 
-    data: bytes
+    draw: Callable[[], bytes]
     title: str
     note: str = ""
+
+    @cached_property
+    def data(self) -> bytes:
+        """Contents of the file."""
+        return self.draw()
 
 
 @dataclass(frozen=True)
@@ -257,6 +263,9 @@ def write_page(
     ...     write_page(Page("Aids", "", []), {"rows": []}, folder).name
     'report.html'
     """
+    pictures = [*_find_pictures(page.sections)]
+    for picture in track(pictures, "pictures", len(pictures)):
+        _ = picture.data
     text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     contents = {
         "report.json": f"{text}\n",
@@ -269,6 +278,13 @@ def write_page(
         for name, content in contents.items():
             stack.enter_context(atomic_path(folder / name)).write_text(content, encoding="utf-8")
     return folder / "report.html"
+
+
+def _find_pictures(sections: Sequence[Section]) -> Iterator[Picture]:
+    """Yield the pictures of sections and of their inner sections."""
+    for section in sections:
+        yield from section.pictures
+        yield from _find_pictures(section.sections)
 
 
 @cache

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from hlsim.audio import encode_flac
 from hlsim.calibration import PASCAL_SPL, level_spl
-from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.extras import require
+from hlsim.progress import track
 from hlsim.report.page import (
     SPECTROGRAM_COLOURS,
     SPECTROGRAM_LEVELS,
@@ -49,11 +50,12 @@ def listening_sections(evaluation: Evaluation) -> list[Section]:
     >>> [sound.label for sound in section.sections[0].player.sounds]
     ['a']
     """
-    sections = [_item_section(evaluation.headline, sounds) for sounds in evaluation.sounds]
+    tracked = track(evaluation.sounds, "players", len(evaluation.sounds))
+    sections = [_item_section(evaluation.headline, sounds) for sounds in tracked]
     return [Section("Listen", [_EXPLANATION], sections=sections)] if sections else []
 
 
-def _item_section(headline: Comparison | None, sounds: ItemSounds) -> Section:
+def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> Section:
     """Return the player of an item, with its rank by the headline comparison."""
     title = sounds.name
     if headline is not None and sounds.change is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from textwrap import fill
 from typing import Any
 
@@ -61,7 +62,7 @@ Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mappin
 def _draw_picture(
     draw: Callable[[Any], None], title: str, note: str = "", height: float = 3.2
 ) -> Picture:
-    """Return an SVG picture for a page of what a function draws on matplotlib axes.
+    """Return an SVG picture for a page, which a function draws on matplotlib axes.
 
     Args:
         draw: Function that is called with the axes.
@@ -72,6 +73,11 @@ def _draw_picture(
     >>> _draw_picture(lambda axes: axes.plot([1, 2]), "A line").title
     'A line'
     """
+    return Picture(partial(_draw_svg, draw, height), title, note)
+
+
+def _draw_svg(draw: Callable[[Any], None], height: float) -> bytes:
+    """Return the contents of an SVG file, see ``_draw_picture``."""
     figures = require("matplotlib.figure", "eval")
     data = io.BytesIO()
     matplotlib = require("matplotlib", "eval")
@@ -82,8 +88,7 @@ def _draw_picture(
         draw(figure.subplots())
         figure.savefig(data, format="svg", transparent=True, metadata={"Date": None})
     svg = data.getvalue().replace(INK.encode(), b"currentColor")
-    svg = svg.replace(b"</style>", _CSS + b"</style>", 1)
-    return Picture(svg, title, note)
+    return svg.replace(b"</style>", _CSS + b"</style>", 1)
 
 
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:

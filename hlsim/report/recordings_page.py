@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hlsim.evaluation.clarity import RULE_MS
-from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.conditions import NAL_R
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
@@ -17,6 +17,7 @@ from hlsim.report.results import (
     HASQI_NOTE,
     Columns,
     comparison_table,
+    mean_level,
     score_columns,
     score_details,
     split_rows,
@@ -97,7 +98,7 @@ def report_page(evaluation: Evaluation) -> Page:
     return Page(f"{measures}: {', '.join(evaluation.names)}", first_sentence, sections)
 
 
-def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
+def _words(evaluation: Evaluation, c: ConditionComparison) -> list[str]:
     """Return sentences about the words understood, if the headline is that of HASPI."""
     if c.measure != "haspi":
         return []
@@ -158,7 +159,7 @@ def _conditions_table(evaluation: Evaluation) -> Table:
     table = evaluation.table[evaluation.table["item"].map(scored)]
     scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
     columns: Columns = {title: (statistic(score), ".3f") for title, score in scores.items()}
-    columns["Level (dB SPL)"] = (statistic("level"), ".1f")
+    columns["Level (dB SPL)"] = (mean_level("combined"), ".1f")
     shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
     caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
     look_ahead = evaluation.details["look_ahead_ms"]

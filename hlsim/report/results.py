@@ -8,7 +8,7 @@ from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
@@ -73,8 +73,24 @@ def statistic(column: str, name: str = "mean") -> Callable[[DataFrame], Any]:
     return lambda rows: compute(rows[column])
 
 
+def mean_level(score: str) -> Callable[[DataFrame], Any]:
+    """Return a function that computes the mean output level of the rows that have a score.
+
+    Args:
+        score: Column of the score.
+
+    >>> import pandas
+    >>> rows = pandas.DataFrame({"haspi": [0.2, None], "level": [65.0, 95.0]})
+    >>> float(mean_level("haspi")(rows))
+    65.0
+    """
+    return lambda rows: rows.loc[rows[score].notna(), "level"].mean()
+
+
 def score_columns(evaluation: Evaluation) -> Columns:
     """Return the columns of a table of scores: number of items, and means of scores and levels.
+
+    The level is that of the items that have the most important score.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES, Condition
@@ -86,7 +102,7 @@ def score_columns(evaluation: Evaluation) -> Columns:
     columns: Columns = {"n": (statistic(evaluation.scores[0], "count"), "d")}
     for score in evaluation.scores:
         columns[f"{column_title(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
-    columns["Output level (dB SPL)"] = (statistic("level"), ".1f")
+    columns["Output level (dB SPL)"] = (mean_level(evaluation.scores[0]), ".1f")
     return columns
 
 
@@ -161,7 +177,9 @@ def _mean_and_deviation(mean: float, deviation: float | None) -> str:
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 
 
-def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparisons") -> Table:
+def comparison_table(
+    comparisons: Sequence[ConditionComparison], caption: str = "Comparisons"
+) -> Table:
     """Return a table with one row per comparison of two conditions by one measure.
 
     The columns are the measure with the two conditions, the change of the output level in dB, the

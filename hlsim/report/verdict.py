@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 
@@ -15,7 +15,7 @@ _LEVEL_TOLERANCE_DB = 1.0
 """Change of the level in dB that is too small to explain a change of a score."""
 
 
-def verdict(c: Comparison, subject: str = "", rival: str = "", noun: str = "item") -> str:
+def verdict(c: ConditionComparison, subject: str = "", rival: str = "", noun: str = "item") -> str:
     """Return a sentence that says which condition is better, with scores and p values.
 
     A higher score is called better only at equal level, because HASPI rewards gain.
@@ -54,7 +54,7 @@ def verdict(c: Comparison, subject: str = "", rival: str = "", noun: str = "item
     return f"{text}: {means} ({facts}; {_describe_tests(c)})."
 
 
-def limits(c: Comparison) -> str:
+def limits(c: ConditionComparison) -> str:
     """Return the caveats of a verdict as text.
 
     These are the change in level, items that are not independent, and items that are left out.
@@ -159,7 +159,7 @@ def count_items(count: int, noun: str = "item") -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def _describe_tests(c: Comparison) -> str:
+def _describe_tests(c: ConditionComparison) -> str:
     """State the p values, which are the same wherever the comparison appears."""
     tests = {"t-test": c.p_t, "Wilcoxon": c.p_w}
     stated = [f"{name} {format_p(p)}" for name, p in tests.items() if p is not None]
@@ -172,7 +172,7 @@ def _describe_tests(c: Comparison) -> str:
     return ", ".join(stated)
 
 
-def _significant_tests(c: Comparison) -> list[bool]:
+def _significant_tests(c: ConditionComparison) -> list[bool]:
     """Return for each test that can decide whether its p value is below ``_ALPHA``.
 
     With few items, Wilcoxon's p exceeds ``_ALPHA`` even if all pairs change alike.
@@ -184,7 +184,7 @@ def _significant_tests(c: Comparison) -> list[bool]:
     return decisions
 
 
-def _describe_units(c: Comparison) -> str:
+def _describe_units(c: ConditionComparison) -> str:
     means = c.unit_means
     if means is None:
         return (

@@ -31,7 +31,8 @@ CALLS = {
     ),
     "hlsim.evaluation.clarity:evaluate_scenes": (
         "clarity {a} mine=nalr --listeners {b} --scenes-listeners {c} --every 3 --enhancer my:e "
-        f"--linked --full-scale-spl 110 {STUDY}"
+        "--microphones 1 3 "
+        f"--outputs A={{a}} --outputs B={{b}} --linked --full-scale-spl 110 {STUDY}"
     ),
 }
 """Command with all its options, by the function that it calls."""
@@ -41,7 +42,8 @@ EXPECTED: dict[str, Any] = {
     "teacher": "my:teacher", "inputs": ["as-is", "compensated"], "enhancers": ["my:e"],
     "simulator": "neuro-msbg-light", "gain_ears": ["N1"], "clean": "a", "before": "b", "after": "c",
     "manifest": "d", "root": "e", "baseline": "noisy", "better_ear": True, "spl": 60.0,
-    "conditions": {"A": "a", "B": "b"}, "scenes": "a", "listeners": "b", "scenes_listeners": "c",
+    "conditions": {"A": "a", "B": "b"}, "outputs": {"A": "a", "B": "b"},
+    "microphones": [1, 3], "scenes": "a", "listeners": "b", "scenes_listeners": "c",
     "stride": 3, "linked": True, "aids": {"mine": "nalr"}, "seed": 7, "jobs": 3,
     "dask": "tcp://host:8786", "audiogram": Audiogram.standard("N3"),
 }  # fmt: skip

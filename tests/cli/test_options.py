@@ -61,6 +61,23 @@ def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> Non
     assert all(f"  {name} " in text for name in COMMANDS)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "simulate a.wav b.wav --audiogram N2 N4",
+        "listen --audiogram 500:30,1000:40 n4 a.wav --out b.html",
+        "demo --audiogram N2 N4",
+    ],
+)
+def test_two_ears_after_one_option_are_an_error_that_says_so(
+    words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--audiogram takes one ear, got" in line and "repeat the option" in line
+
+
 def test_lists_that_begin_with_a_minus_are_values() -> None:
     words = "--levels -5 -10 --audiogram -10,0,5,10,20,30,40,50 msbg --speech . --out o".split()
     parsed = make_parser("evaluate-compensator").parse_args(words)

@@ -272,6 +272,67 @@ def test_lengths_may_differ_by_a_tenth_of_a_second(clarity: Path, tmp_path: Path
         evaluate_scenes({}, **settings)
 
 
+@pytest.mark.usefixtures("quick_scores")
+def test_existing_outputs_are_scored_like_those_of_an_aid(clarity: Path, tmp_path: Path) -> None:
+    aided = evaluate_scenes({"soft": "wdrc"}, out=tmp_path / "aided", **options(clarity)).table
+    folder = tmp_path / "aided" / "signals" / "soft"
+    recorded = evaluate_scenes({}, outputs={"mine": folder}, out=tmp_path / "1", **options(clarity))
+    assert recorded.notes == [] and recorded.details["look_ahead_ms"]["mine"] is None
+    assert [(c.before, c.after) for c in recorded.comparisons if c.planned] == [("NAL-R", "mine")]
+    scores = recorded.table[recorded.table.condition == "mine"].haspi.tolist()
+    assert scores == aided[aided.condition == "soft"].haspi.tolist()
+    first, second, third = sorted(folder.iterdir())
+    first.rename(folder / "S06001_L0001_enhanced.wav")
+    signal, _ = soundfile.read(second)
+    write(second, signal[:, 0])
+    recorded = evaluate_scenes({}, outputs={"mine": folder}, out=tmp_path / "2", **options(clarity))
+    failures = recorded.failures.set_index("name").failure
+    assert "S06001_L0001_HA-output.wav: there is no such audio file" in failures["L0001 S06001"]
+    assert "expected 2 channels" in failures["L0002 S06001"] and len(failures) == 2
+    (note,) = recorded.notes
+    assert note.startswith("1 files of mine") and "S06001_L0001_enhanced.wav" in note
+    assert second.exists(), "a file of the user that is not valid was removed"
+    third.unlink()
+    second.unlink()
+    with pytest.raises(ValueError, match=r"no file is an output of mine .* S06001_L0001_HA-output"):
+        evaluate_scenes({}, outputs={"mine": folder}, out=tmp_path / "3", **options(clarity))
+
+
+class Beamformer:
+    """Aid of its own that uses the first and the third microphone."""
+
+    fingerprint = "1"
+    takes_microphones = True
+
+    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+        assert waveform.shape[:2] == (3, 2)
+        return waveform[0] - waveform[2]
+
+
+@pytest.mark.usefixtures("quick_scores")
+def test_three_microphones_are_averaged_or_handed_to_an_aid(clarity: Path, tmp_path: Path) -> None:
+    scenes = Path(shutil.copytree(clarity / "scenes", tmp_path / "scenes"))
+    settings = options(clarity, scenes=scenes, stride=2, out=tmp_path)
+    mix, _ = soundfile.read(scenes / "S06001_mix_CH1.wav")
+    for scene in PAIRS:
+        for number in (2, 3):
+            shutil.copy(scenes / f"{scene}_target_CH1.wav", scenes / f"{scene}_mix_CH{number}.wav")
+    target, _ = soundfile.read(scenes / "S06001_target_CH1.wav")
+    (note,) = evaluate_scenes({}, **settings).notes
+    assert note.startswith("2 of 2 scenes have signals of other microphones than 1,")
+    aids = {"pair": f"{__name__}:Beamformer"}
+    study = evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
+    assert study.notes == [] and study.failures.empty
+    for name, expected in (("unaided", (mix + 2 * target) / 3), ("pair", mix - target)):
+        written, _ = soundfile.read(tmp_path / "signals" / name / "S06001_L0001_HA-output.wav")
+        assert np.allclose(written, expected, atol=1e-6), name
+    (scenes / "S06002_mix_CH3.wav").unlink()
+    with pytest.raises(ValueError, match=r"S06002_mix_CH3\.wav: there is no such file"):
+        evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
+    with pytest.raises(ValueError, match="different numbers of microphones"):
+        evaluate_scenes(aids, microphones=[1, 1], **settings)
+
+
 LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
 
 
@@ -293,6 +354,7 @@ LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
+        ({"outputs": {"aid": SPEECH}}, "no file is an output of aid"),
     ],
 )
 def test_invalid_settings_are_rejected_before_anything_is_written(

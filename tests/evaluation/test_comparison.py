@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation import Comparison, compare
+from hlsim.evaluation import ConditionComparison, compare
 from hlsim.evaluation.statistics import holm, paired_comparison
 from hlsim.report.verdict import limits, verdict
 
@@ -35,7 +35,7 @@ def draw(n: int, change: float) -> Scores:
     return {"a": low.tolist(), "b": (low + change + 0.05 * generator.normal(size=n)).tolist()}
 
 
-def compare_two(scores: Scores, **settings: Any) -> Comparison:
+def compare_two(scores: Scores, **settings: Any) -> ConditionComparison:
     (comparison,) = compare(table(scores, **settings), [settings.get("measure", "haspi")])
     return comparison
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
-from hlsim.evaluation.recorded_items import Recording, read_recordings
+from hlsim.evaluation.recorded_items import RecordedItem, read_recordings
 from hlsim.files import sha256
 from hlsim.metrics import haspi
 from hlsim.shortcuts import example_speech
@@ -200,7 +200,7 @@ def test_thresholds_between_the_eight_frequencies_are_in_the_key(corpus: Path) -
     files = corpus / "clean" / "a.b.flac"
     ears = [Audiogram((20.0, 20.0), (500.0, 4000.0))]
     ears.append(Audiogram((20.0, 90.0, 20.0), (500.0, 1500.0, 4000.0)))
-    keys = {Recording("a", files, {"x": files}, ear).digest("x") for ear in ears}
+    keys = {RecordedItem("a", files, {"x": files}, ear).digest("x") for ear in ears}
     assert len(keys) == 2
 
 
@@ -318,6 +318,21 @@ def test_both_ears_may_have_clean_files_of_their_own(tmp_path: Path) -> None:
     path.write_text("\n".join(rows[:2]))
     with pytest.raises(ValueError, match="A s has the ears left; add the missing rows"):
         haspi_report(manifest=path, measures=["stoi"], better_ear=True, jobs=1)
+
+
+def test_ears_of_different_sentences_are_no_pair(tmp_path: Path) -> None:
+    path = write_ears(tmp_path, BOTH_EARS, item="sentence 1")
+    lines = path.read_text().split("\n")
+    rows = [row for row in lines if "left-0" in row or "right-1" in row]
+    path.write_text("\n".join([lines[0], *rows]))
+    speech = example_speech()
+    write_audio(tmp_path / "c1.wav", speech[24000:40000], 16000)
+    settings: dict[str, Any] = {"measures": ["stoi"], "better_ear": True, "jobs": 1}
+    with pytest.raises(ValueError, match=r"same speech .* of A sentence 1, but .*c0\.wav"):
+        haspi_report(manifest=path, **settings)
+    # The sound arrives at the other ear 0.6 ms later and 6 dB softer.
+    write_audio(tmp_path / "c1.wav", 0.5 * speech[:16000].roll(10), 16000)
+    assert haspi_report(manifest=path, **settings).table.item.nunique() == 1
 
 
 def test_items_are_not_identified_by_joined_or_rounded_texts(tmp_path: Path) -> None:

@@ -3,12 +3,14 @@
 import base64
 import hashlib
 import re
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hlsim.progress import ProgressLine
 from hlsim.report.page import Card, Page, Picture, Player, Section, Sound, Table, write_page
 
 VOID_TAGS = {"meta", "link", "img", "input", "br"}
@@ -38,7 +40,7 @@ def page() -> str:
     sound = Sound(NASTY, 60.0, b"fLaC123", -30.0, b"\x89PNG")
     inner = Section("Inner", player=Player({NASTY: [sound, sound]}, 1.0, 90.0))
     table = Table(NASTY, ("a", NASTY), [(NASTY, "1"), ("b", "2")])
-    pictures = [Picture(b"\x89PNG", NASTY, NASTY), Picture(b"<svg/>", "svg")]
+    pictures = [Picture(lambda: b"\x89PNG", NASTY, NASTY), Picture(lambda: b"<svg/>", "svg")]
     sections = [
         Section(NASTY, paragraphs=[NASTY], tables=[table]),
         Section("Pictures", pictures=pictures, sections=[inner]),
@@ -138,3 +140,23 @@ def test_each_value_of_a_wide_table_has_the_title_of_its_column_on_a_phone() -> 
     text = Page("p", "", [Section("s", tables=tables)]).html()
     assert re.findall(r'<td data-title="(.*?)">', text) == ["n", "HASPI", "Level"]
     assert text.count('<table class="wide">') == 1
+
+
+def test_pictures_are_counted_while_they_are_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hlsim.progress._TICK", 0.01)
+    monkeypatch.setattr("hlsim.progress._LINE_INTERVAL", 0.02)
+
+    def draw() -> bytes:
+        printed, end = "", time.monotonic() + 10.0
+        while "1 of 2 pictures" not in printed and time.monotonic() < end:
+            time.sleep(0.02)
+            printed += capsys.readouterr().err
+        assert "1 of 2 pictures (50%), 0.0 min left" in printed
+        return b"<svg/>"
+
+    pictures = [Picture(lambda: b"<svg/>", "quick"), Picture(draw, "slow")]
+    inner = Section("Details", sections=[Section("Pictures", pictures=pictures)])
+    with ProgressLine("scores"):
+        write_page(Page("Aids", "", [inner]), {}, tmp_path)

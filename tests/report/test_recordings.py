@@ -12,7 +12,7 @@ from hlsim.audio import write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Condition, Evaluation, compare
 from hlsim.evaluation.measures import MEASURES
-from hlsim.evaluation.recorded_items import Recording
+from hlsim.evaluation.recorded_items import RecordedItem
 from hlsim.evaluation.sounds import perceive_items
 from hlsim.report.plots import means_pictures
 from hlsim.report.recordings_page import report_page
@@ -31,7 +31,7 @@ def evaluation(folder: Path, listen: int = 0) -> Evaluation:
     write_audio(path, 0.02 * torch.randn(1, 16000), 16000)
     files = dict.fromkeys(NAMES, path)
     audiograms = [Audiogram.standard(ear) for ear in ("N1", "N3", "N4", "S2")]
-    items = [Recording(f"s{i}", path, files, audiograms[i % 4]) for i in range(12)]
+    items = [RecordedItem(f"s{i}", path, files, audiograms[i % 4]) for i in range(12)]
     rows = []
     for number, item in enumerate(items):
         low, rise = torch.rand(2).tolist()
@@ -41,7 +41,7 @@ def evaluation(folder: Path, listen: int = 0) -> Evaluation:
             scores = {"haspi": low / 2 + place * (rise - 0.3) / 4, "level": 65.0 + 6.0 * place}
             about = {"clean_level": 65.0, "full_scale_spl": 94.0}
             rows.append({**facts, **scores, **about, "failure": None})
-    rows[-1] |= {"haspi": math.nan, "failure": "the file is silent"}
+    rows[-1] |= {"haspi": math.nan, "level": -40.0, "failure": "the file is silent"}
     table = pandas.DataFrame(rows)
     study = Evaluation(
         items=items,
@@ -57,6 +57,7 @@ def evaluation(folder: Path, listen: int = 0) -> Evaluation:
 def test_a_comparison_has_one_p_wherever_it_appears(tmp_path: Path) -> None:
     study = evaluation(tmp_path)
     page, planned = report_page(study), study.headline
+    assert [row[-1] for row in page.sections[0].tables[0].rows] == ["65.0", "71.0", "77.0"]
     assert planned is not None
     assert page.verdict == verdict(planned)
     assert page.markdown().count(f"p = {planned.overall.p_t:.5f}") >= 3
