@@ -54,8 +54,7 @@ class Aid(nn.Module):
         Raises:
             ValueError: An ear is not valid.
         """
-        thresholds = store_thresholds(audiogram, highest=highest)
-        self.register_buffer("thresholds", thresholds, persistent=False)
+        self.thresholds = store_thresholds(audiogram, highest=highest)
         self._two_ears = has_listeners(audiogram)
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> Any:

@@ -9,6 +9,7 @@ import math
 import os
 import struct
 import warnings
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -289,9 +290,10 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
 def find_audio(folder: str | Path) -> list[Path]:
     """Find all audio files in a folder and its subfolders, except hidden ones, sorted by path.
 
-    Links to files and folders are followed, except for a link to a folder that contains it, whose
-    files are found without it. Audio in formats that libsndfile does not read, such as M4A, causes
-    a warning.
+    Links to files and folders are followed. A file that is found several times, because links lead
+    to it or to a folder that contains it, is listed once, where it lies or else under one of its
+    paths, and a warning counts the others. Links may form a circle. Audio in formats that
+    libsndfile does not read, such as M4A, causes a warning.
 
     Args:
         folder: Folder to search.
@@ -306,22 +308,32 @@ def find_audio(folder: str | Path) -> list[Path]:
     """
     if not Path(folder).is_dir():
         raise ValueError(f"{folder}: there is no such folder; correct the path")
-    files, broken_links, unreadable_files = [], [], []
+    files: dict[str, Path] = {}  # by real path
+    broken_links, repeated_links, unreadable_files = [], [], []
     try:
-        for entry in _visible_files(os.fspath(folder), {os.path.realpath(folder)}):
-            extension = os.path.splitext(entry.name)[1].lower()
-            if extension in ("", *EXTENSIONS) and not os.path.exists(entry.path):
-                broken_links.append(entry.path)
-            elif extension in EXTENSIONS and entry.is_file():
-                files.append(Path(entry.path))
+        for path, real_path in _visible_files(folder):
+            extension = path.suffix.lower()
+            if extension in ("", *EXTENSIONS) and not os.path.exists(real_path):
+                broken_links.append(path)
+            elif real_path in files or os.path.isdir(real_path):
+                repeated_links.append(path)
+            elif extension in EXTENSIONS and os.path.isfile(real_path):
+                files[real_path] = path
             elif extension in _OTHER_EXTENSIONS:
-                unreadable_files.append(entry.path)
+                unreadable_files.append(path)
     except OSError as error:
         raise ValueError(f"{folder}: cannot be searched for audio: {error}") from error
     if broken_links:
         raise ValueError(
             f"{folder}: {len(broken_links)} links lead to files that do not exist, such as "
             f"{min(broken_links)}; fetch the files, or remove the links"
+        )
+    if repeated_links:
+        warnings.warn(
+            f"{folder}: {len(repeated_links)} links are left out because their files are found "
+            f"elsewhere in the folder, such as {min(repeated_links)}; replace those by copies that "
+            "should count several times",
+            stacklevel=2,
         )
     if unreadable_files:
         warnings.warn(
@@ -332,23 +344,33 @@ def find_audio(folder: str | Path) -> list[Path]:
     if not files:
         extensions = ", ".join(EXTENSIONS)
         raise ValueError(f"{folder}: no audio in it; expected files ending in {extensions}")
-    return sorted(files)
+    return sorted(files.values())
 
 
-def _visible_files(folder: str, parents: set[str]) -> Iterator[os.DirEntry[str]]:
-    """Yield everything in a folder and its subfolders that is neither hidden nor a folder.
+def _visible_files(folder: str | Path) -> Iterator[tuple[Path, str]]:
+    """Yield the paths and the real paths of files and repeated folders that are not hidden.
+
+    Every folder is searched once: first all that are no links, then those to which links lead.
 
     Args:
         folder: Folder to search.
-        parents: Real paths of the folder and of those that lead to it, which are not entered again.
     """
-    with os.scandir(folder) as entries:
-        for entry in entries:
+    folders, links = [Path(folder)], deque[Path]()
+    found = set()
+    while folders or links:
+        path = folders.pop() if folders else links.popleft()
+        real_path = os.path.realpath(path)
+        is_file = not os.path.isdir(real_path)
+        if is_file or real_path in found:
+            yield path, real_path
+            continue
+        found.add(real_path)
+        for entry in sorted(os.scandir(path), key=lambda entry: entry.name):
             if entry.name.startswith("."):
                 continue
-            if not entry.is_dir():
-                yield entry
-                continue
-            real_path = os.path.realpath(entry.path)
-            if real_path not in parents:
-                yield from _visible_files(entry.path, {*parents, real_path})
+            if entry.is_symlink():
+                links.append(path / entry.name)
+            elif entry.is_dir():
+                folders.append(path / entry.name)
+            else:
+                yield path / entry.name, os.path.join(real_path, entry.name)

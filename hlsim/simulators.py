@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -81,7 +82,7 @@ class Attenuation(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         # samples before and after a sample of the output on which it depends
         self.reach = round(_HALF_LENGTH_SECONDS * self.sample_rate)
-        self._thresholds = (store_thresholds(audiogram),)
+        self.thresholds = store_thresholds(audiogram)
         self._two_ears = has_listeners(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
@@ -99,8 +100,7 @@ class Attenuation(nn.Module):
                 not broadcast.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
-        (stored,) = self._thresholds
-        ears = resolve_thresholds(stored, audiogram, waveform, two_ears=self._two_ears)
+        ears = resolve_thresholds(self.thresholds, audiogram, waveform, two_ears=self._two_ears)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = torch.promote_types(waveform.dtype, torch.float32)
             half = self.reach
@@ -157,8 +157,11 @@ class PluginSimulator(nn.Module):
         self.needs_exact_lengths: bool = getattr(function, "needs_exact_lengths", False)
         highest_frequency = getattr(function, "highest_frequency", math.inf)
         self.highest_frequency = min(highest_frequency, self.plugin_rate / 2.0)
-        noise = torch.randn(1, self.plugin_rate // 2, generator=torch.Generator().manual_seed(0))
-        no_loss = torch.zeros(1, len(FREQUENCIES))
+        # Whatever torch's default type and device, for example ``meta``
+        settings: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+        generator = torch.Generator().manual_seed(0)
+        noise = torch.randn(1, self.plugin_rate // 2, generator=generator, **settings)
+        no_loss = torch.zeros(1, len(FREQUENCIES), **settings)
         self.plugin.check_aligned(set_level(noise, 65.0), self.plugin_rate, no_loss)
 
     def __str__(self) -> str:

@@ -1,6 +1,7 @@
 """Audio files: reading gives the samples that were written, and errors name bad files."""
 
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -170,24 +171,59 @@ def test_a_part_that_is_not_finite_leaves_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_links_are_followed_unless_they_lead_in_a_circle_or_nowhere(tmp_path: Path) -> None:
+def test_links_are_followed_unless_they_lead_nowhere(tmp_path: Path) -> None:
     corpus, elsewhere = tmp_path / "corpus", tmp_path / "elsewhere"
-    for path in (corpus / "ann" / "1.wav", elsewhere / "deep" / "2.wav"):
-        path.parent.mkdir(parents=True)
+    for path in (corpus / "ann" / "1.wav", elsewhere / "deep" / "2.wav", elsewhere / "3.wav"):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    (corpus / "bob").symlink_to(elsewhere)
-    (corpus / "3.wav").symlink_to(elsewhere / "deep" / "2.wav")
-    (corpus / "ann" / "again").symlink_to(corpus)
-    (elsewhere / "deep" / "up").symlink_to(elsewhere)
+    (corpus / "bob").symlink_to(elsewhere / "deep")
+    (corpus / "3.wav").symlink_to(elsewhere / "3.wav")
     (corpus / "notes.txt").symlink_to(elsewhere / "none.txt")
     names = [path.relative_to(corpus).as_posix() for path in find_audio(corpus)]
-    assert names == ["3.wav", "ann/1.wav", "bob/deep/2.wav"]
+    assert names == ["3.wav", "ann/1.wav", "bob/2.wav"]
     for name in ("4.wav", "eve"):
         link = corpus / name
         link.symlink_to(elsewhere / "none")
         with pytest.raises(ValueError, match=f"1 links lead to files .* such as {link};"):
             find_audio(corpus)
         link.unlink()
+
+
+@pytest.mark.parametrize(
+    "links",
+    [
+        {"a.wav": "deep/1.wav", "b.wav": "a.wav"},
+        {"deep/z.wav": "1.wav", "a": "deep"},
+        {"deep/b": "..", "deep/up": "."},
+        {"a": "elsewhere", "b": "elsewhere"},
+        {"b.wav": "../elsewhere/2.wav", "elsewhere/c": "../deep"},
+    ],
+)
+def test_a_file_to_which_several_paths_lead_is_found_once(
+    tmp_path: Path, links: dict[str, str]
+) -> None:
+    corpus = tmp_path / "corpus"
+    for path in ("corpus/deep/1.wav", "elsewhere/2.wav"):
+        (tmp_path / path).parent.mkdir(parents=True)
+        (tmp_path / path).touch()
+    (corpus / "elsewhere").symlink_to("../elsewhere")
+    for name, target in links.items():
+        (corpus / name).symlink_to(os.path.normpath(corpus / Path(name).parent / target))
+    with pytest.warns(UserWarning, match=r"2 links are left out .*, such as .*corpus/"):
+        files = find_audio(corpus)
+    assert corpus / "deep/1.wav" in files
+    assert len({path.resolve() for path in files}) == len(files) == 2
+
+
+def test_links_between_many_folders_are_followed_once(tmp_path: Path) -> None:
+    folders = [tmp_path / f"{number:02}" for number in range(12)]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "1.wav").touch()
+        for other in folders:
+            (folder / other.name).symlink_to(other)
+    with pytest.warns(UserWarning, match="144 links are left out"):
+        assert find_audio(tmp_path) == [folder / "1.wav" for folder in folders]
 
 
 def test_audio_that_libsndfile_cannot_read_is_counted(tmp_path: Path) -> None:

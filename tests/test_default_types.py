@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from compensators import NALR, WDRC, HearingAid, MappingCompensator, load_compensator
 from compensators.gains import Aid
 from hlsim import MSBG, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
+from hlsim.simulators import Attenuation, PluginSimulator, load_simulator
 
 EAR = [22.3, 27.7, 31.1, 40.9, 50.3, 55.7, 60.1, 60.9]
 """Thresholds that bfloat16 would round."""
@@ -28,9 +29,11 @@ LOADERS: dict[str, Callable[[], nn.Module]] = {
     "neuro-msbg": lambda: load_pretrained("neuro-msbg"),
     "hearing-aid": lambda: load_compensator("hearing-aid"),
     "compensator-general": lambda: load_compensator("compensator-general"),
+    "PluginSimulator": lambda: PluginSimulator("hlsim:MSBG"),
 }
 FITTED: dict[str, Callable[[], nn.Module]] = {
     "MSBG": lambda: MSBG(EAR),
+    "Attenuation": lambda: Attenuation(EAR),
     "NALR": lambda: NALR(EAR),
     "WDRC": lambda: WDRC(EAR),
 }
@@ -110,3 +113,31 @@ def test_loss_keeps_its_simulator_when_its_host_is_emptied(name: str, clean: Ten
     host.to("meta")
     host.to_empty(device="cpu")
     assert torch.equal(call(name, host["loss"], clean), expected)
+
+
+NETWORKS: dict[str, Callable[[], nn.Module]] = {
+    "HearingAid": lambda: HearingAid(EAR),
+    "MappingCompensator": lambda: MappingCompensator(EAR),
+}
+
+
+@pytest.mark.parametrize("name", FITTED | NETWORKS)
+def test_model_keeps_its_ear_when_it_is_emptied(name: str, clean: Tensor) -> None:
+    model = (FITTED | NETWORKS)[name]()
+    expected, weights = model(clean), model.state_dict()
+    model.to("meta").to_empty(device="cpu")
+    model.load_state_dict(weights)
+    assert torch.equal(model(clean), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("name", FITTED)
+def test_model_keeps_its_ear_in_another_type(name: str, dtype: torch.dtype, clean: Tensor) -> None:
+    model = FITTED[name]()
+    expected = model(clean)
+    assert torch.equal(model.to(dtype)(clean), expected)
+
+
+def test_a_simulator_loads_under_another_default_device() -> None:
+    with torch.device("meta"):
+        assert isinstance(load_simulator("hlsim:MSBG"), PluginSimulator)

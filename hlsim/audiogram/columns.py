@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -23,13 +24,18 @@ _KNOWN_WORDS = {
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}
 """Words of columns that do not hold measured thresholds of air conduction."""
 
-# thousands may be separated, and a decimal comma is as good as a point
+# Thousands may be separated, by a blank if no letter is joined to the number ("R1 500" is none),
+# and a decimal comma is as good as a point.
 _NAME = re.compile(
     r"""(?P<before>\D*?)
-    (?P<number>\d{1,3}(?:[ ,.']\d{3})+(?!\d) | \d+(?:[.,]\d+)? | [.,]\d+)
-    [ ]?(?P<kilo>k?)(?P<after>.*)""",
+    (?P<number>(?:(?<![a-z])\d{1,3}(?:[ ]\d{3})+|\d{1,3}(?:[,.']\d{3})+)(?!\d)
+    | \d+(?:[.,]\d+)? | [.,]\d+)
+    [ _]?(?P<kilo>k?)(?P<after>.*)""",
     re.VERBOSE,
 )
+
+_FREQUENCY = re.compile(r"(?P<number>\d+(?:[.,]\d+)?) ?(?P<kilo>k?)(?:hz)?[lr]?(?![a-z0-9])")
+"""A number that may be a frequency, in the name of a column of something else."""
 
 
 class ThresholdColumn(NamedTuple):
@@ -54,8 +60,10 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
 
     A column of thresholds is called ``hl_250``, ``250``, ``250 Hz``, ``1,000 Hz`` or ``1k``, in any
     case, perhaps with an ear, as in ``L250``, ``right_250`` or ``250 Hz (R)``. Columns such as
-    ``hl_250_masked`` are remarks on ``hl_250``. Columns of bone conduction and extrapolated levels
-    are left out, as is everything that does not look like thresholds.
+    ``hl_250_masked`` are remarks on ``hl_250``. Columns with another word before a frequency of
+    audiometry, such as ``aided 250``, ``bone 250`` and ``masked left 250``, and those of
+    extrapolated levels, are left out with a warning that names them. Columns that do not look like
+    thresholds are left out without one.
 
     Args:
         columns: Names of all columns.
@@ -71,10 +79,14 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     {'R 1k': ThresholdColumn(ear='right', hz=1000.0, is_remark=False)}
     """
     meanings = {}
+    other_columns = []
     names: dict[ThresholdColumn, str] = {}
     for column in columns:
-        meaning = _read_name(column)
+        name = " ".join(column.lower().split())
+        meaning = _read_name(column, name)
         if meaning is None:
+            if any(_read_hz(*match) in _USUAL_HZ for match in _FREQUENCY.findall(name)):
+                other_columns.append(column)
             continue
         meanings[column] = meaning
         if meaning.is_remark:
@@ -92,12 +104,23 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
                 f"column {column!r}: expected a name such as hl_500, 500 Hz, 500 or R 500 for "
                 "thresholds; rename the column"
             )
+    if other_columns:
+        warnings.warn(
+            f"not read as thresholds, because of other words in the names of the columns: "
+            f"{', '.join(map(repr, other_columns))}; if they hold thresholds of air conduction, "
+            "rename them, for example to hl_500, L500 or R500",
+            stacklevel=2,
+        )
     return meanings
 
 
-def _read_name(column: str) -> ThresholdColumn | None:
-    """Return the meaning of a column, or None if it has nothing to do with thresholds."""
-    name = " ".join(column.lower().replace("_", " ").split())
+def _read_name(column: str, name: str) -> ThresholdColumn | None:
+    """Return the meaning of a column, or None if it holds no thresholds.
+
+    Args:
+        column: Name of the column, for messages.
+        name: The name in lower case, with single blanks.
+    """
     match = _NAME.match(name)
     if match is None:
         return None
@@ -109,7 +132,7 @@ def _read_name(column: str) -> ThresholdColumn | None:
     may_have_unit = has_hz or not after
     known = _KNOWN_WORDS | {"db", "dbhl"} if may_have_unit else _KNOWN_WORDS
     is_known = words <= known
-    hz = _read_hz(match["number"], bool(match["kilo"]))
+    hz = _read_hz(match["number"], match["kilo"])
     if words & _OTHER_LEVELS:
         return None
     has_other_unit = name[match.end("number") :][:1].isalpha() and not match["kilo"]  # "500ms"
@@ -129,9 +152,9 @@ def _read_name(column: str) -> ThresholdColumn | None:
     return ThresholdColumn(ear, hz)
 
 
-def _read_hz(number: str, is_in_khz: bool) -> float:
-    """Convert the text of a frequency into a number in Hz."""
-    if is_in_khz:
+def _read_hz(number: str, kilo: str) -> float:
+    """Convert the text of a frequency, and a "k" or nothing, into a number in Hz."""
+    if kilo:
         return 1000.0 * float(number.replace(" ", "").replace(",", "."))
     if re.fullmatch(r"\d{1,3}([ ,.']\d{3})+", number):
         return float(re.sub(r"\D", "", number))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -258,9 +259,14 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
             f"{threshold}, got {', '.join(names)}; add or rename columns"
         )
     ears: dict[tuple[str, ...], _Row] = {}
+    first_rows: dict[tuple[str, ...], dict[str, str]] = {}
+    differing_names = set()
     for place, row in rows:
         ear = {name: text_in(row, name) for name in ("listener", "ear") if has_ears}
-        _, wide = ears.setdefault(tuple(ear.values()), (place, ear))
+        key = tuple(ear.values())
+        _, wide = ears.setdefault(key, (place, ear))
+        first_row = first_rows.setdefault(key, row)
+        differing_names |= {name for name in names if row[name] != first_row[name]}
         text = row[frequency]
         column = text if re.search("k|hz", text.lower()) else f"{text} Hz"
         if not convert_at(place, threshold_columns, [column]):
@@ -274,4 +280,11 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
                 "remove one of them"
             )
         wide[column] = row[threshold]
+    if differing_names:
+        warnings.warn(
+            f"{rows[0][0]}: not read, although they differ between the thresholds of one ear: the "
+            f"columns {', '.join(sorted(differing_names))}; remove rows that are not thresholds of "
+            "air conduction",
+            stacklevel=2,
+        )
     return [*ears.values()]

@@ -149,7 +149,7 @@ class MSBG(nn.Module):
         self.rescale_active = rescale_active
         self.smearing = smearing
         self.checkpoint = False
-        self.register_buffer("thresholds", store_thresholds(audiogram), persistent=False)
+        self.thresholds = store_thresholds(audiogram)
         self._two_ears = has_listeners(audiogram)
         self._other_grids = ears_on_other_grids(audiogram)
 

@@ -42,9 +42,8 @@ def read_text(folder: Path, text: str) -> list[Audiogram]:
         "250 Hz*,500 Hz (dB HL),AC 1000\n10,22.5,30\n",
         '"250\nHz","500\nHz","1000\nHz"\n10,22.5,30\n',
         "250 Hz R,500_R,right 1k\n10,22.5,30\n",
-        "AUXU1K1R,2nd visit,2019-05-01,bc_500,250,500,1000\n7,7,7,7,10,22.5,30\n",
+        "AUXU1K1R,2nd visit,2019-05-01,PTA 4,250,500,1000\n7,7,7,7,10,22.5,30\n",
         "threshold_500ms_db_spl,250,500,1000\n7,10,22.5,30\n",
-        "hl_250,hl_500,hl_1000,hl_8000_extrapolated_flat\n10,22.5,30,30\n",
         "hl_250,hl_500,hl_1000\n,,\n10,22.5,30\n,,\n",
         "Frequency (Hz),Threshold (dB HL)\n1000,30\n250,10\n500,22.5\n",
     ],
@@ -53,6 +52,26 @@ def test_columns_are_found_whatever_their_order_case_and_delimiter(
     tmp_path: Path, text: str
 ) -> None:
     assert read_text(tmp_path, text) == [Audiogram((10, 22.5, 30), (250, 500, 1000))]
+
+
+OTHER_COLUMNS = ["aided 2000", "unaided_500", "bone 1000", "masked left 500", "L aided 1k"]
+OTHER_COLUMNS += ["visit2_500", "R2_1000", "L1 500", "UCL 500", "AUXU500R", "pta_500_1000_2000"]
+OTHER_COLUMNS += ["bc_500", "hl_8000_extrapolated_flat"]
+
+
+@pytest.mark.parametrize("column", OTHER_COLUMNS)
+def test_columns_with_a_word_before_the_frequency_are_named(tmp_path: Path, column: str) -> None:
+    with pytest.warns(UserWarning, match=f"not read as thresholds.*'{column}'"):
+        ears = read_text(tmp_path, f"250,500,1000,{column}\n10,22.5,30,7\n")
+    assert ears == [Audiogram((10, 22.5, 30), (250, 500, 1000))]
+
+
+def test_columns_that_differ_within_an_ear_of_a_long_table_are_named(tmp_path: Path) -> None:
+    header, rows = "listener,ear,frequency,threshold", ("A,L,250,10", "A,L,500,20", "A,R,500,30")
+    path = tmp_path / "ears.csv"
+    path.write_text(f"{header},kind,clinic\n{rows[0]},air,x\n{rows[1]},bone,x\n{rows[2]},bone,y\n")
+    with pytest.warns(UserWarning, match=r"one ear: the columns kind; remove rows"):
+        assert len(read_audiograms(path)) == 2
 
 
 @pytest.mark.parametrize("text", ["", "NA", "n/a", "null", "None", "nan"])
