@@ -21,7 +21,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
-from hlsim.checkpoint import read_record, read_weights, save_checkpoint
+from hlsim.checkpoint import CONFIG, read_record, read_weights, save_checkpoint
 from hlsim.files import lock_folder
 from hlsim.progress import ProgressLine, clear_line
 from hlsim.training.batches import BatchData
@@ -180,9 +180,9 @@ def train_network(
         The folder ``checkpoint`` below ``out``.
 
     Raises:
-        ValueError: The folder contains another training or a broken state, or another process is
-            writing to it; there is no such device; gradients would be accumulated; or the loss is
-            not finite.
+        ValueError: The folder contains another training, one with another number of devices, its
+            network alone, or a broken state; another process is writing to it; there is no such
+            device; gradients would be accumulated; or the loss is not finite.
         KeyboardInterrupt: The training was interrupted. It resumes from its last validation.
     """
     recipe = module.recipe
@@ -223,8 +223,11 @@ def train_network(
             raise ValueError(f"cannot train with {options}: {error}") from error
         if trainer.is_global_zero:
             locks.enter_context(lock_folder(folder))
+        record["devices"] = trainer.world_size
         is_resumption = state.exists()
-        if is_resumption:
+        if not is_resumption:
+            _check_no_network(best.folder)
+        else:
             step = _check_state(state, record, best.folder)
             if step >= recipe.steps:
                 trainer.print(f"the training has finished: all {step} steps were taken")
@@ -238,6 +241,18 @@ def train_network(
         finally:
             clear_line(sys.stderr)
     return best.folder
+
+
+def _check_no_network(folder: Path) -> None:
+    """Raise ValueError if a folder has the network of another training, which would be replaced.
+
+    A training that ended before its first state leaves the network before its first step.
+    """
+    if (folder / CONFIG).exists() and read_record(folder).get("about", {}).get("steps") != 0:
+        raise ValueError(
+            f"{folder}: the network of another training would be replaced; move it, or choose "
+            "another output folder"
+        )
 
 
 def _check_state(path: Path, record: Mapping[str, Any], best_folder: Path) -> int:
@@ -260,8 +275,8 @@ def _check_state(path: Path, record: Mapping[str, Any], best_folder: Path) -> in
         actual, steps = contents["record"], int(contents["global_step"])
     except Exception as error:  # torch, zipfile and pickle raise various exceptions.
         raise ValueError(
-            f"{path}: cannot be read as the state of a training; delete it to start from the "
-            "beginning"
+            f"{path}: cannot be read as the state of a training; restore it, or choose another "
+            "output folder"
         ) from error
     settings = {**record, **record["recipe"]}
     actual_settings = {**actual, **actual["recipe"]}
@@ -277,6 +292,6 @@ def _check_state(path: Path, record: Mapping[str, Any], best_folder: Path) -> in
     except ValueError as error:
         raise ValueError(
             f"the training cannot continue, because its best network is lost ({error}); restore "
-            f"{best_folder}, or delete {path} to start from the beginning"
+            f"{best_folder}, or choose another output folder"
         ) from error
     return steps

@@ -190,6 +190,31 @@ def test_a_training_without_its_best_network_does_not_continue(tmp_path: Path, f
         lost.rename(tmp_path / file)
 
 
+def test_the_network_of_another_training_is_not_replaced(tmp_path: Path) -> None:
+    run(VectorTraining(scores={0: 0.0, 2: 1.0}, steps=2), tmp_path)
+    (tmp_path / "last.ckpt").unlink()
+    before = (tmp_path / "checkpoint" / "model.safetensors").read_bytes()
+    with pytest.raises(ValueError, match=f"{tmp_path}/checkpoint: the network .* be replaced"):
+        run(VectorTraining(seed=1), tmp_path)
+    assert (tmp_path / "checkpoint" / "model.safetensors").read_bytes() == before
+
+
+def test_a_training_that_ended_before_its_first_state_starts_again(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="step 3"):
+        run(VectorTraining(factor=math.nan, validate_every=5), tmp_path)
+    assert not (tmp_path / "last.ckpt").exists() and saved_step(tmp_path) == 0
+    run(VectorTraining(), tmp_path)
+    assert saved_step(tmp_path) == 0 and last_state(tmp_path)["global_step"] == 9
+
+
+def test_a_training_does_not_resume_with_another_number_of_devices(tmp_path: Path) -> None:
+    run(VectorTraining(interrupt="stopped"), tmp_path)
+    state = last_state(tmp_path)
+    torch.save(state | {"record": state["record"] | {"devices": 2}}, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match="differs in devices;"):
+        run(VectorTraining(), tmp_path)
+
+
 def test_gradients_are_not_accumulated(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="raise batch in the recipe"):
         run(VectorTraining(), tmp_path, accumulate_grad_batches=2)
