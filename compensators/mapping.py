@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from compensators.aid import Aid
 from compensators.config import MappingConfig
-from compensators.gains import Aid
 from compensators.limiter import soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db

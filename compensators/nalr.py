@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from compensators.gains import Aid
+from compensators.aid import Aid
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds

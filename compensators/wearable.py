@@ -20,6 +20,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from compensators.aid import Aid
 from compensators.filter_bank import (
     DELAY,
     HISTORY,
@@ -30,7 +31,6 @@ from compensators.filter_bank import (
     frame_power,
     gain_at_rate,
 )
-from compensators.gains import Aid
 from compensators.limiter import soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db

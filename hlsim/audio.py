@@ -72,7 +72,7 @@ def read_audio(path: str | Path) -> tuple[Tensor, int]:
 
 
 @dataclass(frozen=True)
-class Recording:
+class AudioInfo:
     """Properties of an audio file, found without keeping its samples in memory.
 
     Attributes:
@@ -82,7 +82,7 @@ class Recording:
         samples: Number of samples per channel.
         power: Mean square of all samples of all channels, where 1.0 is full scale.
 
-    >>> Recording(Path("noise.wav"), sample_rate=16000, channels=2, samples=320, power=0.01).samples
+    >>> AudioInfo(Path("noise.wav"), sample_rate=16000, channels=2, samples=320, power=0.01).samples
     320
     """
 
@@ -93,7 +93,7 @@ class Recording:
     power: float
 
 
-def scan_audio(path: str | Path) -> Recording:
+def scan_audio(path: str | Path) -> AudioInfo:
     """Read an audio file once, a part at a time, and return its properties.
 
     Args:
@@ -116,14 +116,14 @@ def scan_audio(path: str | Path) -> Recording:
             energy += float(np.square(block, dtype=np.float64).sum())
     _check_contents(path, rate, math.isfinite(energy), energy > 0.0)
     _warn_if_truncated(path, expected, samples)
-    return Recording(Path(path), rate, channels, samples, energy / (samples * channels))
+    return AudioInfo(Path(path), rate, channels, samples, energy / (samples * channels))
 
 
-def read_parts(recording: Recording, bounds: Iterable[tuple[int, int]]) -> Iterator[Tensor]:
+def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Iterator[Tensor]:
     """Yield parts of a recording, each of them read when it is needed.
 
     Args:
-        recording: Recording from ``scan_audio``.
+        recording: AudioInfo from ``scan_audio``.
         bounds: Half-open range of samples of each part, in ascending order. Parts may overlap, and
             have no gap between them.
 
@@ -356,15 +356,15 @@ def _visible_files(folder: str | Path) -> Iterator[tuple[Path, str]]:
         folder: Folder to search.
     """
     folders, links = [Path(folder)], deque[Path]()
-    found = set()
+    searched = set()
     while folders or links:
         path = folders.pop() if folders else links.popleft()
         real_path = os.path.realpath(path)
         is_file = not os.path.isdir(real_path)
-        if is_file or real_path in found:
+        if is_file or real_path in searched:
             yield path, real_path
             continue
-        found.add(real_path)
+        searched.add(real_path)
         for entry in sorted(os.scandir(path), key=lambda entry: entry.name):
             if entry.name.startswith("."):
                 continue

@@ -10,15 +10,18 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from itertools import zip_longest
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO, TypeVar
 
 if sys.platform == "win32":
     import msvcrt
 else:
     import fcntl
+
+Result = TypeVar("Result")
 
 _LOCK = ".lock"
 """Name of the file by which processes keep each other out of a folder."""
@@ -163,62 +166,96 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str]]]:
-    """Read a CSV file with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows' cp1252.
+def read_table(
+    table: str | Path | Any, contents: str, known_columns: Collection[str] = ()
+) -> list[tuple[str, dict[str, str]]]:
+    """Read the rows of a CSV file or of a pandas ``DataFrame``.
+
+    A file has commas, semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
-        path: CSV file, whose first line names the columns.
+        table: CSV file, whose first line names the columns, or data frame.
         contents: Description of the contents for error messages, such as "the manifest".
+        known_columns: Names in lower case of columns that may have capitals in the table.
 
     Returns:
-        A list with two members per row: the number of its last line, and its values by column,
-        without surrounding blanks. Missing values are empty. Rows without any value are left out.
+        A list with two members per row: its place for messages, and its texts by column, without
+        surrounding blanks. Missing values are empty. Rows without any value are left out.
 
     Raises:
-        ValueError: The file cannot be read or has no rows, a column appears twice, or a row has too
-            many values.
+        ValueError: The file cannot be read, there are no rows, a column appears twice, or a row has
+            too many values.
 
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_atomically(f"{folder}/ears.csv", "name;500 Hz\\nA;20\\n")
-    ...     read_table(f"{folder}/ears.csv", "the table")
-    [(2, {'name': 'A', '500 Hz': '20'})]
+    ...     write_atomically(f"{folder}/ears.csv", "Name;500 Hz\\nA;20\\n")
+    ...     [row for _, row in read_table(f"{folder}/ears.csv", "the ears", ["name"])]
+    [{'name': 'A', '500 Hz': '20'}]
     """
+    if isinstance(table, str | Path):
+        source, unit = str(table), "line"
+        names, lines = _read_csv(Path(table), contents)
+    else:
+        source, unit = contents, "row"
+        names = [str(column).strip() for column in table.columns]
+        cells = table.astype(object).where(table.notna(), "").astype(str)
+        lines = list(zip(table.index, cells.values.tolist(), strict=True))
+    names = [name.lower() if name.lower() in known_columns else name for name in names]
+    for name in names:
+        if name and names.count(name) > 1:
+            raise ValueError(f"{source}: the column {name} appears twice; rename one of the two")
     rows = []
+    for number, texts in lines:
+        place = f"{source}, {unit} {number}"
+        if any(texts[len(names) :]):
+            raise ValueError(
+                f"{place}: expected {len(names)} values, one for each column of the "
+                f"header, got {len(texts)}; put values that contain the separator into quotes"
+            )
+        pairs = zip_longest(names, texts[: len(names)], fillvalue="")
+        values = {name: text.strip() for name, text in pairs if name}
+        if any(values.values()):  # spreadsheets write rows of commas
+            rows.append((place, values))
+    if not rows:
+        raise ValueError(f"{source}: expected a table with rows, got no rows; add them")
+    return rows
+
+
+def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the names of the columns of a file, and the number and the texts of each line."""
     try:
-        with io.StringIO(_decode(Path(path).read_bytes()), newline="") as file:
+        with io.StringIO(_decode(path.read_bytes()), newline="") as file:
             header = file.readline()
-            delimiter = max(",;\t", key=header.count)
             file.seek(0)
-            reader = csv.DictReader(file, delimiter=delimiter, restval="")
-            names = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = names
-            for name in names:
-                if name and names.count(name) > 1:
-                    raise ValueError(
-                        f"{path}, line 1: the column {name} appears twice; rename one of the two"
-                    )
-            for row in reader:
-                surplus_values = row.pop(None, ())
-                if any(surplus_values):
-                    raise ValueError(
-                        f"{path}, line {reader.line_num}: expected {len(names)} values, one for "
-                        f"each column of the header, got {len(names) + len(surplus_values)}; put "
-                        "values that contain the separator into quotes"
-                    )
-                values = {name: value.strip() for name, value in row.items() if name}
-                if any(values.values()):  # spreadsheets write rows of commas
-                    rows.append((reader.line_num, values))
+            reader = csv.reader(file, delimiter=max(",;\t", key=header.count))
+            lines = [(reader.line_num, texts) for texts in reader if texts]
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path}: {contents} must be a CSV file in UTF-8 or cp1252 ({error})"
         ) from error
     except (OSError, csv.Error) as error:
         raise ValueError(f"{path}: cannot read {contents}: {error}") from error
-    if not rows:
-        raise ValueError(
-            f"{path}: expected {contents} with a header and rows, got no rows; add them"
-        )
-    return rows
+    names = [name.strip() for name in lines[0][1]] if lines else []
+    return names, lines[1:]
+
+
+def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
+    """Call a function, and put a place in a file before the message of a ValueError that it raises.
+
+    Args:
+        place: Place for the message, such as ``ears.csv, line 2``.
+        convert: Function to call.
+        arguments: Arguments of the function.
+
+    Returns:
+        The result of the function.
+
+    >>> convert_at("ears.csv, line 2", float, "20")
+    20.0
+    """
+    try:
+        return convert(*arguments)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
 
 
 def _decode(data: bytes) -> str:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from compensators import NALR, WDRC, HearingAid, MappingCompensator, load_compensator
-from compensators.gains import Aid
+from compensators.aid import Aid
 from hlsim import MSBG, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.simulators import Attenuation, PluginSimulator, load_simulator
 

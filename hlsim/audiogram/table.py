@@ -13,9 +13,9 @@ from typing import Any
 from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD, EarName
-from hlsim.audiogram.value import Audiogram, convert_at, ears_in_row
+from hlsim.audiogram.value import Audiogram, ears_in_row
 from hlsim.checks import reject_duplicates
-from hlsim.files import read_table
+from hlsim.files import convert_at, read_table
 
 _Builders = Mapping[str, Callable[[], Listener]]
 """Functions that build listeners, under the names of the listeners."""
@@ -41,8 +41,9 @@ def read_audiograms(
             rejected, and N7, which has them, is left out of the standard audiograms.
 
     Returns:
-        A list with two members per ear: the texts of its row by column, and its audiogram. For a
-        row with both ears, the text in the column ``ear`` is ``left`` or ``right``.
+        A list with two members per ear: the texts of its row by column, and its audiogram. The
+        names of the columns ``listener`` and ``ear`` are in lower case. For a row with both ears,
+        the text in the column ``ear`` is ``left`` or ``right``.
 
     Raises:
         ValueError: The file cannot be read, has no rows, a row is not an audiogram, or a column
@@ -62,7 +63,7 @@ def read_audiograms(
     audiograms = []
     for place, row in _read_rows(path):
         for name, ear in convert_at(place, _read_ears, row, highest).items():
-            is_named = name is None or text_in(row, "ear") != ""
+            is_named = name is None or row.get("ear")
             audiograms.append((row if is_named else {**row, "ear": str(name)}, ear))
     return audiograms
 
@@ -105,25 +106,6 @@ def read_listeners(
     return {name: builders[name]() for name in (builders if names is None else names)}
 
 
-def text_in(row: Mapping[str, str], name: str) -> str:
-    """Return the text of a row in a column whose name may have capitals, or an empty text.
-
-    Args:
-        row: Texts by column.
-        name: Name of the column in lower case.
-
-    Raises:
-        ValueError: Two columns have this name.
-
-    >>> text_in({"Ear": "L", "500 Hz": "20"}, "ear")
-    'L'
-    """
-    columns = [column for column in row if column.strip().lower() == name]
-    if len(columns) > 1:
-        raise ValueError(f"columns {' and '.join(columns)} have the same name; rename one of them")
-    return row[columns[0]].strip() if columns else ""
-
-
 def _read_entries(path: str | Path) -> _Builders:
     """Read Clarity's ``listeners.json``, and return functions that build the listeners."""
     try:
@@ -143,7 +125,7 @@ def _group_rows(path: str | Path | Any) -> _Builders:
     """Read the rows of a table, and return functions that build the listeners."""
     rows: dict[str, list[_Row]] = {}
     for place, row in _read_rows(path):
-        name = convert_at(place, text_in, row, "listener")
+        name = row.get("listener")
         if not name:
             raise ValueError(f"{place}: expected a name in the column listener, got none; add it")
         rows.setdefault(name, []).append((place, row))
@@ -156,7 +138,7 @@ def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
     for place, row in rows:
         for name, ear in convert_at(place, _read_ears, row).items():
             if name is None:
-                text = text_in(row, "ear")
+                text = row.get("ear", "")
                 raise ValueError(
                     f"{place}: expected left or right in the column ear, got {text!r}; correct it"
                 )
@@ -174,57 +156,20 @@ def _read_ears(
 ) -> dict[EarName | None, Audiogram]:
     """Return the audiograms of a row by ear, which its columns or its column ``ear`` name."""
     ears = ears_in_row(row, highest)
-    name = EAR_NAMES.get(text_in(row, "ear").lower())
+    name = EAR_NAMES.get(row.get("ear", "").lower())
     if None in ears:
         return {name: ears[None]}
     if name is not None:
         raise ValueError(
-            f"columns of thresholds name the ear, and the column ear has {text_in(row, 'ear')!r}; "
+            f"columns of thresholds name the ear, and the column ear has {row['ear']!r}; "
             "remove the column ear"
         )
     return ears
 
 
-def read_rows(table: str | Path | Any, contents: str) -> list[tuple[str, dict[str, str]]]:
-    """Read the rows of a CSV file or of a pandas ``DataFrame``.
-
-    Args:
-        table: The file or the data frame.
-        contents: Description of the contents for error messages, such as "the manifest".
-
-    Returns:
-        A list with two members per row: its place for messages, and its texts by column. Missing
-        values are empty.
-
-    Raises:
-        ValueError: The file cannot be read, there are no rows, or a column appears twice.
-
-    >>> import pandas
-    >>> read_rows(pandas.DataFrame({"hl_500": [20]}), "the ears")[0][1]
-    {'hl_500': '20'}
-    """
-    if isinstance(table, str | Path):
-        return [(f"{table}, line {line}", row) for line, row in read_table(table, contents)]
-    names = [str(column).strip() for column in table.columns]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise ValueError(f"{contents}: the column {repeated[0]} appears twice; rename one of them")
-    if not len(table):
-        raise ValueError(f"{contents}: expected a table with rows, got no rows; add them")
-    cells = table.astype(object).where(table.notna(), "").astype(str)
-    rows = zip(table.index, cells.itertuples(index=False, name=None), strict=True)
-    return [
-        (
-            f"{contents}, row {index}",
-            {name: text.strip() for name, text in zip(names, row, strict=True)},
-        )
-        for index, row in rows
-    ]
-
-
 def _read_rows(table: str | Path | Any) -> list[_Row]:
     """Read the rows of a table of ears, and join those of a long one."""
-    rows = read_rows(table, "audiograms")
+    rows = read_table(table, "audiograms", ("listener", "ear"))
     columns: dict[str, str] = {}
     for column in rows[0][1]:
         other = columns.setdefault(_without_units(column), column)
@@ -252,7 +197,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         threshold: Name of the column of thresholds in dB HL.
     """
     names = [column for column in rows[0][1] if column not in (frequency, threshold)]
-    has_ears = {"listener", "ear"} <= {column.lower() for column in names}
+    has_ears = {"listener", "ear"} <= set(names)
     if names and not has_ears:
         raise ValueError(
             f"{rows[0][0]}: expected the columns listener and ear beside {frequency} and "
@@ -262,7 +207,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
     first_rows: dict[tuple[str, ...], dict[str, str]] = {}
     differing_names = set()
     for place, row in rows:
-        ear = {name: text_in(row, name) for name in ("listener", "ear") if has_ears}
+        ear = {name: row[name] for name in ("listener", "ear") if has_ears}
         key = tuple(ear.values())
         _, wide = ears.setdefault(key, (place, ear))
         first_row = first_rows.setdefault(key, row)

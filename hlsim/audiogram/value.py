@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,8 +29,6 @@ from hlsim.audiogram.scale import (
     EarName,
 )
 from hlsim.extras import require
-
-Result = TypeVar("Result")
 
 _UNMEASURED = ("", "na", "n/a", "null", "none", "nan")
 
@@ -401,26 +399,6 @@ def ears_in_row(
             f"them, got {', '.join(threshold_columns(row))}; rename the columns"
         )
     return {ear: _from_mapping(points[ear]) for ear in (None, *EARS) if ear in points}
-
-
-def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
-    """Call a function, and put a place in a file before the message of a ValueError that it raises.
-
-    Args:
-        place: Place for the message, such as ``ears.csv, line 2``.
-        convert: Function to call.
-        arguments: Arguments of the function.
-
-    Returns:
-        The result of the function.
-
-    >>> convert_at("ears.csv, line 2", Audiogram.from_row, {"hl_500": "20"})
-    Audiogram({500: 20})
-    """
-    try:
-        return convert(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
 
 
 def check_range(

@@ -13,7 +13,7 @@ from compensators import NALR
 from compensators.long_signals import process_blocks
 from compensators.nalr import ORDER
 from compensators.wearable import Wearable
-from hlsim.audio import Recording, read_parts
+from hlsim.audio import AudioInfo, read_parts
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.calibration import NEURO_RATE
@@ -72,7 +72,7 @@ class Meter:
 
 
 def process_recording(
-    model: nn.Module, recording: Recording, gain: float, ears: Any, **sliders: float
+    model: nn.Module, recording: AudioInfo, gain: float, ears: Any, **sliders: float
 ) -> Iterator[Tensor]:
     """Yield the output of a simulator or an aid for a recording, one part after the other.
 
@@ -84,7 +84,7 @@ def process_recording(
 
     Args:
         model: Simulator or aid at the sample rate of the recording.
-        recording: Recording from ``scan_audio``.
+        recording: AudioInfo from ``scan_audio``.
         gain: Factor on the input, by which the output is divided.
         ears: Audiogram, or listener for a stereo recording.
         sliders: Further arguments of an aid, each under its name.
@@ -132,7 +132,7 @@ def _process_channels(
     return torch.stack(outputs)
 
 
-def read_all(recording: Recording) -> Iterator[Tensor]:
+def read_all(recording: AudioInfo) -> Iterator[Tensor]:
     """Yield consecutive parts of a recording, (channels, time)."""
     hop = round(_BLOCK_SECONDS * recording.sample_rate)
     blocks = split_into_blocks(recording.samples, hop, 0, 0)

@@ -20,7 +20,7 @@ silent except for one second per hour."""
 MAX_SAMPLES_IN_MEMORY = 2**30
 """Number of samples of all recordings in memory: 2 GB, 18 hours at 16 kHz."""
 
-Source = str | Path | Sequence[Path | tuple[Path, Path]]
+AudioFiles = str | Path | Sequence[Path | tuple[Path, Path]]
 """A folder that is searched for audio, with its subfolders; or a list of files.
 
 In a list, a pair of files, clean speech and its noisy version, stands for the noise between them.
@@ -47,7 +47,7 @@ class Clips:
     instead.
 
     Args:
-        source: Folder or files, see ``Source``.
+        source: Folder or files, see ``AudioFiles``.
         sample_rate: Sample rate of the clips in Hz.
         seconds: Duration of a clip.
         repeat: Whether recordings that are shorter than a clip are repeated; otherwise silence
@@ -68,7 +68,7 @@ class Clips:
 
     def __init__(
         self,
-        source: Source,
+        source: AudioFiles,
         *,
         sample_rate: int,
         seconds: float,
@@ -197,7 +197,7 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
     return noisy
 
 
-def hash_source(source: Source) -> str:
+def hash_source(source: AudioFiles) -> str:
     """Compute a hash of the contents of recordings, which changes when one is replaced.
 
     Paths have no influence except for the order of the files, so that a corpus may be moved. If all
@@ -205,7 +205,7 @@ def hash_source(source: Source) -> str:
     of each file and four pieces of it, from its start to its end, about 1 GB together.
 
     Args:
-        source: Folder or files, see ``Source``.
+        source: Folder or files, see ``AudioFiles``.
 
     Returns:
         The SHA-256 in hexadecimal.
@@ -236,7 +236,7 @@ def hash_source(source: Source) -> str:
     return digest.hexdigest()
 
 
-def _find_pairs(source: Source) -> list[tuple[Path | None, Path]]:
+def _find_pairs(source: AudioFiles) -> list[tuple[Path | None, Path]]:
     """Return the files of a source, each with its clean version if it stands for noise."""
     files = find_audio(source) if isinstance(source, str | Path) else source
     return [file if isinstance(file, tuple) else (None, file) for file in files]

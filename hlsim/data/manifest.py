@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from hlsim.audiogram.value import convert_at
-from hlsim.files import path_below, read_table, write_atomically
+from hlsim.files import convert_at, path_below, read_table, write_atomically
 
 SPLITS = ("train", "valid", "test")
 """Names of the splits."""
@@ -65,20 +64,15 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     """
     folder = Path(path).parent if root is None else Path(root)
     utterances = []
-    for line, row in read_table(path, "the manifest"):
-        names = [name.lower() for name in row]
-        twice = [name for name in COLUMNS if names.count(name) > 1]
-        if twice:
-            raise ValueError(f"{path}: the column {twice[0]} appears twice; remove one of the two")
-        values = {name.lower(): text for name, text in row.items() if name.lower() in COLUMNS}
+    for place, row in read_table(path, "the manifest", COLUMNS):
+        values = {name: text for name, text in row.items() if name in COLUMNS}
         if not values.get("path") or values.get("split", "train") not in SPLITS:
             raise ValueError(
-                f"{path}, line {line}: expected a file in the column 'path', and train, valid or "
+                f"{place}: expected a file in the column 'path', and train, valid or "
                 f"test in the column 'split', got {values}; correct the row"
             )
         for column in ("path", "noisy"):
             if values.get(column):
-                place = f"{path}, line {line}"
                 file = convert_at(place, path_below, folder, values[column])
                 values[column] = Path(os.path.relpath(file, folder)).as_posix()
         utterances.append(Utterance(**values))

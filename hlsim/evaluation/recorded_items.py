@@ -29,12 +29,12 @@ from hlsim.audiogram import Audiogram
 from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, EARS
-from hlsim.audiogram.table import read_audiograms, read_listeners, read_rows, text_in
-from hlsim.audiogram.value import convert_at, ears_in_row
+from hlsim.audiogram.table import read_audiograms, read_listeners
+from hlsim.audiogram.value import ears_in_row
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.running.fingerprint import value_hash
 from hlsim.evaluation.study import Item
-from hlsim.files import path_below, sha256
+from hlsim.files import convert_at, path_below, read_table, sha256
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -273,8 +273,8 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
         return [(name, side, ear) for name, both in listeners for side, ear in both.ears().items()]
     ears = []
     for number, (row, audiogram) in enumerate(read_audiograms(audiograms), start=1):
-        side = EAR_NAMES.get(text_in(row, "ear").lower(), "")
-        ears.append((text_in(row, "listener") or f"row {number}", side, audiogram))
+        side = EAR_NAMES.get(row.get("ear", "").lower(), "")
+        ears.append((row.get("listener") or f"row {number}", side, audiogram))
     source = audiograms if is_file else "the table"
     names = [(listener, side) for listener, side, _ in ears]
     for listener, side in names:
@@ -327,10 +327,7 @@ def read_recordings(
     ['c/1']
     """
     is_file = isinstance(manifest, (str, Path))
-    rows = [
-        (place, convert_at(place, _known_columns, row))
-        for place, row in read_rows(manifest, "the manifest")
-    ]
+    rows = read_table(manifest, "the manifest", _COLUMNS)
     folder = root if root is not None else (Path(manifest).parent if is_file else Path())
     columns = rows[0][1]
     if "spl" in columns:
@@ -354,17 +351,6 @@ def read_recordings(
             recording = convert_at(place, _merge, recordings[key], recording)
         recordings[key] = recording
     return list(recordings.values())
-
-
-def _known_columns(row: Mapping[str, str]) -> dict[str, str]:
-    """Return a row with the names of known columns in lower case, whatever their case was."""
-    known: dict[str, str] = {}
-    for column, text in row.items():
-        name = column.lower() if column.lower() in _COLUMNS else column
-        if name in known:
-            raise ValueError(f"the column {name} appears twice; remove one of the two")
-        known[name] = text
-    return known
 
 
 def _merge(earlier: RecordedItem, recording: RecordedItem) -> RecordedItem:

@@ -24,7 +24,7 @@ from hlsim.data.augment import (
     equalise_share,
     replace_share,
 )
-from hlsim.data.clips import Clips, Source, hash_source
+from hlsim.data.clips import AudioFiles, Clips, hash_source
 from hlsim.data.ears import draw_thresholds
 from hlsim.data.manifest import read_manifest
 from hlsim.data.mixing import mix
@@ -68,7 +68,7 @@ class TrainingData:
     scores are therefore those of speakers that the network knows.
 
     Attributes:
-        speech: Folder or files of clean speech, see ``Source``.
+        speech: Folder or files of clean speech, see ``AudioFiles``.
         noise: Folder or files of noise that is mixed in, or pairs of clean and noisy speech.
         audiograms: CSV file of measured ears, which are used in addition to random ones.
         valid_speech: Clean speech for validation, like ``speech``.
@@ -81,11 +81,11 @@ class TrainingData:
     ['b.wav']
     """
 
-    speech: Source
-    noise: Source | None = None
+    speech: AudioFiles
+    noise: AudioFiles | None = None
     audiograms: Path | None = None
-    valid_speech: Source | None = None
-    valid_noise: Source | None = None
+    valid_speech: AudioFiles | None = None
+    valid_noise: AudioFiles | None = None
     valid_audiograms: Path | None = None
     workers: int = 0
 

@@ -172,7 +172,7 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         ("L1,left", "L1,top", "line 2: .*got 'top'"),
         ("before/a", "../a", "line 2: expected the path of a file below"),
         ("condition,", "treatment,", "line 2: there is no column condition, only listener, ear, "),
-        ("listener,ear", "ear,Ear", "line 2: the column ear appears twice"),
+        ("listener,ear", "ear,Ear", "the column ear appears twice"),
         (",audiogram\n", ",ear_of\n", "line 2: there is no audiogram of listener 'L1'"),
     ],
 )

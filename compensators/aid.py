@@ -1,4 +1,4 @@
-"""Base class of all aids: an ear of their own, and insertion gains.
+"""Base class of all aids, which may store an ear and measure their insertion gains.
 
 The insertion gain is the level of an aid's output minus that of its input in dB, in a third of an
 octave around a frequency. It is measured with noise that has the spectrum of average speech.
