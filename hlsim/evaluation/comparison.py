@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.statistics import PairedComparison, holm, paired_comparison
 
@@ -32,8 +31,6 @@ class ConditionComparison:
         overall: Statistics over all items, with p values that are not adjusted.
         level_change: Change of the mean output level of the same items in dB; NaN if levels are
             not known.
-        by_severity: The same statistics for the items of each degree of hearing loss that occurs,
-            under its name, such as ``"mild"``.
         unit: Column of the table that several items share, such as ``"listener"``.
         unit_means: The same statistics over one mean score per unit, because items of one listener
             are not independent; None unless there are two units or more.
@@ -56,7 +53,6 @@ class ConditionComparison:
     after: str
     overall: PairedComparison
     level_change: float
-    by_severity: Mapping[str, PairedComparison]
     unit: str
     unit_means: PairedComparison | None
     left_out: int
@@ -143,16 +139,11 @@ def _compare_pair(
         return None
     first, second = pairs.to_numpy(float).T
     rows = table.drop_duplicates("item").set_index("item").loc[pairs.index]
-    degrees, units = (np.array(rows.get(column, [])) for column in ("severity", unit))
+    units = np.array(rows.get(unit, []))
     level_change = math.nan
     if "level" in table:
         levels = table.pivot(index="item", columns="condition", values="level").loc[pairs.index]
         level_change = float((levels[after] - levels[before]).mean())
-    by_severity = {
-        name: paired_comparison(first[degrees == name], second[degrees == name])
-        for name in SEVERITIES
-        if name in degrees
-    }
     overall = paired_comparison(first, second)
     return ConditionComparison(
         measure=measure,
@@ -160,7 +151,6 @@ def _compare_pair(
         after=after,
         overall=overall,
         level_change=level_change,
-        by_severity=by_severity,
         unit=unit,
         unit_means=_compare_units(units, first, second),
         left_out=len(scores) - len(pairs),

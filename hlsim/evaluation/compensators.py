@@ -43,9 +43,6 @@ from hlsim.plugins import WaveformPlugin
 UTTERANCES = 6
 """Number of clips of speech, of 3 s each, with which gains are measured."""
 
-HARD = 0.6
-"""Unaided HASPI below which an item belongs to the group ``hard``."""
-
 
 def evaluate_compensators(
     compensators: Mapping[str, nn.Module],
@@ -101,7 +98,7 @@ def evaluate_compensators(
             and of all scores.
 
     Returns:
-        The evaluation with the groups ``clean``, ``noisy`` and ``hard`` (unaided HASPI below 0.6)
+        The evaluation with the groups ``clean`` and ``noisy`` (speech in noise)
         if they have items. Its ``details`` are ``gain_curves``, ``steady_tones`` and ``wearing``:
         results of ``measure_aids`` with ``measure_gain_curve``, ``measure_steady_tones`` and
         ``measure_wearability``.
@@ -170,8 +167,9 @@ def evaluate_compensators(
     evaluation = replace(evaluation, table=table.assign(gap=relative_loss - 1.0), details=details)
     groups = _make_groups(evaluation)
     same_level = next(c.name for c in conditions if c.kind == "same level")
-    first_group = next(group for name, group in groups.items() if name != "hard")
-    sounds = perceive_items(first_group, listen, [UNAIDED, same_level, *evaluation.aids])
+    sounds = perceive_items(
+        next(iter(groups.values())), listen, [UNAIDED, same_level, *evaluation.aids]
+    )
     return replace(evaluation, groups=groups, sounds=sounds)
 
 
@@ -208,7 +206,7 @@ def _make_conditions(
 
 
 def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
-    """Return the evaluations of clean speech, of noisy speech, and of hard items, by name.
+    """Return the evaluations of clean speech and of speech in noise, by name.
 
     An item that lacks a value in one condition is in no group.
     """
@@ -219,17 +217,11 @@ def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
             "every item lacks at least one value, so that nothing can be compared; the first is "
             f"{first['name']} under {first['condition']}: {first['failure']}"
         )
-    unaided = table[table["condition"] == UNAIDED].set_index("item")
-    members = {
-        "clean": unaided["speech"] == "clean",
-        "noisy": unaided["speech"] == "noisy",
-        "hard": unaided["haspi"] < HARD,
-    }
     same_level = [c for c in evaluation.conditions if c.kind == "same level"]
     planned = [("haspi", condition.name, condition.of) for condition in same_level]
     groups = {}
-    for name, is_member in members.items():
-        part = table[table["item"].map(is_member)]
+    for name in ("clean", "noisy"):
+        part = table[table["speech"] == name]
         if not part.empty:
             comparisons = compare(part, evaluation.scores, planned=planned, unit="ear")
             groups[name] = replace(evaluation, table=part, comparisons=comparisons)

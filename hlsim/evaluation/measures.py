@@ -6,13 +6,13 @@ column of the study's table.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
-from scipy.fft import next_fast_len
+from scipy.signal import correlate, correlation_lags
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
@@ -181,16 +181,12 @@ def find_lag(output: Tensor, clean: Tensor) -> int | None:
     >>> find_lag(torch.nn.functional.pad(speech, (32, 0)), speech)
     32
     """
-    signals = [signal.double() - signal.double().mean() for signal in (output, clean)]
-    points = next_fast_len(len(output) + len(clean), real=True)
-    spectra = [torch.fft.rfft(signal, points) for signal in signals]
-    correlation = torch.fft.irfft(spectra[0] * spectra[1].conj(), points).abs()
-    peak = int(correlation.argmax())
-    energies = [float(signal.square().sum()) for signal in signals]
-    lowest = _CORRELATION_FLOOR * math.sqrt(math.prod(energies))
-    if not float(correlation[peak]) > lowest:
-        return None
-    return peak if peak < len(output) else peak - points
+    signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
+    correlation = np.abs(correlate(*signals, method="fft"))
+    peak = correlation.argmax()
+    lowest = _CORRELATION_FLOOR * np.prod([np.linalg.norm(signal) for signal in signals])
+    lags = correlation_lags(len(output), len(clean))
+    return int(lags[peak]) if correlation[peak] > lowest else None
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.scale import EARS
@@ -23,7 +24,6 @@ from hlsim.evaluation.recorded_items import (
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.sounds import perceive_items
 from hlsim.evaluation.study import Condition
-from hlsim.extras import require
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -112,7 +112,10 @@ def haspi_report(
     folders = {BEFORE: before, AFTER: after, **(conditions or {})}
     folders_of_outputs = {name: folder for name, folder in folders.items() if folder is not None}
     if manifest is not None:
-        _check_manifest_is_alone(clean, folders_of_outputs)
+        if clean is not None or folders_of_outputs:
+            raise ValueError(
+                "expected either a manifest or folders, got both; leave out one of them"
+            )
         recordings = read_recordings(manifest, root, audiogram, audiograms, **settings)
     else:
         _check_folders(clean, before, after, conditions, root)
@@ -137,12 +140,6 @@ def haspi_report(
         listen=listen,
         **running,
     )
-
-
-def _check_manifest_is_alone(clean: Any, folders: Mapping[str, Any]) -> None:
-    """Raise ValueError if there are folders beside a manifest."""
-    if clean is not None or folders:
-        raise ValueError("expected either a manifest or folders, got both; leave out one of them")
 
 
 def _check_folders(clean: Any, before: Any, after: Any, conditions: Any, root: Any) -> None:
@@ -223,15 +220,14 @@ def score_recordings(
     settings = {"seed": recordings[0].seed, "baseline": baseline, "better_ear": better_ear}
     columns = [*find_measures(measures), LEVELS, ALIGNMENT]
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
-    scores = evaluation.scores
-    evaluation = replace(evaluation, notes=_describe_lags(evaluation.table))
+    table, scores, names = evaluation.table, evaluation.scores, evaluation.names
+    notes = _describe_lags(table)
     if better_ear:
-        better = _better_ears(evaluation.table, utterances, scores)
-        evaluation = replace(evaluation, table=better)
-        evaluation.check_scores()
-    planned = planned or [(scores[0], evaluation.names[0], evaluation.names[-1])]
-    comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
-    evaluation = replace(evaluation, comparisons=comparisons)
+        table = _better_ears(table, utterances, scores)
+        replace(evaluation, table=table).check_scores()
+    planned = planned or [(scores[0], names[0], names[-1])]
+    comparisons = compare(table, scores, baseline=baseline, planned=planned)
+    evaluation = replace(evaluation, table=table, notes=notes, comparisons=comparisons)
     return replace(evaluation, sounds=perceive_items(evaluation, listen, played))
 
 
@@ -292,7 +288,7 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
 
     Each score has its own better ear. It is missing if it lacks for one of the ears, because the
     other one may be the worse ear. Values that are not scores are those of the better ear by the
-    first score that is not missing.
+    first score that is not missing, and of the left ear if both are equal.
 
     Args:
         table: Table of ``run_study`` for recordings of both ears of each utterance.
@@ -303,41 +299,30 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
         The table with one row per utterance and condition. Facts of the item are those of the
         better ear in the last condition, whose number is in the column ``source``.
     """
-    pairs: dict[tuple[int, str], dict[str, dict[str, Any]]] = {}
-    for row in table.to_dict("records"):
-        key = utterances[row["item"]], row["condition"]
-        pairs.setdefault(key, {})[row["ear"]] = row
-    rows: dict[int, list[dict[str, Any]]] = {}
-    for (utterance, _), ears in pairs.items():
-        row = _better_ear(ears["left"], ears["right"], scores)
-        rows.setdefault(utterance, []).append({**row, "item": utterance})
-    for rows_of_utterance in rows.values():
-        facts = {fact: rows_of_utterance[-1].get(fact) for fact in _EAR_FACTS}
-        for row in rows_of_utterance:
-            row |= facts
-    joined = [row for utterance in sorted(rows) for row in rows[utterance]]
-    better: DataFrame = require("pandas", "eval").DataFrame(joined)
-    return better
-
-
-def _better_ear(
-    left: Mapping[str, Any], right: Mapping[str, Any], scores: Sequence[str]
-) -> dict[str, Any]:
-    """Return the row of an utterance under a condition, from the rows of both ears."""
-    complete = [score for score in scores if not math.isnan(left[score] + right[score])]
-    first = next(iter(complete), None)
-    # The left ear counts if both ears have the same score.
-    best = right if first is not None and right[first] > left[first] else left
-    values = dict.fromkeys(scores, math.nan)
-    values |= {score: max(left[score], right[score]) for score in complete}
-    reasons = [
-        f"{row['ear']} ear: {row['failure']}"
-        for row in (left, right)
-        if isinstance(row["failure"], str)
+    rows = table.assign(source=table["item"], item=[utterances[i] for i in table["item"]])
+    left, right = (
+        rows[rows["ear"] == side].set_index(["item", "condition"], drop=False) for side in EARS
+    )
+    right = right.reindex(left.index)
+    changes = (right[scores] - left[scores]).bfill(axis=1).iloc[:, 0]
+    better = left.where(changes.isna() | (changes <= 0.0), right)
+    better[scores] = np.maximum(left[scores], right[scores])  # NaN if one of them is
+    better["failure"] = [
+        "; ".join(
+            f"{side} ear: {reason}"
+            for side, reason in zip(EARS, reasons, strict=True)
+            if isinstance(reason, str)
+        )
+        or None
+        for reasons in zip(left["failure"], right["failure"], strict=True)
     ]
-    name = join_name(best["listener"], best["utterance"], best["snr"])
-    failure = "; ".join(reasons) or None
-    return {**best, **values, "name": name, "source": best["item"], "failure": failure}
+    parts = better[["listener", "utterance", "snr"]].itertuples(index=False)
+    better["name"] = [join_name(*part) for part in parts]
+    better = better.reset_index(drop=True).sort_values("item", kind="stable", ignore_index=True)
+    last = better.drop_duplicates("item", keep="last").set_index("item")
+    for fact in last.columns.intersection(_EAR_FACTS):
+        better[fact] = better["item"].map(last[fact])
+    return better
 
 
 def _describe_lags(table: DataFrame) -> list[str]:

@@ -277,7 +277,7 @@ def run_measures(
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
     facts = {fact for source in items for fact in source.facts}
-    columns = _Columns([*_RESERVED_COLUMNS, *facts])
+    owners = dict.fromkeys([*_RESERVED_COLUMNS, *facts], "")
     results: _Results = {}
     tasks = []
     for number, source in track(enumerate(items), "items whose scores are looked up", len(items)):
@@ -285,7 +285,7 @@ def run_measures(
         for condition in conditions:
             for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
                 if key in store.scores:
-                    columns.add(measure, store.scores[key])
+                    _claim_columns(owners, measure, store.scores[key])
                     results[number, condition.name, measure.name] = store.scores[key]
                 else:
                     task.missing.append((condition, measure, key))
@@ -307,49 +307,36 @@ def run_measures(
                 results[task.number, condition.name, measure.name] = values
                 if isinstance(values, str):
                     continue
-                columns.add(measure, values)
+                _claim_columns(owners, measure, values)
                 if key:
                     store.append(key, values)
             report_progress(len(results), total)
         tasks = tasks_of_crashes
     table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
     table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
-    return table, columns.name_scores(measures)
+    columns = {m.name: [c for c, owner in owners.items() if owner == m.name] for m in measures}
+    return table, [
+        replace(m, scores=columns[m.name] if m.scores is None else m.scores) for m in measures
+    ]
 
 
-class _Columns:
-    """Columns of a table, each with the measure that returns it.
+def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> None:
+    """Note the measure that returns each of some columns.
 
     Args:
-        occupied: Columns that no measure may return.
+        owners: Name of the measure of each column; empty if no measure may return it.
+        measure: The measure.
+        values: Values that it has returned.
+
+    Raises:
+        ValueError: A column exists already.
     """
-
-    def __init__(self, occupied: Sequence[str]) -> None:
-        self._measures: dict[str, str] = dict.fromkeys(occupied, "")
-
-    def add(self, measure: Measure, values: Values) -> None:
-        """Add the columns of the values of a measure.
-
-        Raises:
-            ValueError: A column exists already.
-        """
-        for column in values:
-            if self._measures.setdefault(column, measure.name) != measure.name:
-                raise ValueError(
-                    f"{measure.name} returns {column}, a column that exists already; rename it in "
-                    "the measure"
-                )
-
-    def name_scores(self, measures: Sequence[Measure]) -> list[Measure]:
-        """Return the measures, each with the columns of its scores."""
-        return [
-            measure
-            if measure.scores is not None
-            else replace(
-                measure, scores=[c for c, name in self._measures.items() if name == measure.name]
+    for column in values:
+        if owners.setdefault(column, measure.name) != measure.name:
+            raise ValueError(
+                f"{measure.name} returns {column}, a column that exists already; rename it in "
+                "the measure"
             )
-            for measure in measures
-        ]
 
 
 def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure]) -> list[str]:

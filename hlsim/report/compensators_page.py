@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
-from hlsim.evaluation.compensators import HARD, UTTERANCES
+from hlsim.evaluation.compensators import UTTERANCES
 from hlsim.evaluation.conditions import COMPRESSION, NAL_R
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
@@ -34,11 +34,7 @@ from hlsim.report.results import (
 )
 from hlsim.report.verdict import verdict
 
-_GROUPS = {
-    "clean": "Clean speech",
-    "noisy": "Speech in noise",
-    "hard": f"Items with unaided HASPI below {HARD:g}",
-}
+_GROUPS = {"clean": "Clean speech", "noisy": "Speech in noise"}
 
 _COLUMNS: Columns = {
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
@@ -102,22 +98,26 @@ def compensators_page(evaluation: Evaluation) -> Page:
     Args:
         evaluation: Evaluation of ``evaluate_compensators``.
     """
-    main = {name: group for name, group in evaluation.groups.items() if name != "hard"}
+    groups = evaluation.groups
     first_verdict, *further_verdicts = [
         f"On {_GROUPS[name].lower()}, {verdict(c, c.after, 'NAL-R at the same level')}"
-        for name, group in main.items()
+        for name, group in groups.items()
         for c in group.comparisons
         if c.planned
     ]
     names = evaluation.aids
-    tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in main.items()]
+    tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in groups.items()]
     means = [
-        picture for name, group in main.items() for picture in means_pictures(group, _GROUPS[name])
+        picture
+        for name, group in groups.items()
+        for picture in means_pictures(group, _GROUPS[name])
     ]
     about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE, HASQI_NOTE]
     sections = [
         Section("Scores", about, tables, means),
-        *listening_sections(replace(evaluation, comparisons=next(iter(main.values())).comparisons)),
+        *listening_sections(
+            replace(evaluation, comparisons=next(iter(groups.values())).comparisons)
+        ),
         Section("Gain", [_GAINS], pictures=_gain_pictures(evaluation)),
         Section("Could it be worn?", [_WEARING], [_wearing_table(evaluation)]),
         _details(evaluation),
@@ -156,8 +156,6 @@ def _details(evaluation: Evaluation) -> Section:
             }.items()
             if group.table[fact].nunique() > 1
         ]
-        if name == "hard":
-            tables.insert(0, summary_table("All items", *_rows(group)))
         gaps = summary_table("Mean loss", split_rows(group.table), _GAP_COLUMNS)
         tests = comparison_table(
             [c for c in group.comparisons if c.after in group.aids],

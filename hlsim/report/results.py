@@ -246,7 +246,7 @@ def _comparison_sections(evaluation: Evaluation) -> list[Section]:
     """Return the sections of a page with the comparisons that the verdict leaves out.
 
     These are all pairs of conditions, and the verdict's pair by the means of listeners or another
-    unit and for each degree of hearing loss.
+    unit.
     """
     headline, sections = evaluation.headline, []
     if headline is None:
@@ -257,14 +257,9 @@ def _comparison_sections(evaluation: Evaluation) -> list[Section]:
         caption = "All comparisons; other p values are adjusted by Holm within each measure"
         table = comparison_table(evaluation.comparisons, caption)
         sections.append(Section("All comparisons", plan if headline.planned else [], [table]))
-    parts = {"all items": headline.overall}
     if headline.unit_means is not None:
-        parts[f"{headline.unit} means"] = headline.unit_means
-    if len(headline.by_severity) > 1:
-        parts |= {f"loss: {name}": part for name, part in headline.by_severity.items()}
-    if len(parts) > 1:
-        notes = [SEVERITY_NOTE] if len(headline.by_severity) > 1 else []
-        sections.append(Section("Parts of the items", notes, [paired_table(pair, parts)]))
+        rows = {"all items": headline.overall, f"{headline.unit} means": headline.unit_means}
+        sections.append(Section(f"Items and {headline.unit}s", tables=[paired_table(pair, rows)]))
     return sections
 
 
@@ -300,7 +295,7 @@ def detail_section(
 
 
 def score_details(evaluation: Evaluation) -> Section:
-    """Return the section "Details" of a page about scores, with all comparisons and means by SNR.
+    """Return the section "Details" of a page about scores, with comparisons, and means by SNR and degree of loss.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report
@@ -321,8 +316,10 @@ def score_details(evaluation: Evaluation) -> Section:
     if evaluation.settings.get("better_ear"):
         notes.append("Each score is that of the better ear, by each measure.")
     sections = _comparison_sections(evaluation)
-    if "snr" in evaluation.table and evaluation.table["snr"].nunique() > 1:
-        rows = split_rows(evaluation.table, "snr")
-        tables = [summary_table("Means by SNR (dB)", rows, score_columns(evaluation))]
-        sections.append(Section("By SNR", tables=tables))
+    facts = {"snr": ("SNR (dB)", []), "severity": ("degree of loss", [SEVERITY_NOTE])}
+    for fact, (title, texts) in facts.items():
+        if fact in evaluation.table and evaluation.table[fact].nunique() > 1:
+            rows = split_rows(evaluation.table, fact)
+            table = summary_table(f"Means by {title}", rows, score_columns(evaluation))
+            sections.append(Section(f"By {title}", texts, [table]))
     return detail_section(evaluation, sections, notes)
