@@ -52,8 +52,8 @@ RULE_MS = 5.0
 _MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
 """Ends of the names of files with the signals of the front microphones."""
 
-_OTHER_MICROPHONES = (2, 3)
-"""Numbers of the middle and the rear microphone in the names of files, after ``CH``."""
+_MICROPHONES = (1, 2, 3)
+"""Numbers of the front, middle and rear microphone in the names of files, after ``CH``."""
 
 _REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
 """Ends of the names of references. The last one already has the target's level in the room."""
@@ -169,7 +169,7 @@ def evaluate_scenes(
     find_measures(names)
     all_pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)
     pairs = all_pairs[::stride]
-    _check_microphones(pairs, microphones)
+    microphones = [*dict.fromkeys(microphones)]
     notes = _describe_unused_microphones(pairs, microphones)
     folders = {label: Path(folder) for label, folder in (outputs or {}).items()}
     for label, folder in folders.items():
@@ -180,24 +180,27 @@ def evaluate_scenes(
     look_ahead_ms = {
         c.name: _measure_look_ahead(c, pairs[0], rate, microphones) for c in conditions
     }
-    settings = {"full_scale_spl": full_scale_spl, "seed": seed}
-    write = partial(_write_signals, Path(out), conditions, folders, microphones, rate, settings)
+    write = partial(_write_signals, Path(out), conditions, folders, microphones, rate)
     parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
-    recordings = []
     written = run_parallel(write, pairs, **parallel)
-    for pair, ears in track(written, "pairs of scene and listener", len(pairs)):
-        if isinstance(ears, Crash):
-            errors = {condition.name: ValueError(CRASH) for condition in conditions}
-            ears = _make_recordings(Path(out), pair, errors, settings)
-        recordings += ears
+    recordings = []
+    for pair, files in track(written, "pairs of scene and listener", len(pairs)):
+        if isinstance(files, Crash):
+            files = {condition.name: ValueError(CRASH) for condition in conditions}
+        for side, ear in pair.listener.ears().items():
+            item = RecordedItem(
+                pair.scene, _reference_file(Path(out), pair), files, ear, pair.name, side
+            )
+            recordings.append(replace(item, full_scale_spl=full_scale_spl, seed=seed))
+    aid_names = [condition.name for condition in conditions if condition.kind == "aid"]
     evaluation = score_recordings(
         recordings,
         [replace(condition, process=None) for condition in conditions],
         names,
         better_ear=True,
-        planned=[("haspi", NAL_R, c.name) for c in conditions if c.kind == "aid"],
+        planned=[("haspi", NAL_R, name) for name in aid_names],
         listen=listen,
-        played=[UNAIDED, NAL_R, *(c.name for c in conditions if c.kind == "aid")],
+        played=[UNAIDED, NAL_R, *aid_names],
         store=Path(out) / "scores.jsonl",
         **running,
     )
@@ -275,25 +278,10 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
     return pairs
 
 
-def _check_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> None:
-    """Raise ValueError unless all scenes have files of these microphones."""
-    if not numbers or len({*numbers}) < len(numbers):
-        raise ValueError(f"expected different numbers of microphones, got {[*numbers]}")
-    for pair, number in product(pairs, numbers):
-        path = pair.microphone(number)
-        if not path.is_file():
-            raise ValueError(
-                f"{path}: there is no such file; add it, or leave microphone {number} out "
-                "(microphones, --microphones)"
-            )
-
-
 def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> list[str]:
     """Return a sentence about microphones that no aid receives, or none."""
-    unused = {n for n in (1, *_OTHER_MICROPHONES) if n not in numbers}
-    scenes = {
-        pair.scene for pair, n in product(pairs, sorted(unused)) if pair.microphone(n).is_file()
-    }
+    others = [number for number in _MICROPHONES if number not in numbers]
+    scenes = {pair.scene for pair, n in product(pairs, others) if pair.microphone(n).is_file()}
     if not scenes:
         return []
     return [
@@ -422,9 +410,8 @@ def _write_signals(
     folders: Mapping[str, Path],
     microphones: Sequence[int],
     rate: int,
-    settings: Mapping[str, Any],
     pair: _Pair,
-) -> list[RecordedItem]:
+) -> dict[str, Path | ValueError]:
     """Write the reference and the outputs of a scene for a listener.
 
     Args:
@@ -433,10 +420,9 @@ def _write_signals(
         folders: Folders of existing outputs, by the label of their aid.
         microphones: Numbers of the microphones that are used.
         rate: Sample rate in Hz.
-        settings: Further arguments of the recordings.
         pair: The scene and the listener.
 
-    Returns: One recording per ear.
+    Returns: File of the outputs for both ears under each condition, or why there is none.
 
     Raises:
         ValueError: A file of the scene is broken, or has another rate or length.
@@ -457,32 +443,11 @@ def _write_signals(
             outputs[condition.name] = ValueError(describe_error(error))
             if condition.process is not None:
                 path.unlink(missing_ok=True)  # It is the output of an earlier run.
-    return _make_recordings(out, pair, outputs, settings)
+    return outputs
 
 
 def _reference_file(out: Path, pair: _Pair) -> Path:
     return out / "reference" / f"{pair.scene}.wav"
-
-
-def _make_recordings(
-    out: Path,
-    pair: _Pair,
-    outputs: Mapping[str, Path | ValueError],
-    settings: Mapping[str, Any],
-) -> list[RecordedItem]:
-    """Return one recording per ear of the listener.
-
-    Args:
-        out: Folder of the results.
-        pair: The scene and the listener.
-        outputs: File of the outputs for both ears under each condition, or why there is none.
-        settings: Further arguments of the recordings.
-    """
-    reference = _reference_file(out, pair)
-    return [
-        RecordedItem(pair.scene, reference, outputs, ear, pair.name, side, **settings)
-        for side, ear in pair.listener.ears().items()
-    ]
 
 
 def _read_microphones(pair: _Pair, rate: int, numbers: Sequence[int]) -> Tensor:

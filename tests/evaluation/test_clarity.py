@@ -327,10 +327,8 @@ def test_three_microphones_are_averaged_or_handed_to_an_aid(clarity: Path, tmp_p
         written, _ = soundfile.read(tmp_path / "signals" / name / "S06001_L0001_HA-output.wav")
         assert np.allclose(written, expected, atol=1e-6), name
     (scenes / "S06002_mix_CH3.wav").unlink()
-    with pytest.raises(ValueError, match=r"S06002_mix_CH3\.wav: there is no such file"):
+    with pytest.raises(ValueError, match=r"S06002_mix_CH3\.wav: there is no such audio file"):
         evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
-    with pytest.raises(ValueError, match="different numbers of microphones"):
-        evaluate_scenes(aids, microphones=[1, 1], **settings)
 
 
 LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
