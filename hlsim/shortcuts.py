@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from numpy.typing import NDArray
@@ -25,10 +25,12 @@ from hlsim.calibration import (
 from hlsim.checks import check_number, check_rate
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
-from hlsim.files import write_atomically
 from hlsim.simulators import load_simulator
 from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
 from hlsim.version import __version__
+
+if TYPE_CHECKING:
+    from hlsim.report.page import Player
 
 EXAMPLE_SPL = 65.0
 """Level of conversational speech in dB SPL."""
@@ -174,7 +176,7 @@ def listen(
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
     **signals: Tensor | NDArray[Any],
-) -> Players:
+) -> Player:
     """Show a player in a notebook that switches between signals at the same position.
 
     All signals have the same gain, so that what is soft for the ear is soft here, and the volume
@@ -196,7 +198,7 @@ def listen(
         >>> import hlsim
         >>> speech = hlsim.example_speech()
         >>> hlsim.listen(original=speech, louder=10.0 * speech)
-        Players(original 65 dB SPL, louder 85 dB SPL)
+        Player(original 65 dB SPL, louder 85 dB SPL)
     """
     if not signals:
         raise ValueError("no signal to play; pass signals by name, as in listen(original=speech)")
@@ -212,48 +214,9 @@ def listen(
         if not bool(tensor.isfinite().all()):
             raise ValueError(f"some samples of {label!r} are NaN or infinite; leave it out")
         pascals[label.replace("_", " ")] = tensor * gain
-    return Players(pascals, check_rate(sample_rate))
+    from hlsim.report.players import make_player
 
-
-class Players:
-    """A player of several signals, displayed by a notebook or saved as a page.
-
-    Args:
-        signals: Signals in pascals by their labels, ``(time,)`` or ``(2, time)``.
-        sample_rate: Sample rate in Hz of all signals.
-
-    >>> Players({"original": example_speech()}, 16000)
-    Players(original 65 dB SPL)
-    """
-
-    def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:
-        from hlsim.report.players import make_player
-
-        self._player = make_player({"": signals}, sample_rate)
-
-    def _repr_html_(self) -> str:
-        return self._player.html()
-
-    def __repr__(self) -> str:
-        sounds = self._player.sounds
-        levels = ", ".join(f"{sound.label} {sound.level:.0f} dB SPL" for sound in sounds)
-        return f"Players({levels})"
-
-    def save(self, path: str | Path) -> None:
-        """Write the player as one HTML file, which a browser opens offline.
-
-        Args:
-            path: File to write.
-
-        Raises:
-            ValueError: The file cannot be written.
-        """
-        from hlsim.report.page import Page, Section
-
-        title = ", ".join(sound.label for sound in self._player.sounds)
-        title = title[:1].upper() + title[1:]
-        page = Page(title, "", [Section("Listen", player=self._player)])
-        write_atomically(Path(path), page.html())
+    return make_player({"": pascals}, check_rate(sample_rate))
 
 
 def info() -> str:

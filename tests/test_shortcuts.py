@@ -44,7 +44,7 @@ def test_one_gain_calibrates_all_channels_of_a_file(tmp_path) -> None:
 def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
     pytest.importorskip("matplotlib")
     players = hlsim.listen(original=SPEECH, soft_N4=0.1 * SPEECH.numpy())
-    assert repr(players).startswith("Players(original ") and ", soft N4 " in repr(players)
+    assert repr(players).startswith("Player(original ") and ", soft N4 " in repr(players)
     players.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert "<h1>Original, soft N4</h1>" in page, "labels keep their capitals"
@@ -82,6 +82,6 @@ def test_a_stereo_file_can_be_played_beside_a_mono_one(tmp_path) -> None:
     left, right = (float(level_spl(SPEECH)) - drop for drop in (0.0, 20.0))
     power = (10 ** (left / 10) + 10 ** (right / 10)) / 2
     level = 10 * math.log10(power)
-    assert repr(players) == f"Players(stereo {level:.0f} dB SPL, mono {left:.0f} dB SPL)"
+    assert repr(players) == f"Player(stereo {level:.0f} dB SPL, mono {left:.0f} dB SPL)"
     players.save(tmp_path / "new folder" / "players.html")
     assert (tmp_path / "new folder" / "players.html").read_text().count("<audio") == 2

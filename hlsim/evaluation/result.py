@@ -34,7 +34,6 @@ class ItemSounds:
         groups: Signals by label, for each group by its heading, which may be empty. Shape of each
             signal: (time,).
         failures: Reason for each label without a sound.
-        facts: Columns of the table that describe the item.
         change: Change of the score between the two conditions of the headline comparison; None if
             items are not ranked by it.
         rank: Place of the item in the order of the changes, from 1, and the number of items.
@@ -50,7 +49,6 @@ class ItemSounds:
     sample_rate: int
     groups: Mapping[str, Mapping[str, Tensor]]
     failures: Mapping[str, str] = field(default_factory=dict)
-    facts: Mapping[str, Any] = field(default_factory=dict)
     change: float | None = None
     rank: tuple[int, int] = (0, 0)
 

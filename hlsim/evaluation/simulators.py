@@ -206,4 +206,6 @@ def _example_sounds(evaluation: Evaluation) -> ItemSounds:
     # A short clip is filled up with silence.
     end = int(item.signal.nonzero().max()) + item.sample_rate // 10
     groups = {"": {name: signal[:end] for name, signal in signals.items()}}
-    return ItemSounds(item.name, item.ear, item.sample_rate, groups, failures, item.facts)
+    facts = item.facts
+    name = f"{item.name}: {facts['treatment']}, {facts['speech']}, {facts['input_level']:g} dB SPL"
+    return ItemSounds(name, item.ear, item.sample_rate, groups, failures)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.extras import require
-from hlsim.files import atomic_path
+from hlsim.files import atomic_path, write_atomically
 from hlsim.progress import track
 
 SPECTROGRAM_LEVELS = (0.0, 90.0)
@@ -124,7 +124,7 @@ class Sound:
 class Player:
     """A player with which a reader of a page compares sounds, such as outputs of hearing aids.
 
-    A sound to which the reader switches continues at the position of the one before.
+    A notebook displays it. A sound to which the reader switches continues at the position of the one before.
 
     Attributes:
         groups: Sounds by the heading of their group, which may be empty. The sounds of a group are
@@ -147,9 +147,27 @@ class Player:
         """All sounds of the player, in order."""
         return [sound for group in self.groups.values() for sound in group]
 
-    def html(self) -> str:
+    def __repr__(self) -> str:
+        levels = ", ".join(f"{sound.label} {sound.level:.0f} dB SPL" for sound in self.sounds)
+        return f"Player({levels})"
+
+    def _repr_html_(self) -> str:
         """Return the player as HTML for a notebook, with its sounds, style and script embedded."""
         return _render("fragment.html", player=self)
+
+    def save(self, path: str | Path) -> None:
+        """Write the player as one HTML file, which a browser opens offline.
+
+        Args:
+            path: File to write.
+
+        Raises:
+            ValueError: The file cannot be written.
+        """
+        title = ", ".join(sound.label for sound in self.sounds)
+        title = title[:1].upper() + title[1:]
+        page = Page(title, "", [Section("Listen", player=self)])
+        write_atomically(Path(path), page.html())
 
 
 @dataclass(frozen=True)

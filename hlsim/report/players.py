@@ -34,11 +34,12 @@ _EXPLANATION = (
 )
 
 
-def listening_sections(evaluation: Evaluation) -> list[Section]:
+def listening_sections(evaluation: Evaluation, about: str = _EXPLANATION) -> list[Section]:
     """Return the section "Listen" of a page, with one player per item that has sounds.
 
     Args:
         evaluation: The evaluation of the page.
+        about: Sentences about the sounds.
 
     Returns: The section, or an empty list if no item has sounds.
 
@@ -52,7 +53,7 @@ def listening_sections(evaluation: Evaluation) -> list[Section]:
     """
     tracked = track(evaluation.sounds, "players", len(evaluation.sounds))
     sections = [_item_section(evaluation.headline, sounds) for sounds in tracked]
-    return [Section("Listen", [_EXPLANATION], sections=sections)] if sections else []
+    return [Section("Listen", [about], sections=sections)] if sections else []
 
 
 def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> Section:

@@ -198,13 +198,11 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
     if len(scores.columns) < 2:
         return []
     colours = condition_colours(evaluation.conditions)
-    has_intervals = False
     means: list[tuple[str, float, tuple[float, float] | None]] = []
     for name in scores:
         values = scores[name].dropna().to_numpy()
         is_enough = len(values) >= MIN_ITEMS_FOR_INTERVAL
         interval = bootstrap_interval(values) if is_enough else None
-        has_intervals |= is_enough
         means.append((name, float(values.mean()), interval))
 
     def draw(axes: Any) -> None:
@@ -217,14 +215,13 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
         axes.set(xlabel=title, ylim=(len(means) - 0.5, -0.5))
         axes.grid(axis="x", alpha=0.4)
 
-    note = "Points are means over items"
-    if has_intervals:
-        note += (
-            ", lines their 95 % intervals. The intervals of two conditions may overlap although "
-        )
-        note += "their difference is significant, because each item is scored under both"
+    note = (
+        "Points are means over items, lines their 95 % intervals if there are "
+        f"{MIN_ITEMS_FOR_INTERVAL} items or more. The intervals of two conditions may overlap "
+        "although their difference is significant, because each item is scored under both."
+    )
     heading = f"{title} of all conditions" + (f", {part[0].lower()}{part[1:]}" if part else "")
-    return [_draw_picture(draw, heading, f"{note}.", height=1.0 + 0.4 * len(means))]
+    return [_draw_picture(draw, heading, note, height=1.0 + 0.4 * len(means))]
 
 
 def scores_pictures(evaluation: Evaluation) -> list[Picture]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from hlsim.evaluation.result import Evaluation, ItemSounds
+from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.simulators import agreement
 from hlsim.extras import install_command, is_installed
 from hlsim.report.page import Page, Section
-from hlsim.report.players import make_player
+from hlsim.report.players import listening_sections
 from hlsim.report.results import (
     Columns,
     comparison_table,
@@ -27,6 +27,8 @@ def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float | None
     """Return a function that computes a statistic of ``agreement`` for a column of a table."""
     return lambda rows: agreement(rows, score)[statistic]
 
+
+_LISTEN = "The input, and the outputs of the teacher and of each simulator."
 
 COLUMNS: Columns = {
     "n": (statistic("snr", "count"), "d"),
@@ -91,7 +93,7 @@ def simulators_page(evaluation: Evaluation) -> Page:
             if group.table[fact].nunique() > 1
         ]
         details.append(Section(title, tables=fact_tables))
-    sections += [_listening_section(sounds) for sounds in evaluation.sounds]
+    sections += listening_sections(evaluation, _LISTEN)
     sections.append(detail_section(evaluation, details, [_about(evaluation)]))
     return Page("Simulators", _verdict(evaluation), sections)
 
@@ -132,17 +134,3 @@ def _about(evaluation: Evaluation) -> str:
     if not is_installed("pesq"):
         text += f" PESQ was left out; to add it, {install_command('pesq')} and run again."
     return text
-
-
-def _listening_section(sounds: ItemSounds) -> Section:
-    """Return the section "Listen" with a player of one item.
-
-    Its sounds are the input, and the outputs of the teacher and of each simulator.
-    """
-    facts = sounds.facts
-    texts = [
-        f"{_TREATMENTS[facts['treatment']]}, {facts['speech']}, {facts['input_level']:g} dB SPL, "
-        f"degree of loss: {facts['severity']}."
-    ]
-    texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
-    return Section("Listen", texts, player=make_player(sounds.groups, sounds.sample_rate))

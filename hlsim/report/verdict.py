@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import chain, combinations
 
 from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.measures import column_title
@@ -124,21 +125,17 @@ def describe_missing_pairs(evaluation: Evaluation) -> list[str]:
     """
     if not evaluation.comparisons:
         return []
-    compared = {name for c in evaluation.comparisons for name in (c.before, c.after)}
-    pairs = {(c.before, c.after) for c in evaluation.comparisons}
-    baseline = evaluation.settings.get("baseline")
-    first_names = [baseline] if baseline else evaluation.names
-    missing = []
-    for place, first in enumerate(first_names):
-        for second in evaluation.names[place + 1 :]:
-            if (first, second) not in pairs:
-                missing.append(f"{first} and {second}")
+    names, baseline = evaluation.names, evaluation.settings.get("baseline")
+    compared = {(c.before, c.after) for c in evaluation.comparisons}
+    missing = [
+        f"{first} and {second}"
+        for first, second in combinations(names, 2)
+        if baseline in (None, first) and (first, second) not in compared
+    ]
     if not missing:
         return []
-    return [
-        f"Not compared, because no item has both scores: {', '.join(missing)}."
-        + ("" if len(compared) == len(evaluation.names) else " Check the names of the conditions.")
-    ]
+    hint = " Check the names of the conditions." if {*names} - {*chain(*compared)} else ""
+    return [f"Not compared, because no item has both scores: {', '.join(missing)}.{hint}"]
 
 
 def format_p(p: float) -> str:

@@ -63,8 +63,8 @@ def test_values_failures_and_page(options: dict[str, Any]) -> None:
     titles = [section.title for section in page.sections[:3]]
     assert titles == ["Speech as it is", "20 dB louder", "Listen"]
     (sounds,) = study.sounds
-    assert sounds.facts["treatment"] == "as-is"
-    labels = [sound.label for sound in page.sections[2].player.sounds[:3]]
+    assert ": as-is, " in sounds.name
+    labels = [sound.label for sound in page.sections[2].sections[0].player.sounds[:3]]
     assert labels == ["input", "teacher", "light"]
     assert "Failures" in page.markdown() and "NaN" in page.markdown()
 

@@ -74,7 +74,7 @@ def test_a_black_spectrogram_says_why() -> None:
     notes = {sound.label: sound.note for sound in make_player({"": sounds}, 16000).sounds}
     assert notes["loud"] == ""
     assert notes["faint"] == "nothing is perceived"
-    page = make_player({"": {"loud": loud, "faint": tone(-20.0)}}, 16000).html()
+    page = make_player({"": {"loud": loud, "faint": tone(-20.0)}}, 16000)._repr_html_()
     assert page.count(">nothing is perceived<") == 1
 
 
