@@ -280,8 +280,8 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
 
 def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> list[str]:
     """Return a sentence about microphones that no aid receives, or none."""
-    others = [number for number in _MICROPHONES if number not in numbers]
-    scenes = {pair.scene for pair, n in product(pairs, others) if pair.microphone(n).is_file()}
+    unused = [number for number in _MICROPHONES if number not in numbers]
+    scenes = {pair.scene for pair, n in product(pairs, unused) if pair.microphone(n).is_file()}
     if not scenes:
         return []
     return [

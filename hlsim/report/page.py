@@ -124,7 +124,8 @@ class Sound:
 class Player:
     """A player with which a reader of a page compares sounds, such as outputs of hearing aids.
 
-    A notebook displays it. A sound to which the reader switches continues at the position of the one before.
+    A notebook displays it. A sound to which the reader switches continues at the position of the
+    one before.
 
     Attributes:
         groups: Sounds by the heading of their group, which may be empty. The sounds of a group are
