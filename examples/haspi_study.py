@@ -22,6 +22,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
+from hlsim.progress import ProgressLine
 from hlsim.report.recordings_page import write_report
 from hlsim.report.verdict import verdict
 
@@ -87,15 +88,16 @@ def main() -> None:
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
-    report = haspi_report(
-        manifest=out / "study.csv",
-        audiograms=audiograms,
-        measures=("haspi", "stoi"),
-        store=out / "report" / "scores.jsonl",
-        listen=3,
-        jobs=1,
-        progress=lambda done, total: print(f"\r{done} of {total} values", end="", file=sys.stderr),
-    )
+    with ProgressLine("values") as progress:
+        report = haspi_report(
+            manifest=out / "study.csv",
+            audiograms=audiograms,
+            measures=("haspi", "stoi"),
+            store=out / "report" / "scores.jsonl",
+            listen=3,
+            jobs=1,
+            progress=progress,
+        )
     assert report.headline is not None
     print(verdict(report.headline))
     print(write_report(report, out / "report"))

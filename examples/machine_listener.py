@@ -44,7 +44,6 @@ import csv
 import math
 import os
 import re
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import version
@@ -72,6 +71,7 @@ from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
 from hlsim.files import read_table, sha256
 from hlsim.plugins import load_plugin
+from hlsim.progress import ProgressLine
 from hlsim.simulators import load_simulator
 
 if TYPE_CHECKING:
@@ -702,16 +702,13 @@ def run_compare(options: argparse.Namespace) -> None:
     items = make_items(*parts, choose_ears(options.audiograms), *settings, step=options.step)
     normal_items = make_items(*parts, {"NH": Audiogram.standard("NH")}, *settings)
     out = Path(options.out)
-    running: dict[str, Any] = {
-        "store": ScoreStore(out / "scores.jsonl"),
-        "jobs": options.jobs,
-        "progress": lambda done, total: print(f"\r{done} of {total}", end="", file=sys.stderr),
-    }
+    running: dict[str, Any] = {"store": ScoreStore(out / "scores.jsonl"), "jobs": options.jobs}
     unaided = Condition("unaided", Unaided().eval())
-    normal = run_study(normal_items, [unaided], [measure], **running)
+    with ProgressLine("outputs for a normal ear") as progress:
+        normal = run_study(normal_items, [unaided], [measure], progress=progress, **running)
     conditions = make_conditions(options.aids, own_levels=options.own_levels)
-    table = run_study(items, conditions, [measure], **running)
-    print(file=sys.stderr)
+    with ProgressLine("outputs") as progress:
+        table = run_study(items, conditions, [measure], progress=progress, **running)
     table.to_csv(out / "table.csv", index=False)
     failures = table["failure"].dropna()
     if not failures.empty:
