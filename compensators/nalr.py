@@ -1,20 +1,15 @@
 """NAL-R, a prescription of gains for an audiogram that do not depend on the level."""
 
-import numpy as np
 import scipy
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from compensators.aid import Aid
-from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
-from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.audiogram import HIGHEST_LEVEL
+from hlsim.audiogram.prescription import nalr_filter, nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
-from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.dsp.interpolation import interpolate
-from hlsim.torchtools import constant
 
 ORDER = 220
 """Order of the filter, which has one more tap."""
@@ -81,7 +76,7 @@ class NALR(Aid):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
             points = scipy.fft.next_fast_len(time + ORDER, real=True)
-            taps = self._taps(thresholds).to(signal.dtype)
+            taps = nalr_filter(thresholds, self.sample_rate, ORDER).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
             delay = ORDER // 2
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
@@ -104,28 +99,3 @@ class NALR(Aid):
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
         """
         return nalr_gains_db(self.find_thresholds(audiogram, highest=HIGHEST_LEVEL))
-
-    def _taps(self, thresholds: Tensor) -> Tensor:
-        """Return the taps of the filter for ears, symmetric around the middle one.
-
-        Shape: (..., 8) dB HL -> (..., ORDER + 1).
-        """
-        frequencies = np.linspace(0.0, self.sample_rate / 2.0, ORDER + 1)
-        gains = interpolate(
-            nalr_gains_db(thresholds.double()), FREQUENCIES, tuple(frequencies.tolist())
-        )
-        return (10.0 ** (gains / 20.0)) @ _design(like=gains)
-
-
-@constant
-def _design() -> NDArray[np.float64]:
-    """Return the taps for a gain of 1 at each of ``ORDER + 1`` evenly spaced frequencies.
-
-    The filter is linear in its gains.
-
-    Returns: (ORDER + 1, ORDER + 1), one row per frequency.
-    """
-    points = ORDER + 1
-    grid = np.arange(points) / ORDER
-    rows = [frequency_sampling_fir(points, grid, gain) for gain in np.eye(points)]
-    return np.stack(rows)

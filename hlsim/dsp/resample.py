@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.checks import check_rate
+from hlsim.checks import check_rate, check_time_last
 from hlsim.torchtools import compute_once
 
 ROLLOFF = 0.9475937167399596
@@ -66,22 +66,18 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
         target_rate: Sample rate of the result in Hz.
 
     Raises:
-        TypeError: The samples are integers or complex.
-        ValueError: A rate is not a whole number from 1 to 1000000 Hz, or the greatest common
-            divisor of the rates is so small that the kernel would take gigabytes, as for
-            44101 and 16000 Hz.
+        ValueError: The samples are integers or complex, time is not last, a rate is not a whole
+            number from 1 to 1000000 Hz, or the greatest common divisor of the rates is so small
+            that the kernel would take gigabytes, as for 44101 and 16000 Hz.
 
     >>> resample(torch.randn(2, 44100), 44100, 16000).shape
     torch.Size([2, 16000])
     """
     source_rate = check_rate(source_rate, 1, HIGHEST_RATE)
     target_rate = check_rate(target_rate, 1, HIGHEST_RATE)
+    check_time_last(waveform)
     if source_rate == target_rate:
         return waveform
-    if not waveform.is_floating_point():
-        raise TypeError(
-            f"expected a floating-point waveform, got {waveform.dtype}; call waveform.float()"
-        )
     common = math.gcd(source_rate, target_rate)
     source, target = source_rate // common, target_rate // common
     if source * target > MAX_KERNEL_VALUES:

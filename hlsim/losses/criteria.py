@@ -22,7 +22,7 @@ from hlsim.dsp.resample import resample
 from hlsim.losses import coherent_bands, paper
 from hlsim.losses.frozen_simulator import Reference, check_shape
 from hlsim.losses.interaural import interaural_loss
-from hlsim.losses.score_loss import score_loss
+from hlsim.losses.score_loss import SCORES, score_loss
 from hlsim.metrics.band_levels import band_level_loss
 
 CriterionLike = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
@@ -143,7 +143,7 @@ def _score(name: str, signals: Comparison) -> dict[str, Tensor]:
 def _interaural(signals: Comparison) -> dict[str, Tensor]:
     output = signals.limited_output.unflatten(0, (-1, 2))
     clean = signals.clean.unflatten(0, (-1, 2))
-    ends = [max(pair) for pair in zip(signals.lengths[::2], signals.lengths[1::2], strict=True)]
+    ends = signals.lengths[::2]  # both ears have the same length
     if set(ends) == {output.shape[-1]}:
         changes = interaural_loss(output, clean, signals.sample_rate)
     else:
@@ -171,20 +171,16 @@ CRITERIA = {
         compute=_paper,
         reference=Reference("clean", normal_ear="simulator"),
     ),
-    "haspi": Criterion(
-        weights={"haspi": 1.0},
-        compute=partial(_score, "haspi"),
-        reference=None,
-        limits_gradient=True,
-        handles_padding=True,
-    ),
-    "hasqi": Criterion(
-        weights={"hasqi": 1.0},
-        compute=partial(_score, "hasqi"),
-        reference=None,
-        limits_gradient=True,
-        handles_padding=True,
-    ),
+    **{
+        name: Criterion(
+            weights={name: 1.0},
+            compute=partial(_score, name),
+            reference=None,
+            limits_gradient=True,
+            handles_padding=True,
+        )
+        for name in SCORES
+    },
     "interaural": Criterion(
         weights={"interaural": 1.0},
         compute=_interaural,

@@ -307,11 +307,19 @@ class HearingLossLoss(nn.Module):
             )
         stored = self._unregistered.thresholds
         ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)
-        if self.ears == "better" or any(entry.two_ears for entry in self.criteria.values()):
+        pairs_ears = any(entry.two_ears for entry in self.criteria.values())
+        pairs_ears = pairs_ears or self.ears == "better"
+        if pairs_ears:
             check_two_channels(clean)
         dtype = torch.promote_types(torch.result_type(output, clean), torch.float32)
         output, clean = output.to(dtype), clean.to(dtype)
         ends = None if lengths is None else check_lengths(lengths, clean.shape)
+        if pairs_ears and ends is not None and not torch.equal(ends[..., 0], ends[..., 1]):
+            raise ValueError(
+                "expected the same length for both ears of an item, left and right, got "
+                f"{ends.tolist()}; repeat the length of each item: "
+                "lengths.unsqueeze(-1).expand(-1, 2)"
+            )
         if ends is None or bool((ends == clean.shape[-1]).all()):
             return output, clean, ears, None
         return silence_after(output, ends), silence_after(clean, ends), ears, ends

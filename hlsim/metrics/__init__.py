@@ -8,7 +8,7 @@ from hlsim.metrics.haspi_score import HaspiReference, haspi
 from hlsim.metrics.hasqi_score import HasqiReference, hasqi
 from hlsim.metrics.mbstoi_score import mbstoi
 
-_TORCHMETRICS = ["HAAQI", "HASPI", "HASQI"]
+_TORCHMETRICS = ["HAAQI", "HASPI", "HASQI", "MBSTOI"]
 
 __all__ = [
     "HaaqiReference",

@@ -18,7 +18,7 @@ from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
-from hlsim.torchtools import constant
+from hlsim.torchtools import Samples, as_samples, constant
 
 OCTAVES = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
 """Centre frequencies of the octaves in Hz."""
@@ -51,7 +51,7 @@ class Interaural(NamedTuple):
     coherence: Tensor
 
 
-def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
+def interaural(waveform: Samples, *, sample_rate: int = 16000) -> Interaural:
     """Compute the differences of level and time between two ears over a whole signal, per octave.
 
     The time difference is the delay with the largest cross-correlation of the waveforms in the
@@ -73,7 +73,8 @@ def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
     tensor([20., 20., 20., 20., 20.], dtype=torch.float64)
     """
     check_rate(sample_rate)
-    check_two_channels(check_waveform(waveform))
+    waveform = check_waveform(as_samples(waveform))
+    check_two_channels(waveform)
     left, right, cross, octaves = spectra_of_ears(waveform.detach().double(), sample_rate)
     delays = torch.arange(
         -MAX_DELAY_MICROSECONDS, MAX_DELAY_MICROSECONDS + 1, device=waveform.device
@@ -94,12 +95,12 @@ def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
     )
 
 
-def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000) -> Interaural:
+def interaural_change(before: Samples, after: Samples, *, sample_rate: int = 16000) -> Interaural:
     """Compute how an aid changes the differences of level and time between two ears.
 
     Args:
         before: Input of the aid for the left and the right ear. Shape: (..., 2, time).
-        after: Output of the aid for the left and the right ear. Shape: (..., 2, time).
+        after: Output of the aid, of the same shape.
         sample_rate: Sample rate in Hz.
 
     Returns:
@@ -107,12 +108,17 @@ def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000
         the output.
 
     Raises:
-        ValueError: A waveform has another shape, or the rate is out of range.
+        ValueError: The shapes differ or are not (..., 2, time), or the rate is out of range.
 
     >>> noise = torch.randn(2, 16000)
     >>> interaural_change(noise, noise).level
     tensor([0., 0., 0., 0., 0.], dtype=torch.float64)
     """
+    if before.shape != after.shape:
+        raise ValueError(
+            "expected input and output of the same shape, got "
+            f"{tuple(before.shape)} and {tuple(after.shape)}; align and cut them"
+        )
     of_input = interaural(before, sample_rate=sample_rate)
     of_output = interaural(after, sample_rate=sample_rate)
     return Interaural(

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.audiogram.prescription import nalr_filter
 from hlsim.dsp.fft import fft_length
-from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics.ear import alignment, fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
-from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS, HairCells
+from hlsim.metrics.ear.model import CHANNELS, HairCells
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise
 from hlsim.metrics.reference import PreparedBatch, Reference
@@ -176,8 +175,7 @@ class QualityReference(Reference):
         cells = ear_model.hair_cells(self._ears[clean.items])
         if self._is_amplified:
             return clean.signals, cells
-        ears = self._ears_on_host[clean.items].double()
-        return _amplify(clean.signals, ears, clean.audible), cells
+        return _amplify(clean.signals, self._ears[clean.items], clean.audible), cells
 
     def _features(
         self,
@@ -379,28 +377,13 @@ def _frozen_table() -> NDArray[np.float64]:
 # -- NAL-R -----------------------------------------------------------------------------------------
 
 
-def _nalr_taps(thresholds: Tensor) -> NDArray[np.float64]:
-    """Return the taps of NAL-R at 24 kHz, linear in dB between the audiometric frequencies.
-
-    Shape: (8,) dB HL -> (141,).
-    """
-    indices = list(AUDIOMETRIC_INDICES)
-    if thresholds[indices].max() <= 0.0:
-        return np.eye(NALR_ORDER + 1)[NALR_ORDER // 2]
-    gains = nalr_gains_db(thresholds)[indices].numpy()
-    grid = np.arange(NALR_ORDER + 1) / NALR_ORDER
-    decibels = np.interp(grid * RATE / 2, AUDIOMETRIC_HZ, gains)
-    return frequency_sampling_fir(len(grid), grid, 10.0 ** (decibels / 20.0))
-
-
 def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
     """Amplify signals by NAL-R. As in pyclarity, the output begins at the filter's last tap.
 
     Shape: (items, padded), (items, 8) dB HL -> (items, padded).
     """
     points = fft_length(extent.longest + NALR_ORDER, 2)
-    taps = torch.from_numpy(np.stack([_nalr_taps(ear) for ear in ears]))
-    fir = taps.to(signals)
-    spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(fir, points)
+    taps = nalr_filter(ears, RATE, NALR_ORDER)
+    spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(taps, points)
     filtered = torch.fft.irfft(spectrum, points)[:, NALR_ORDER : NALR_ORDER + extent.longest]
     return functional.pad(filtered, (0, extent.padded - extent.longest))

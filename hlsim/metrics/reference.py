@@ -30,7 +30,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
 from hlsim.metrics.pair import SHORTEST_SECONDS, Equalisation, Noise, check_finite, check_pair
-from hlsim.torchtools import Samples, as_samples, broadcast_shape, on_host
+from hlsim.torchtools import Samples, as_samples, broadcast_shape
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -116,7 +116,6 @@ class Reference(ABC):
         check_finite("clean", self._rows)
         if self._needs_ear or audiogram is not None:
             self._ears = self._thresholds(audiogram)
-            self._ears_on_host = self._thresholds(audiogram, host=True)
         self._groups = [slice(0, items)]
         if clean.device.type == "cpu":
             self._groups = [slice(item, item + 1) for item in range(items)]
@@ -124,15 +123,11 @@ class Reference(ABC):
         if keep:
             self._batches = map_on_cores(self._prepare, self._groups, self._clean)
 
-    def _thresholds(self, audiogram: AudiogramLike | None, *, host: bool = False) -> Tensor:
-        """Return the thresholds of the ear of each item.
+    def _thresholds(self, audiogram: AudiogramLike | None) -> Tensor:
+        """Return the thresholds in dB HL of the ear of each item. Shape: -> (items, 8).
 
         Args:
             audiogram: One ear, or one for each item; None raises ValueError.
-            host: Return the thresholds on the CPU, even if this must wait for a GPU.
-
-        Returns:
-            Thresholds. Shape: (items, 8) dB HL.
         """
         shape = self._clean.shape[:-1]
         ears = resolve_thresholds(None, audiogram, self._clean, highest=HIGHEST_LEVEL)
@@ -141,7 +136,6 @@ class Reference(ABC):
                 f"expected one audiogram or one for each item, got shape {tuple(ears.shape)} "
                 f"for signals of shape {tuple(self._clean.shape)}"
             )
-        ears = on_host(ears) if host else ears
         return ears.expand(*shape, 8).reshape(-1, 8)
 
     @torch.inference_mode(False)  # the features may serve a training later

@@ -1,4 +1,4 @@
-"""HASPI, HASQI and HAAQI as metrics of torchmetrics, for validation loops.
+"""HASPI, HASQI, HAAQI and MBSTOI as metrics of torchmetrics, for validation loops.
 
 A metric collects the mean score over batches. The classes need the extra ``train``.
 
@@ -8,20 +8,26 @@ does not understand in a class.
 
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
-from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, has_listeners
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    as_thresholds,
+    check_two_channels,
+    has_listeners,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale, level_spl
 from hlsim.checks import Lengths, check_lengths, check_number, check_rate
 from hlsim.extras import require
 from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
+from hlsim.metrics.mbstoi_score import mbstoi
 from hlsim.metrics.pair import match_pair, scores_or_errors
 
 _Metric: Any = require("torchmetrics", "train").Metric
@@ -30,7 +36,8 @@ _Metric: Any = require("torchmetrics", "train").Metric
 class _MeanScore(_Metric):
     """Mean of a score over all items since the last ``reset``.
 
-    Subclasses set ``score`` to the function that computes the score of each item.
+    Subclasses set ``score`` to the function that computes scores, and ``ears_per_score`` to 2 if
+    both ears of a listener have one score.
     """
 
     is_differentiable = False
@@ -41,6 +48,7 @@ class _MeanScore(_Metric):
     plot = _Metric._plot
 
     score: ClassVar[Callable[..., Tensor]]
+    ears_per_score: ClassVar[int] = 1
 
     total: Tensor
     total_level: Tensor
@@ -151,9 +159,11 @@ class _MeanScore(_Metric):
                 f"(batch, 2, time), got {tuple(output.shape)}"
             )
         sides = output.shape[1] if output.ndim == 3 else 1
+        scores_per_item = sides // self.ears_per_score
         time = output.shape[-1]
         outputs, references = (
-            signal.double().reshape(-1, sides, time) for signal in (output, clean)
+            signal.double().reshape(-1, scores_per_item, self.ears_per_score, time)
+            for signal in (output, clean)
         )
         items = len(outputs)
         audiogram = self.audiogram if audiogram is None else audiogram
@@ -161,7 +171,7 @@ class _MeanScore(_Metric):
             raise ValueError(
                 "expected an audiogram, got None; pass one to update, or to the constructor"
             )
-        ears = _thresholds(audiogram, items, sides)
+        ears = _thresholds(audiogram, items, sides).reshape(*outputs.shape[:3], -1)
         ends = torch.full((items,), time)
         if lengths is not None:
             ends = check_lengths(lengths, torch.Size((items, longest))).clamp_max(time)
@@ -177,21 +187,21 @@ class _MeanScore(_Metric):
             outputs[:items].flatten(0, 1),
             references[:items].flatten(0, 1),
             ears[:items].flatten(0, 1),
-            ends[:items].repeat_interleave(sides).tolist(),
+            ends[:items].repeat_interleave(scores_per_item).tolist(),
             sample_rate=self.sample_rate,
             full_scale_spl=self.full_scale_spl,
         )
         for item in range(items):
-            of_ears = scores[item * sides : (item + 1) * sides]
+            of_ears = scores[item * scores_per_item : (item + 1) * scores_per_item]
             values = [float(score) for score in of_ears if isinstance(score, Tensor)]
-            if len(values) < sides:
+            if len(values) < scores_per_item:
                 self.failed += 1
                 reason = next(score for score in of_ears if isinstance(score, ValueError))
                 message = f"{type(self).__name__} leaves out item {first + item}: {reason}"
                 warnings.warn(message, stacklevel=2)
                 continue
             best = max(values)
-            samples = outputs[item, values.index(best), : ends[item]]
+            samples = outputs[item, values.index(best), :, : ends[item]].flatten()
             self.total += best
             self.total_level += float(level_spl(samples, self.full_scale_spl))
             self.count += 1
@@ -280,6 +290,67 @@ class HAAQI(_MeanScore):
     """
 
     score = staticmethod(haaqi)
+
+
+def _mbstoi(
+    output: Tensor,
+    clean: Tensor,
+    ears: Tensor,
+    *,
+    lengths: Sequence[int],
+    sample_rate: int,
+    full_scale_spl: float,
+) -> Tensor:
+    """Compute MBSTOI, which does not depend on the ears and on the scale, item by item."""
+    pairs = zip(output, clean, lengths, strict=True)
+    scores = [mbstoi(x[:, :end], y[:, :end], sample_rate=sample_rate) for x, y, end in pairs]
+    return torch.stack(scores)
+
+
+class MBSTOI(_MeanScore):
+    """Mean MBSTOI, the intelligibility of outputs at two ears, over all items since ``reset``.
+
+    MBSTOI assumes normal hearing: for a listener with a hearing loss, apply a simulator to the
+    outputs first. The arguments and attributes are those of ``HASPI`` without ``audiogram``. The
+    level is that of both ears together.
+
+    >>> from hlsim import example_speech
+    >>> speech, metric = example_speech()[:16000].expand(2, -1), MBSTOI()
+    >>> round(float(metric(speech, speech)), 2)
+    1.0
+    """
+
+    score = staticmethod(_mbstoi)
+    ears_per_score = 2
+
+    def __init__(self, sample_rate: int = 16000, **options: Any) -> None:
+        if "audiogram" in options:
+            raise ValueError(
+                "MBSTOI takes no audiogram, because it assumes normal hearing; leave it out, and "
+                "apply a simulator to the outputs"
+            )
+        super().__init__(sample_rate, **options)
+
+    def update(  # type: ignore[override]  # there is no audiogram
+        self, output: Tensor, clean: Tensor, lengths: Lengths | None = None
+    ) -> None:
+        """Score a batch, and add the scores to the mean.
+
+        An item that cannot be scored is left out with a warning and counted in ``failed``.
+
+        Args:
+            output: Outputs of an aid at the left and the right ear. Shape: (2, time) or (batch, 2,
+                time).
+            clean: Clean speech of the same shape.
+            lengths: Number of samples of each item of a padded batch. Shape: (batch,).
+
+        Raises:
+            ValueError: The shapes do not fit, or the signals are not what ``mbstoi`` accepts.
+        """
+        check_two_channels(output)
+        if output.ndim == 2:
+            output, clean = output[None], clean[None]
+        super().update(output, clean, ["NH", "NH"], lengths)
 
 
 def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:

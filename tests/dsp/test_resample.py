@@ -83,7 +83,9 @@ def test_resampling_compiles_to_one_graph() -> None:
 
 
 def test_bad_arguments_are_rejected() -> None:
-    with pytest.raises(TypeError, match="expected a floating-point waveform"):
+    with pytest.raises(ValueError, match="expected waveform to be a floating-point tensor"):
         resample(torch.ones(50, dtype=torch.int16), 44100, 16000)
+    with pytest.raises(ValueError, match=r"got shape \(50, 2\); transpose it: x.T"):
+        resample(torch.ones(50, 2), 44100, 16000)
     with pytest.raises(ValueError, match="cannot resample from 44101 to 16000 Hz"):
         resample(torch.ones(50), 44101, 16000)

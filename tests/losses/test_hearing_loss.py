@@ -163,6 +163,20 @@ def test_caller_can_be_compiled(clean: Tensor) -> None:
     assert_same((values[0], slopes[0]), (values[1], slopes[1]))
 
 
+@pytest.mark.slow
+def test_a_full_graph_is_compiled_from_exported_networks_only(clean: Tensor) -> None:
+    """The guide to networks of your own says so."""
+    network, ears = load_pretrained("neuro-msbg-light"), torch.tensor([N3.levels, S2.levels])
+    exact = MSBG()
+    loss = HearingLossLoss(simulator=network)
+    options: Options = {"fullgraph": True, "backend": "aot_eager"}
+    for model, signals in ((network, (clean,)), (exact, (clean,)), (loss, (clean, clean))):
+        with pytest.raises(torch._dynamo.exc.Unsupported):
+            torch.compile(model, **options)(*signals, ears)
+    program = torch.export.export(network, (clean, ears)).module()
+    close(torch.compile(program, **options)(clean, ears), network(clean, ears))
+
+
 @pytest.mark.parametrize("simulator", [*SIMULATORS, "neuro-msbg-light"])
 @pytest.mark.parametrize("seconds", [0.3, 9.0])
 def test_checkpoint_stores_less_and_changes_no_bit(

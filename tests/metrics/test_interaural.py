@@ -1,5 +1,7 @@
 """Interaural differences equal known delays and gains, and the loss depends on nothing else."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -49,8 +51,11 @@ def test_change_swapped_ears_and_silence(scene: Tensor) -> None:
     assert not bool(change.time.any())
     one_silent_ear = torch.stack((scene[0], torch.zeros(16000)))
     assert bool(torch.stack(interaural(one_silent_ear)).isnan().all())
+    assert torch.equal(interaural(scene.numpy()).level, differences.level)
     with pytest.raises(ValueError):
         interaural(scene[0])
+    with pytest.raises(ValueError, match="input and output of the same shape"):
+        interaural_change(scene, scene[:, :8000])
 
 
 def test_the_loss_depends_only_on_differences_between_the_ears(scene: Tensor) -> None:
@@ -88,3 +93,16 @@ def test_as_a_part_of_the_training_loss_it_restores_the_differences(scene: Tenso
     assert float(slope[0]) > 0.0 > float(slope[1])
     with pytest.raises(ValueError):
         loss(scene[0], scene[0], EAR)
+
+
+@pytest.mark.parametrize("options", [{"criterion": "interaural"}, {"ears": "better"}])
+def test_both_ears_of_an_item_have_one_length(scene: Tensor, options: dict[str, Any]) -> None:
+    """Otherwise a part of one ear would be compared with silence in the other one."""
+    loss = HearingLossLoss(EAR, simulator="msbg", reduction="none", **options)
+    clean = torch.stack((scene, scene))[..., :12000]
+    output = clean * torch.tensor([[2.0], [1.0]])
+    values = loss(output, clean, lengths=[[12000, 12000], [9000, 9000]])
+    alone = loss(output[1, :, :9000], clean[1, :, :9000])
+    torch.testing.assert_close(values[1], alone, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="the same length for both ears of an item"):
+        loss(output, clean, lengths=[[12000, 12000], [12000, 9000]])

@@ -15,12 +15,13 @@ from torch.nn import functional
 import hlsim
 from hlsim import NALR, WDRC, Audiogram
 from hlsim.audio import read_audio
+from hlsim.audiogram.prescription import nalr_filter
 from hlsim.data import bundled
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.haaqi_score import _split_by_rate
-from hlsim.metrics.quality import _nalr_taps, _scale_motion_to_level
+from hlsim.metrics.quality import _scale_motion_to_level
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
@@ -158,7 +159,7 @@ def test_identical_music_has_pyclaritys_score_below_1(
 ) -> None:
     """The module's docstring and the guide for Cadenza state these scores."""
     clean, ear = example_music(24000), Audiogram.standard(name)
-    taps = torch.from_numpy(_nalr_taps(torch.tensor(ear.thresholds, dtype=torch.float64)))
+    taps = nalr_filter(torch.tensor(ear.thresholds), 24000, 140)
     by_nalr = functional.conv1d(clean[None], taps[None, None], padding="same")[0]
     for kind, output, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
         arguments = clean.numpy(), output.numpy(), ear, 24000, 7
@@ -185,7 +186,7 @@ def test_modulation_correlation_equals_pyclaritys(segments: int) -> None:
 def test_nalr_equals_pyclaritys(ear: Audiogram) -> None:
     clarity = pytest.importorskip("clarity.enhancer.nalr")
     expected, _ = clarity.NALR(140, 24000).build(ear.to_clarity())
-    taps = _nalr_taps(torch.tensor(ear.thresholds, dtype=torch.float64))
+    taps = nalr_filter(torch.tensor(ear.thresholds), 24000, 140)
     np.testing.assert_allclose(taps, expected, rtol=0, atol=1e-12)
 
 

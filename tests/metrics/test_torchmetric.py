@@ -14,7 +14,7 @@ from hlsim.audiogram import Audiogram
 pytest.importorskip("torchmetrics")
 
 import hlsim.metrics
-from hlsim.metrics import HAAQI, HASPI, HASQI
+from hlsim.metrics import HAAQI, HASPI, HASQI, MBSTOI, mbstoi
 
 N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
 
@@ -71,6 +71,34 @@ def test_the_better_ear_of_two_channels_counts(clean: Tensor) -> None:
     for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
         with pytest.raises(ValueError, match=r"thresholds|audiogram"):
             metric.update(output, both, wrong)
+
+
+def test_mbstoi_scores_both_ears_of_an_item_together(clean: Tensor) -> None:
+    from torchmetrics import MetricCollection
+
+    both = torch.stack([clean, 0.7 * clean.roll(6, -1)], 1)  # (batch, 2, time)
+    output = noisy(both)
+    output[0, :, 12000:] = 0.1  # padding
+    metric = MBSTOI(full_scale_spl=100.0)
+    metric.update(output, both, lengths=[12000, 12800])
+    metric.update(output[1], both[1])
+    items = [(0, 12000), (1, 12800), (1, 12800)]
+    pairs = [(output[i, :, :n].double(), both[i, :, :n].double()) for i, n in items]
+    expected = [float(mbstoi(x, y)) for x, y in pairs]
+    assert float(metric.compute()) == pytest.approx(sum(expected) / 3, abs=1e-6)
+    levels = [100.0 + 10.0 * float(x.square().mean().log10()) for x, _ in pairs]
+    assert float(metric.level) == pytest.approx(sum(levels) / 3, abs=1e-3)
+    both[0] = 0.0
+    with pytest.warns(UserWarning, match="MBSTOI leaves out item 3: clean is silent at both ears"):
+        metric.update(output, both)
+    assert (int(metric.count), int(metric.failed)) == (4, 1)
+    collection = MetricCollection([HASPI(), MBSTOI()])
+    values = collection(output[1:], both[1:], audiogram=[N3, N3])
+    assert float(values["MBSTOI"]) == pytest.approx(expected[1], abs=1e-6)
+    with pytest.raises(ValueError, match="takes no audiogram"):
+        MBSTOI(audiogram="N3")
+    with pytest.raises(ValueError, match="two ears"):
+        metric.update(clean[0], clean[0])
 
 
 def test_limit_and_lengths(clean: Tensor) -> None:
@@ -188,7 +216,7 @@ def test_states_of_other_settings_are_not_merged(clean: Tensor) -> None:
 def test_options_of_torchmetrics() -> None:
     with pytest.raises(ValueError, match="dist_sync_on_step=True is not supported"):
         HASPI(dist_sync_on_step=True)
-    for kind in (HASPI, HASQI, HAAQI):
+    for kind in (HASPI, HASQI, HAAQI, MBSTOI):
         torch.jit.script(kind())
 
 
