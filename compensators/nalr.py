@@ -5,11 +5,12 @@ import torch
 from torch import Tensor
 
 from compensators.aid import Aid
-from hlsim.audiogram import HIGHEST_LEVEL
-from hlsim.audiogram.prescription import nalr_filter, nalr_gains_db
+from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
+from hlsim.dsp.fir import filters_with_gains
 
 ORDER = 220
 """Order of the filter, which has one more tap."""
@@ -76,7 +77,8 @@ class NALR(Aid):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
             points = scipy.fft.next_fast_len(time + ORDER, real=True)
-            taps = nalr_filter(thresholds, self.sample_rate, ORDER).to(signal.dtype)
+            gains = nalr_gains_db(thresholds.double())
+            taps = filters_with_gains(gains, FREQUENCIES, self.sample_rate, ORDER).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
             delay = ORDER // 2
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]

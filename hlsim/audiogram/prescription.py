@@ -1,17 +1,12 @@
-"""Gains that the prescription NAL-R gives to an ear, and filters with these gains.
+"""Gains that the prescription NAL-R gives to an ear.
 
 Source: Byrne and Dillon 1986, Ear and Hearing 7(4), and for severe losses Byrne, Parkinson and
 Newall 1990, Ear and Hearing 11(1).
 """
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram.scale import FREQUENCIES
-from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.dsp.interpolation import interpolate
 from hlsim.torchtools import constant
 
 
@@ -44,43 +39,6 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     all_gains = torch.cat((low, at_3_khz, high, high[..., -1:]), -1)
     has_no_loss = (losses <= 0.0).all(-1, keepdim=True)
     return torch.where(has_no_loss, 0.0, all_gains)
-
-
-def nalr_filter(thresholds: Tensor, sample_rate: int, order: int) -> Tensor:
-    """Design the filter with the gains of NAL-R, linear in dB between the audiometric frequencies.
-
-    The filter has linear phase, and is that of pyclarity.
-
-    Shape: (..., 8) -> (..., order + 1), float64.
-
-    Args:
-        thresholds: Thresholds in dB HL at ``hlsim.audiogram.FREQUENCIES``.
-        sample_rate: Sample rate in Hz.
-        order: Order of the filter, an even number. The filter delays by half of it.
-
-    >>> taps = nalr_filter(torch.full((8,), 40.0), sample_rate=16000, order=220)
-    >>> int(taps.argmax())
-    110
-    """
-    frequencies = np.linspace(0.0, sample_rate / 2.0, order + 1)
-    gains = interpolate(
-        nalr_gains_db(thresholds.double()), FREQUENCIES, tuple(frequencies.tolist())
-    )
-    return (10.0 ** (gains / 20.0)) @ _unit_filters(order, like=gains)
-
-
-@constant
-def _unit_filters(order: int) -> NDArray[np.float64]:
-    """Return the filters with a gain of 1 at one of ``order + 1`` evenly spaced frequencies.
-
-    A filter is linear in its gains, and so the sum of these filters times the gains.
-
-    Returns: (order + 1, order + 1), one row per frequency.
-    """
-    points = order + 1
-    grid = np.arange(points) / order
-    rows = [frequency_sampling_fir(points, grid, gain) for gain in np.eye(points)]
-    return np.stack(rows)
 
 
 @constant

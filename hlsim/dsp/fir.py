@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length, rfft
+from hlsim.dsp.interpolation import interpolate
+from hlsim.torchtools import constant
 
 BLOCK_POINTS = 4096
 """Length of the Fourier transforms of ``filter_in_blocks``."""
@@ -61,6 +63,42 @@ def frequency_sampling_fir(
     delay = np.exp(-0.5j * (taps - 1) * np.pi * np.arange(_GRID_POINTS) / intervals)
     impulse_response = np.fft.irfft(grid_gains * delay, 2 * intervals)
     return impulse_response[:taps] * scipy.signal.get_window(window, taps, fftbins=False)
+
+
+def filters_with_gains(
+    gains_db: Tensor, frequencies: tuple[float, ...], sample_rate: int, order: int
+) -> Tensor:
+    """Design linear-phase filters whose gains in dB are straight lines between some frequencies.
+
+    They are those of ``frequency_sampling_fir``, and differentiable in the gains.
+
+    Shape: (..., gains) -> (..., order + 1).
+
+    Args:
+        gains_db: Gains in dB.
+        frequencies: Ascending frequencies of the gains in Hz. Beyond their ends, gains are
+            constant.
+        sample_rate: Sample rate in Hz.
+        order: Order of the filters, an even number. They delay by half of it.
+
+    >>> filters_with_gains(torch.zeros(2), (250.0, 4000.0), sample_rate=16000, order=4).round()
+    tensor([0., 0., 1., 0., 0.])
+    """
+    points = np.linspace(0.0, sample_rate / 2.0, order + 1)
+    gains = interpolate(gains_db, frequencies, tuple(points.tolist()))
+    return (10.0 ** (gains / 20.0)) @ _unit_filters(order, like=gains)
+
+
+@constant
+def _unit_filters(order: int) -> NDArray[np.float64]:
+    """Return the filters with a gain of 1 at one of ``order + 1`` evenly spaced frequencies.
+
+    A filter is linear in its gains: it is the sum of these filters times the gains.
+
+    Returns: (order + 1, order + 1), one row per frequency.
+    """
+    grid = np.arange(order + 1) / order
+    return np.stack([frequency_sampling_fir(len(grid), grid, gain) for gain in np.eye(len(grid))])
 
 
 def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram.prescription import nalr_filter
+from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.dsp.fft import fft_length
+from hlsim.dsp.fir import filters_with_gains
 from hlsim.metrics.ear import alignment, fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
@@ -383,7 +385,7 @@ def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
     Shape: (items, padded), (items, 8) dB HL -> (items, padded).
     """
     points = fft_length(extent.longest + NALR_ORDER, 2)
-    taps = nalr_filter(ears, RATE, NALR_ORDER)
+    taps = filters_with_gains(nalr_gains_db(ears.double()), FREQUENCIES, RATE, NALR_ORDER)
     spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(taps, points)
     filtered = torch.fft.irfft(spectrum, points)[:, NALR_ORDER : NALR_ORDER + extent.longest]
     return functional.pad(filtered, (0, extent.padded - extent.longest))

@@ -15,8 +15,10 @@ from torch.nn import functional
 import hlsim
 from hlsim import NALR, WDRC, Audiogram
 from hlsim.audio import read_audio
-from hlsim.audiogram.prescription import nalr_filter
+from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.data import bundled
+from hlsim.dsp.fir import filters_with_gains
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.extent import Extent
@@ -159,7 +161,7 @@ def test_identical_music_has_pyclaritys_score_below_1(
 ) -> None:
     """The module's docstring and the guide for Cadenza state these scores."""
     clean, ear = example_music(24000), Audiogram.standard(name)
-    taps = nalr_filter(torch.tensor(ear.thresholds), 24000, 140)
+    taps = nalr_taps(ear)
     by_nalr = functional.conv1d(clean[None], taps[None, None], padding="same")[0]
     for kind, output, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
         arguments = clean.numpy(), output.numpy(), ear, 24000, 7
@@ -182,11 +184,17 @@ def test_modulation_correlation_equals_pyclaritys(segments: int) -> None:
     assert float(result) == pytest.approx(expected, abs=1e-12)
 
 
+def nalr_taps(ear: Audiogram) -> Tensor:
+    """Return NAL-R's filter at 24 kHz. Shape: (141,), float64."""
+    gains = nalr_gains_db(torch.tensor(ear.thresholds, dtype=torch.float64))
+    return filters_with_gains(gains, FREQUENCIES, 24000, 140)
+
+
 @pytest.mark.parametrize("ear", [NH, N3, N6])
 def test_nalr_equals_pyclaritys(ear: Audiogram) -> None:
     clarity = pytest.importorskip("clarity.enhancer.nalr")
     expected, _ = clarity.NALR(140, 24000).build(ear.to_clarity())
-    taps = nalr_filter(torch.tensor(ear.thresholds), 24000, 140)
+    taps = nalr_taps(ear)
     np.testing.assert_allclose(taps, expected, rtol=0, atol=1e-12)
 
 
