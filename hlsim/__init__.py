@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hlsim.audiogram.table import read_listeners as read_listeners
     from hlsim.checkpoint import list_pretrained as list_pretrained
     from hlsim.data.mixing import mix as mix
+    from hlsim.evaluation.digits import reception_threshold as reception_threshold
     from hlsim.losses.hearing_loss import HASPILoss as HASPILoss
     from hlsim.losses.hearing_loss import HearingLossLoss as HearingLossLoss
     from hlsim.msbg import MSBG as MSBG
@@ -41,6 +42,7 @@ _NAMES = {
     "hlsim.audiogram.table": "read_audiograms read_listeners",
     "hlsim.checkpoint": "list_pretrained",
     "hlsim.data.mixing": "mix",
+    "hlsim.evaluation.digits": "reception_threshold",
     "hlsim.losses.hearing_loss": "HASPILoss HearingLossLoss",
     "hlsim.msbg": "MSBG estimate_delay",
     "hlsim.neuro": "NeuroMSBG load_pretrained",

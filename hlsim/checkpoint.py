@@ -35,11 +35,19 @@ _WITHOUT_CHECKPOINT = ("msbg", "msbg-unsmeared", "attenuation", "nalr", "wdrc")
 CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
-"""Kind of the checkpoints of simulators. All other kinds are compensators."""
+"""Kind of the checkpoints of simulators."""
+
+DIGIT_LISTENER = "digit-listener"
+"""Kind of the checkpoints of listeners of the digit test. All other kinds are compensators."""
+
+_LISTENER_LOADER = "hlsim.evaluation.digits.load_listener"
+
+_LOADERS = {SIMULATOR: "load_pretrained", DIGIT_LISTENER: _LISTENER_LOADER}
+"""Function that loads a checkpoint by its kind, unless ``load_compensator`` does."""
 
 
 def list_pretrained() -> dict[str, str]:
-    """List the checkpoints that ship with hlsim.
+    """List the simulators and aids that ship with hlsim as checkpoints.
 
     Returns:
         Name of the function that loads it (``load_pretrained`` for a simulator,
@@ -49,11 +57,12 @@ def list_pretrained() -> dict[str, str]:
     'load_pretrained'
     """
     folders = sorted(path.parent for path in checkpoints_folder().glob(f"*/{CONFIG}"))
-    return {folder.name: _loader_name(read_record(folder)["kind"]) for folder in folders}
+    loaders = {folder.name: _loader_name(read_record(folder)["kind"]) for folder in folders}
+    return {name: loader for name, loader in loaders.items() if loader != _LISTENER_LOADER}
 
 
 def _loader_name(kind: str) -> str:
-    return "load_pretrained" if kind == SIMULATOR else "load_compensator"
+    return _LOADERS.get(kind, "load_compensator")
 
 
 def read_checkpoint(

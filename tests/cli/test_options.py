@@ -16,6 +16,7 @@ FUNCTIONS = {
     "evaluate-compensator": "hlsim.evaluation.compensators:evaluate_compensators",
     "evaluate-simulator": "hlsim.evaluation.simulators:evaluate_simulators",
     "clarity": "hlsim.evaluation.clarity:evaluate_scenes",
+    "srt": "hlsim.evaluation.digits:reception_threshold",
     "prepare": "hlsim.data.layouts",
     "train-compensator": "hlsim.training.compensator",
     "train-simulator": "hlsim.training.simulator",

@@ -1,0 +1,81 @@
+"""The command ``srt``, which measures the speech reception threshold in noise of simulated ears."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from hlsim.cli.inputs import (
+    build_compensator,
+    parse_ears,
+    read_sliders,
+    use_one_thread,
+    warn_of_other_ears,
+)
+from hlsim.cli.options import Parser, count, seed, sound_level
+from hlsim.progress import ProgressLine
+
+
+def srt(parser: Parser) -> None:
+    """Declare the options of the command ``srt``."""
+    parser.set_command(
+        _srt,
+        "--audiogram N4 --compensator hearing-aid",
+        "--audiogram N2 --audiogram N4 --simulator attenuation --triplets 300",
+    )
+    group = parser.add_mutually_exclusive_group(required=True)
+    parser.audiogram(text="; repeat the option for several ears", group=group, action="append")
+    parser.listener("both ears, each of which is tested alone", group=group)
+    text = "aid to compare with none: nalr, wdrc, or a checkpoint's name or folder"
+    parser.option("--compensator", str, text)
+    parser.sliders()
+    text = (
+        "msbg (exact), msbg-unsmeared, attenuation (a linear ear), or a checkpoint's name or folder"
+    )
+    parser.option("--simulator", str, text, "msbg")
+    parser.option("--noise-spl", sound_level, "level of the noise in dB SPL, 40 to 90", 65.0)
+    parser.option("--triplets", count, "triplets of digits per test, 30 to 3000", 120)
+    parser.option("--seed", seed, "seed of digits and noises", 0)
+    parser.set_defaults(full_scale_spl=94.0)  # for the aid, whose signals are in pascals
+
+
+def _srt(options: argparse.Namespace) -> None:
+    use_one_thread()
+    named_ears = parse_ears(options)
+    from hlsim.audiogram import Audiogram
+    from hlsim.calibration import NEURO_RATE
+    from hlsim.evaluation.digits import reception_threshold
+
+    ears: dict[str, Audiogram] = {}
+    for name, ear in named_ears.items():
+        if isinstance(ear, Audiogram):
+            ears[name] = ear
+        else:
+            ears.update(ear.ears().items())
+    aid = None
+    if options.compensator:
+        for ear in ears.values():
+            warn_of_other_ears({options.compensator: options.compensator}, ear)
+        aid = build_compensator(options, NEURO_RATE)
+    sliders: dict[str, Any] = {**read_sliders(options)}
+    with ProgressLine("tests") as progress:
+        result = reception_threshold(
+            [*ears.values()],
+            aid,
+            simulator=options.simulator,
+            noise_spl=options.noise_spl,
+            triplets=options.triplets,
+            seed=options.seed,
+            show=progress,
+            **sliders,
+        )
+    tests = {"unaided": result.unaided, "aided": result.aided, "benefit": result.benefit}
+    for number, name in enumerate(ears):
+        texts = [f"{test} {_in_words(value, number)}" for test, value in tests.items() if value]
+        print(f"{name}, {result.pta[number]:.0f} dB HL: {', '.join(texts)}")
+
+
+def _in_words(estimate: Any, number: int) -> str:
+    """Return an estimate of one of several ears with its 95 % interval."""
+    value, low, high = (values[number] for values in estimate)
+    return f"{value:.1f} dB [{low:.1f}, {high:.1f}]"

@@ -1,0 +1,13 @@
+"""A digits-in-noise test that a simulated ear takes, and its speech reception threshold."""
+
+from hlsim.evaluation.digits.listener import DigitListener, load_listener
+from hlsim.evaluation.digits.psychometric import Estimate
+from hlsim.evaluation.digits.threshold import ReceptionThreshold, reception_threshold
+
+__all__ = [
+    "DigitListener",
+    "Estimate",
+    "ReceptionThreshold",
+    "load_listener",
+    "reception_threshold",
+]

@@ -1,0 +1,134 @@
+"""The listener of the digits-in-noise test: a small network that recognises perceived digits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hlsim.calibration import NEURO_RATE
+from hlsim.checkpoint import DIGIT_LISTENER, read_checkpoint
+from hlsim.checks import check_number
+from hlsim.data.bundled import SLOT_SAMPLES
+from hlsim.dsp.erb import erb_frequency, erb_number
+from hlsim.dsp.fft import power
+from hlsim.dsp.stft import STFT
+from hlsim.evaluation.digits.material import DIGITS_PER_TRIPLET, LEAD_SAMPLES
+from hlsim.neuro.config import ModelConfig
+
+_LOWEST_HZ, _HIGHEST_HZ = 80.0, 7800.0
+"""Lower edge of the lowest band and upper edge of the highest one in Hz."""
+
+_MARGIN_FRAMES = 5
+"""Frames of 10 ms before and after the slot of a digit that the network gets."""
+
+_POWER_FLOOR = 1e-14
+"""Power that is added before the logarithm, below that of the noise of a normal ear."""
+
+
+@dataclass(frozen=True)
+class DigitListenerConfig(ModelConfig):
+    """Sizes of a ``DigitListener``.
+
+    Attributes:
+        bands: Number of frequency bands, evenly spaced on the ERB-number scale.
+        channels: Number of feature maps of each convolution.
+
+    Raises:
+        ValueError: A value is out of range.
+
+    >>> DigitListenerConfig(channels=8).to_dict()["channels"]
+    8
+    """
+
+    bands: int = 40
+    channels: int = 32
+
+    def __post_init__(self) -> None:
+        check_number("bands", self.bands, 8, 80, whole=True)
+        check_number("channels", self.channels, 1, 256, whole=True)
+
+
+class DigitListener(nn.Module):
+    """Recogniser of digits, which gets what an ear perceives and knows when each digit begins.
+
+    Levels in bands become a picture per digit, without its mean, so that the overall level says
+    nothing. Three convolutions and a linear layer compute a score per digit.
+
+    Args:
+        config: Sizes of the network; by default ``DigitListenerConfig()``.
+
+    >>> DigitListener()(torch.randn(2, 48000)).shape
+    torch.Size([2, 3, 10])
+    """
+
+    bands: Tensor
+
+    def __init__(self, config: DigitListenerConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or DigitListenerConfig()
+        self.stft = STFT(fft=512, window=400, hop=NEURO_RATE // 100)
+        self.register_buffer("bands", self._band_weights(), persistent=False)
+        slot_frames = SLOT_SAMPLES // self.stft.hop
+        starts = LEAD_SAMPLES // self.stft.hop + slot_frames * np.arange(DIGITS_PER_TRIPLET)
+        self.slots = [
+            slice(start - _MARGIN_FRAMES, start + slot_frames + _MARGIN_FRAMES)
+            for start in starts.tolist()
+        ]
+        layers: list[nn.Module] = []
+        channels = 1
+        height, width = config.bands, slot_frames + 2 * _MARGIN_FRAMES
+        for kernel in (5, 5, 3):
+            convolution = nn.Conv2d(
+                channels, config.channels, kernel, stride=2, padding=kernel // 2
+            )
+            layers += [convolution, nn.BatchNorm2d(config.channels), nn.ReLU()]
+            channels, height, width = config.channels, (height + 1) // 2, (width + 1) // 2
+        size = channels * height * width
+        self.network = nn.Sequential(*layers, nn.Flatten(), nn.Dropout(0.2), nn.Linear(size, 10))
+
+    def forward(self, perceived: Tensor) -> Tensor:
+        """Compute a score per digit, whose softmax is its probability.
+
+        Shape: (triplets, time) -> (triplets, 3, 10).
+
+        Args:
+            perceived: Perceived triplets in pascals at 16 kHz.
+        """
+        powers = power(self.stft.analyse(perceived)) @ self.bands
+        levels = (powers + _POWER_FLOOR).log10().mT
+        pictures = torch.stack([levels[..., slot] for slot in self.slots], 1)
+        pictures = pictures - pictures.mean((-2, -1), keepdim=True)
+        scores: Tensor = self.network(pictures.flatten(0, 1).unsqueeze(1))
+        return scores.reshape(-1, DIGITS_PER_TRIPLET, 10)
+
+    def _band_weights(self) -> Tensor:
+        """Compute triangular weights of the spectrum's powers, (frequencies, bands)."""
+        count = self.config.bands
+        lowest, highest = erb_number(np.array([_LOWEST_HZ, _HIGHEST_HZ]))
+        edges = erb_frequency(np.linspace(lowest, highest, count + 2))
+        hertz = np.linspace(0.0, NEURO_RATE / 2.0, self.stft.frequencies)
+        weights = [np.interp(hertz, edges[i : i + 3], (0.0, 1.0, 0.0)) for i in range(count)]
+        return torch.from_numpy(np.stack(weights, 1).astype(np.float32))
+
+
+@cache
+def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
+    """Load a trained listener, in evaluation mode and with weights that are not trained further.
+
+    Args:
+        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
+
+    Raises:
+        ValueError: There is no such checkpoint, or it is damaged or of another kind.
+
+    >>> load_listener().config.bands
+    40
+    """
+    kinds = {DIGIT_LISTENER: DigitListenerConfig.from_dict}
+    listener = read_checkpoint(name, kinds, DigitListener)
+    return listener.eval().requires_grad_(False)

@@ -1,0 +1,166 @@
+"""Sounds of the digits-in-noise test: triplets of digits, noise, and the noise of the ear."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import soundfile
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
+from hlsim.data.bundled import DIGIT_DBFS, DIGITS, SLOT_SAMPLES
+
+DIGITS_PER_TRIPLET = 3
+
+LEAD_SAMPLES = NEURO_RATE // 2
+"""Samples of noise before the first digit, in which an aid settles."""
+
+TAIL_SAMPLES = NEURO_RATE // 4
+"""Samples of noise after the slot of the last digit."""
+
+TRIPLET_SAMPLES = LEAD_SAMPLES + DIGITS_PER_TRIPLET * SLOT_SAMPLES + TAIL_SAMPLES
+"""Length of a triplet, 3 s, in samples at 16 kHz."""
+
+_SPECTRUM_SAMPLES = 4096
+"""Length of the frames from which the spectrum of the digits is computed."""
+
+# ANSI S3.5-1997, Table 3, reference internal noise spectrum level in dB SPL per hertz. The table
+# begins at 160 Hz; the first two values extrapolate it.
+_INTERNAL_NOISE_HZ = np.array(
+    "50 100 160 200 250 315 400 500 630 800 1000 1250 1600 2000 2500 3150 4000 5000 6300 8000"
+    "".split(),
+    dtype=float,
+)
+_INTERNAL_NOISE_DB = np.array(
+    "4 2 .6 -1.7 -3.9 -6.1 -8.2 -9.7 -10.8 -11.9 -12.5 -13.5 -15.4 -17.7 -21.2 -24.2 -25.9 -23.6 "
+    "-15.8 -7.1".split(),
+    dtype=float,
+)
+
+
+class Triplets(NamedTuple):
+    """Triplets of digits with their noises, for all ears the same.
+
+    Attributes:
+        speech: Digits with RMS 1 each, without noise, (triplets, time).
+        noise: Noise with RMS 1 and the long-term spectrum of the digits, (triplets, time).
+        internal: Noise of a normal ear in pascals, (triplets, time).
+        digits: Spoken digits, (triplets, 3).
+    """
+
+    speech: Tensor
+    noise: Tensor
+    internal: Tensor
+    digits: Tensor
+
+
+@cache
+def load_digits() -> Tensor:
+    """Load the bundled digits, with RMS 1.
+
+    Returns:
+        Samples at 16 kHz, (voices, 10, SLOT_SAMPLES).
+
+    >>> load_digits().shape
+    torch.Size([8, 10, 12000])
+    """
+    voices = [soundfile.read(path, dtype="float32")[0] for path in sorted(DIGITS.glob("*.flac"))]
+    samples = torch.from_numpy(np.stack(voices)) / 10.0 ** (DIGIT_DBFS / 20.0)
+    return samples.reshape(len(voices), -1, SLOT_SAMPLES)
+
+
+def draw_triplets(count: int, generator: torch.Generator) -> Triplets:
+    """Draw triplets of digits, each spoken by one voice, with noises.
+
+    Args:
+        count: Number of triplets.
+        generator: Source of the random numbers.
+
+    >>> draw_triplets(2, torch.Generator().manual_seed(0)).digits.shape
+    torch.Size([2, 3])
+    """
+    bank = load_digits()
+    voices = torch.randint(len(bank), (count, 1), generator=generator)
+    digits = torch.randint(10, (count, DIGITS_PER_TRIPLET), generator=generator)
+    speech = nn.functional.pad(bank[voices, digits].flatten(1), (LEAD_SAMPLES, TAIL_SAMPLES))
+    noise = _draw_noise(count, _speech_amplitudes(), generator)
+    internal = _draw_noise(count, _internal_amplitudes(), generator)
+    return Triplets(speech, noise / noise.square().mean(-1, keepdim=True).sqrt(), internal, digits)
+
+
+def present(triplets: Triplets, snr: Tensor, noise_spl: float | Tensor) -> Tensor:
+    """Add the noise at a level, and the digits at a signal-to-noise ratio.
+
+    Args:
+        triplets: Digits and noises.
+        snr: Level of a digit minus that of the noise in dB, per triplet.
+        noise_spl: Level of the noise in dB SPL, for all triplets or per triplet.
+
+    Returns:
+        Samples in pascals at 16 kHz, (triplets, time).
+
+    >>> triplets = draw_triplets(1, torch.Generator().manual_seed(0))
+    >>> present(triplets, torch.tensor([0.0]), 65.0).shape
+    torch.Size([1, 48000])
+    """
+    noise_gain = 10.0 ** ((torch.as_tensor(noise_spl) - PASCAL_SPL) / 20.0)
+    mixture = triplets.noise + triplets.speech * 10.0 ** (snr[:, None] / 20.0)
+    return mixture * noise_gain.reshape(-1, 1)
+
+
+def perceive(signals: Tensor, thresholds: Tensor, simulator: nn.Module, internal: Tensor) -> Tensor:
+    """Simulate what ears perceive of signals, and add the noise of a normal ear.
+
+    Without a loss, the noise of the ear masks what is below the normal threshold. A simulator makes
+    sounds as soft for a normal ear as they are for the impaired one, so the same noise also masks
+    what is below the threshold of the impaired ear.
+
+    Args:
+        signals: Signals in pascals at 16 kHz, (triplets, time).
+        thresholds: Ears in dB HL, (triplets, 8).
+        simulator: Simulator of the hearing loss.
+        internal: Noise of the ear in pascals, (triplets, time).
+
+    >>> from hlsim.simulators import load_simulator
+    >>> triplets = draw_triplets(1, torch.Generator().manual_seed(0))
+    >>> sound = present(triplets, torch.tensor([0.0]), 65.0)
+    >>> ears = torch.full((1, 8), 40.0)
+    >>> perceive(sound, ears, load_simulator("msbg"), triplets.internal).shape
+    torch.Size([1, 48000])
+    """
+    perceived: Tensor = simulator(signals, thresholds)
+    return perceived + internal
+
+
+def _draw_noise(count: int, amplitudes: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw Gaussian noise with an amplitude per frequency, (count, TRIPLET_SAMPLES)."""
+    white = torch.randn(count, TRIPLET_SAMPLES, generator=generator)
+    return torch.fft.irfft(torch.fft.rfft(white) * amplitudes, TRIPLET_SAMPLES)
+
+
+@cache
+def _speech_amplitudes() -> Tensor:
+    """Compute the amplitudes of the digits' long-term spectrum at the frequencies of a triplet."""
+    words = load_digits().double()
+    speech = words[words != 0.0]
+    frames = speech[: len(speech) // _SPECTRUM_SAMPLES * _SPECTRUM_SAMPLES]
+    frames = frames.reshape(-1, _SPECTRUM_SAMPLES) * torch.hann_window(_SPECTRUM_SAMPLES).double()
+    amplitudes = torch.fft.rfft(frames).abs().square().mean(0).sqrt().numpy()
+    return _interpolate(amplitudes, np.linspace(0.0, NEURO_RATE / 2.0, len(amplitudes)))
+
+
+@cache
+def _internal_amplitudes() -> Tensor:
+    """Compute the factors by which white noise of RMS 1 becomes the internal noise in pascals."""
+    root_density = 10.0 ** ((_INTERNAL_NOISE_DB - PASCAL_SPL) / 20.0)
+    return _interpolate(root_density * np.sqrt(NEURO_RATE / 2.0), _INTERNAL_NOISE_HZ)
+
+
+def _interpolate(amplitudes: NDArray[Any], hertz: NDArray[np.float64]) -> Tensor:
+    """Interpolate amplitudes to the frequencies of the Fourier transform of a triplet."""
+    grid = np.fft.rfftfreq(TRIPLET_SAMPLES, 1.0 / NEURO_RATE)
+    return torch.from_numpy(np.interp(grid, hertz, amplitudes).astype(np.float32))

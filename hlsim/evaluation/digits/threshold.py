@@ -1,0 +1,214 @@
+"""The speech reception threshold of an ear, without and with an aid.
+
+The test is that of Smits et al. (2004): triplets of digits in steady noise with the spectrum of the
+digits, of which the listener must recognise all three. The noise has a fixed level. The threshold
+is the signal-to-noise ratio at which half of the triplets are understood.
+
+The signal-to-noise ratios are constant stimuli (ISO 8253-3) in three rounds: a fifth of the
+triplets over the whole range, then twice two fifths around the threshold so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from compensators import load_compensator
+from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
+from hlsim.checkpoint import DIGIT_LISTENER
+from hlsim.checks import check_number, loud_outputs
+from hlsim.evaluation.digits.listener import DigitListener, load_listener
+from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
+from hlsim.evaluation.digits.psychometric import (
+    HIGHEST_SNR,
+    LOWEST_SNR,
+    Array,
+    Estimate,
+    estimate_threshold,
+    subtract,
+)
+from hlsim.simulators import EXACT, load_simulator
+
+NOISE_SPL = 65.0
+"""Level of the noise in dB SPL by default."""
+
+TRIPLETS = 120
+"""Number of triplets per ear and condition by default."""
+
+_PTA = [FREQUENCIES.index(hz) for hz in (500.0, 1000.0, 2000.0, 4000.0)]
+"""Indices of the frequencies of the pure-tone average."""
+
+_ROUND_ENDS = (0.2, 0.6)
+"""Shares of the triplets that are presented before the second and before the third round."""
+
+_AROUND_DB = 4.0
+"""Largest distance in dB from the threshold so far, in all rounds but the first."""
+
+AidFunction = Callable[..., Tensor]
+"""Function of signals in pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL."""
+
+
+@dataclass(frozen=True)
+class ReceptionThreshold:
+    """Speech reception thresholds in noise. The lower a threshold, the better.
+
+    Attributes:
+        unaided: Threshold without an aid, as signal-to-noise ratio in dB.
+        aided: Threshold with the aid, or None without an aid.
+        benefit: Unaided minus aided threshold in dB, or None without an aid. Its interval counts
+            the errors of both thresholds as independent, although both come from the same triplets.
+        pta: Pure-tone average in dB HL, the mean threshold at 500, 1000, 2000 and 4000 Hz.
+    """
+
+    unaided: Estimate
+    aided: Estimate | None
+    benefit: Estimate | None
+    pta: Any
+
+
+@dataclass(frozen=True)
+class _Test:
+    """Digit test behind a simulated ear.
+
+    Attributes:
+        material: Triplets of the test.
+        simulator: Simulator of the hearing loss.
+        listener: Recogniser of the digits.
+        noise_spl: Level of the noise in dB SPL.
+    """
+
+    material: Triplets
+    simulator: nn.Module
+    listener: DigitListener
+    noise_spl: float
+
+    def measure(self, ear: Tensor, aid: AidFunction | None) -> Estimate:
+        """Measure the threshold of one ear, (8,) in dB HL, with an aid or None."""
+        count = len(self.material.digits)
+        snr, right = np.zeros(count), np.zeros(count)
+        centre = np.nan  # after the first round, the threshold so far
+        ends = [round(share * count) for share in _ROUND_ENDS]
+        for part in np.split(np.arange(count), ends):
+            if part[0] == 0:
+                levels = np.linspace(LOWEST_SNR, HIGHEST_SNR, len(part))
+            else:
+                levels = centre + np.linspace(-_AROUND_DB, _AROUND_DB, len(part))
+            snr[part] = levels.clip(LOWEST_SNR, HIGHEST_SNR)
+            right[part] = self._count_right(part, snr[part], ear, aid)
+            finished = part[-1] + 1
+            estimate = estimate_threshold(snr[:finished], right[:finished])
+            centre = min(estimate.value, HIGHEST_SNR)
+        return estimate
+
+    def _count_right(
+        self, part: NDArray[np.int64], snr: Array, ear: Tensor, aid: AidFunction | None
+    ) -> Array:
+        """Present some of the triplets, and count the right digits of each."""
+        triplets = Triplets(*(values[part] for values in self.material))
+        signals = present(triplets, torch.from_numpy(snr).float(), self.noise_spl)
+        if aid is not None:
+            output = aid(signals, ear)
+            if output.shape != signals.shape or not bool(output.isfinite().all()):
+                raise ValueError(
+                    f"expected the aid to return finite samples of shape {tuple(signals.shape)}, "
+                    f"got shape {tuple(output.shape)}; return as many samples as the input has, "
+                    "without NaN or infinity"
+                )
+            signals = output
+        scores = self.listener(perceive(signals, ear, self.simulator, triplets.internal))
+        return (scores.argmax(-1) == triplets.digits).sum(-1).double().numpy()
+
+
+def reception_threshold(
+    audiogram: AudiogramLike,
+    aid: str | Path | AidFunction | None = None,
+    *,
+    simulator: str | Path | nn.Module = EXACT,
+    listener: str | Path = DIGIT_LISTENER,
+    noise_spl: float = NOISE_SPL,
+    triplets: int = TRIPLETS,
+    seed: int = 0,
+    show: Callable[[int, int], None] = lambda done, total: None,
+    **sliders: Any,
+) -> ReceptionThreshold:
+    """Measure the speech reception threshold in noise of simulated ears by a digit test.
+
+    A small network behind the simulated ear recognises triplets of digits. It has a skill of its
+    own, so compare thresholds with each other; those of people differ by a constant
+    (docs/digits.md). Each ear is tested alone, on the CPU, and each one, without and with the aid,
+    gets the same triplets and noises. The same call therefore returns the same bits.
+
+    Args:
+        audiogram: One or more ears. The results have their shape: numbers for one ear, (batch,) for
+            a list of ears, (2,) for a ``Listener``, whose better ear has the lower threshold.
+        aid: Name or folder of an aid, as in ``load_compensator``, or a function of signals in
+            pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL; None for no aid.
+        simulator: Simulator of the hearing loss, as in ``load_simulator``.
+        listener: Name of the shipped listener, or the folder of another one
+            (examples/train_digit_listener.py).
+        noise_spl: Level of the noise in dB SPL, 40 to 90.
+        triplets: Number of triplets per ear, without and with the aid, 30 to 3000.
+        seed: Seed of digits, voices and noises.
+        show: Function of the numbers of finished and of all tests, which shows the progress.
+        sliders: Further arguments of the aid, such as ``noise_reduction=0.0``.
+
+    Returns:
+        Thresholds in dB with their 95 % intervals. A threshold above 32 dB is infinite.
+
+    Raises:
+        ValueError: An ear, an aid, a simulator, a listener or a number is not valid, there are
+            sliders without an aid, or the output of the aid has another shape or is not finite.
+
+    >>> import hlsim
+    >>> result = hlsim.reception_threshold("N3", "nalr", triplets=30)
+    >>> bool(result.unaided.low < result.unaided.value < result.unaided.high)
+    True
+    """
+    check_number("noise_spl", noise_spl, 40.0, 90.0)
+    check_number("triplets", triplets, 30, 3000, whole=True)
+    check_number("seed", seed, 0, 2**32 - 1, whole=True)
+    if sliders and aid is None:
+        names = ", ".join(sliders)
+        raise ValueError(f"{names} has no effect without an aid; pass one, such as 'hearing-aid'")
+    thresholds = as_thresholds(audiogram)
+    ears = thresholds.reshape(-1, len(FREQUENCIES)).to("cpu", torch.float32)
+    aids: list[AidFunction | None] = [None]
+    if aid is not None:
+        function = load_compensator(aid) if isinstance(aid, str | Path) else aid
+        aids.append(partial(function, **sliders))
+    test = _Test(
+        draw_triplets(triplets, torch.Generator().manual_seed(seed)),
+        load_simulator(simulator),
+        load_listener(listener),
+        noise_spl,
+    )
+    total = len(aids) * len(ears)
+    estimates: list[Estimate] = []
+    with torch.inference_mode(), loud_outputs():
+        for tested_aid in aids:
+            for ear in ears:
+                show(len(estimates), total)
+                estimates.append(test.measure(ear, tested_aid))
+    show(total, total)
+
+    def in_shape_of_ears(values: Any) -> Any:
+        return np.array(values).reshape(thresholds.shape[:-1])[()]
+
+    conditions = [
+        Estimate(*map(in_shape_of_ears, zip(*estimates[start : start + len(ears)], strict=True)))
+        for start in range(0, total, len(ears))
+    ]
+    unaided = conditions[0]
+    aided = None if aid is None else conditions[1]
+    benefit = None if aided is None else subtract(unaided, aided)
+    pta = in_shape_of_ears(ears.double()[:, _PTA].mean(-1).numpy())
+    return ReceptionThreshold(unaided, aided, benefit, pta)

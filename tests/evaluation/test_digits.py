@@ -1,0 +1,201 @@
+"""Digits, noises, listener and thresholds of the digits-in-noise test."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import expit, logit
+
+import hlsim
+from hlsim import Listener, reception_threshold
+from hlsim.calibration import set_level
+from hlsim.checkpoint import checkpoints_folder
+from hlsim.cli.main import main
+from hlsim.data.bundled import DIGITS
+from hlsim.evaluation.digits.listener import load_listener
+from hlsim.evaluation.digits.material import (
+    Triplets,
+    draw_triplets,
+    load_digits,
+    perceive,
+    present,
+)
+from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
+from hlsim.simulators import load_simulator
+
+QUICK: dict[str, Any] = {"simulator": "attenuation", "triplets": 30}
+"""Settings of a test of a second."""
+
+
+def draw(count: int, seed: int = 0) -> Triplets:
+    return draw_triplets(count, torch.Generator().manual_seed(seed))
+
+
+def share_right(ear: object, snr: float, noise_spl: float = 65.0, simulator: str = "msbg") -> float:
+    """Return the share of the digits of 16 triplets that the listener recognises."""
+    triplets = draw(16)
+    signals = present(triplets, torch.full((16,), snr), noise_spl)
+    thresholds = torch.tensor(hlsim.audiogram.as_audiogram(ear).thresholds)
+    perceived = perceive(signals, thresholds, load_simulator(simulator), triplets.internal)
+    recognised = load_listener()(perceived).argmax(-1)
+    return float((recognised == triplets.digits).float().mean())
+
+
+def test_digits_are_small_and_have_one_level() -> None:
+    bank = load_digits()
+    assert bank.shape == (8, 10, 12000)
+    assert sum(path.stat().st_size for path in DIGITS.iterdir()) < 1_000_000
+    speech = bank[..., 800:]  # without the silence before it
+    for word in speech.flatten(0, 1):
+        end = int(word.nonzero().max()) + 1 - 800
+        assert float(word[:end].square().mean().sqrt()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_noise_has_rms_1_and_the_spectrum_of_the_digits() -> None:
+    triplets = draw(40)
+    torch.testing.assert_close(triplets.noise.square().mean(-1), torch.ones(40))
+    levels = []
+    for signals in (triplets.noise, triplets.speech):
+        powers = torch.fft.rfft(signals).abs().square().mean(0)
+        octaves = [powers[int(1.5 * hz) : int(6.0 * hz)].sum() for hz in (250, 500, 1000, 2000)]
+        levels.append(10.0 * (torch.stack(octaves) / powers.sum()).log10())
+    torch.testing.assert_close(*levels, atol=1.5, rtol=0.0)
+
+
+def test_noise_of_the_ear_has_the_spectrum_level_of_the_standard() -> None:
+    internal = draw(40).internal
+    powers = torch.fft.rfft(internal).abs().square().mean(0)
+    density = 2.0 * powers / (internal.shape[-1] * 16000.0)  # Pa^2 per hertz
+    for hz, expected in ((250, -3.9), (1000, -12.5), (4000, -25.9)):
+        level = 10.0 * density[3 * hz - 60 : 3 * hz + 60].mean().log10() + 94.0
+        assert float(level) == pytest.approx(expected, abs=0.5)
+
+
+def test_presented_levels_are_those_of_digits_and_noise() -> None:
+    triplets = draw(2)
+    only_noise = present(triplets, torch.full((2,), -100.0), 65.0)
+    torch.testing.assert_close(only_noise, set_level(triplets.noise, 65.0), rtol=1e-3, atol=1e-6)
+    speech = present(triplets, torch.full((2,), 20.0), 65.0) - only_noise
+    factor = 10.0 ** ((85.0 - 94.0) / 20.0)
+    torch.testing.assert_close(speech, factor * triplets.speech, rtol=1e-3, atol=1e-5)
+
+
+def test_a_seed_decides_all_random_numbers() -> None:
+    for same, again, other in zip(draw(2), draw(2), draw(2, seed=1), strict=True):
+        assert torch.equal(same, again) and not torch.equal(same, other)
+
+
+@pytest.mark.parametrize("threshold", [-12.0, 3.0])
+def test_known_thresholds_are_found_within_their_interval(threshold: float) -> None:
+    rng = np.random.default_rng(0)
+    snr = threshold + np.linspace(-8.0, 8.0, 200)
+    span = 0.9 - 0.01
+    share = 0.1 + span * expit(0.4 * (snr - threshold) + logit((TARGET - 0.1) / span))
+    inside, errors = [], []
+    for _ in range(40):
+        estimate = estimate_threshold(snr, rng.binomial(3, share))
+        inside.append(estimate.low <= threshold <= estimate.high)
+        errors.append(estimate.value - threshold)
+    assert abs(np.mean(errors)) < 0.3 and np.mean(inside) >= 0.85
+
+
+def test_a_threshold_that_is_never_reached_is_infinite() -> None:
+    estimate = estimate_threshold(np.linspace(-20.0, 30.0, 60), np.zeros(60))
+    assert estimate == (np.inf, np.inf, np.inf)
+    assert np.isnan(subtract(estimate, estimate).value)
+    assert subtract(estimate, Estimate(1.0, 0.0, 2.0)).value == np.inf
+
+
+def test_shipped_listener_is_small_and_hears_what_was_measured() -> None:
+    folder = checkpoints_folder() / "digit-listener"
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 1_000_000
+    assert share_right("NH", 5.0) >= 0.95
+    assert share_right("NH", -30.0) <= 0.3
+    assert share_right("N4", 15.0) >= 0.8
+
+
+def test_louder_noise_and_a_worse_ear_leave_fewer_digits() -> None:
+    louder = share_right("N2", -25.0, noise_spl=80.0), share_right("N2", -5.0, noise_spl=60.0)
+    assert louder[0] < louder[1]
+    assert share_right("N5", -5.0) < share_right("N3", -5.0) <= share_right("NH", -5.0)
+
+
+def test_a_worse_ear_has_a_higher_threshold_and_gain_lowers_it() -> None:
+    result = reception_threshold(["NH", "N3", "N5"], lambda x, _: 10.0 * x, **QUICK)
+    normal, moderate, severe = result.unaided.value
+    assert normal + 1.0 < moderate and moderate + 3.0 < severe
+    assert result.benefit is not None and result.aided is not None
+    assert result.benefit.value[2] > 3.0
+    np.testing.assert_array_equal(result.benefit.value, result.unaided.value - result.aided.value)
+    assert result.pta.tolist() == [0.0, 46.25, 76.25]
+    for estimate in (result.unaided, result.aided, result.benefit):
+        assert (estimate.low < estimate.value).all() and (estimate.value < estimate.high).all()
+
+
+def test_the_same_call_has_the_same_bits_and_ears_are_independent() -> None:
+    first = reception_threshold(["N2", "N4"], "nalr", **QUICK)
+    second = reception_threshold(["N2", "N4"], "nalr", **QUICK)
+    alone = reception_threshold("N4", "nalr", **QUICK)
+    for name in ("unaided", "aided", "benefit"):
+        both, again, single = (getattr(x, name) for x in (first, second, alone))
+        np.testing.assert_array_equal(np.array(both), np.array(again))
+        assert np.array(both)[:, 1].tolist() == np.array(single).tolist()
+    listener = reception_threshold(Listener("N2", "N4"), **QUICK)
+    assert listener.unaided.value.tolist() == first.unaided.value.tolist()
+    assert reception_threshold("N4", seed=1, **QUICK).unaided.value != alone.unaided.value
+
+
+def test_sliders_reach_the_aid() -> None:
+    gains = []
+
+    def aid(signals: torch.Tensor, ear: torch.Tensor, gain: float) -> torch.Tensor:
+        gains.append(gain)
+        return signals
+
+    result = reception_threshold("N2", aid, gain=0.5, **QUICK)
+    assert set(gains) == {0.5}
+    assert result.benefit is not None and result.benefit.value == 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"audiogram": "N7"}, "-10 to 100 dB HL"),
+        ({"aid": "no-such"}, "no checkpoint"),
+        ({"aid": "neuro-msbg"}, "load it with load_pretrained"),
+        ({"simulator": "no-such"}, "no checkpoint"),
+        ({"listener": "hearing-aid"}, "expected a checkpoint of kind digit-listener"),
+        ({"noise_spl": 20.0}, "noise_spl to be a number from 40 to 90"),
+        ({"triplets": 3}, "triplets to be a whole number"),
+        ({"seed": -1}, "seed"),
+        ({"noise_reduction": 0.5}, "no effect without an aid"),
+        ({"aid": lambda x, _: x[..., :-1]}, "return as many samples"),
+        ({"aid": lambda x, _: x * float("nan")}, "without NaN"),
+    ],
+)
+def test_invalid_arguments_are_rejected(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        reception_threshold(**{"audiogram": "N3", **QUICK, **settings})
+
+
+def test_other_loaders_name_the_loader_of_a_listener() -> None:
+    with pytest.raises(ValueError, match=r"load it with hlsim\.evaluation\.digits\.load_listener"):
+        hlsim.load_pretrained("digit-listener")
+    assert "digit-listener" not in hlsim.list_pretrained()
+
+
+def test_command_prints_a_line_per_ear(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    quick = "--simulator attenuation --triplets 30".split()
+    words = "srt --audiogram N2 --audiogram N4 --compensator nalr".split()
+    assert main([*words, *quick]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(",")[0] for line in lines] == ["N2", "N4"]
+    assert all(word in lines[1] for word in ("unaided", "aided", "benefit", "62 dB HL"))
+    table = tmp_path / "ears.csv"
+    table.write_text("listener,L500,L4000,R500,R4000\nA,20,30,50,60\n")
+    assert main(["srt", "--listener", str(table), *quick]) == 0
+    assert [line[:5] for line in capsys.readouterr().out.splitlines()] == ["left,", "right"]
+    assert main(["srt", "--audiogram", "N2", "--noise-reduction", "1", *quick]) == 2
+    assert "no effect without an aid" in capsys.readouterr().err
