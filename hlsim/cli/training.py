@@ -113,10 +113,5 @@ def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
         data = TrainingData.from_manifest(options.manifest, options.root, **sources)
     else:
         data = TrainingData(options.speech, **sources)
-    return {
-        "data": data,
-        "out": options.out,
-        "max_minutes": options.max_minutes,
-        "accelerator": options.device,
-        "devices": options.devices,
-    }
+    common = {name: getattr(options, name) for name in ("out", "max_minutes", "devices")}
+    return {"data": data, "accelerator": options.device, **common}

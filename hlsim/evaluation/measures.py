@@ -41,7 +41,7 @@ NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
 
 
-def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: Tensor) -> Values:
+def _score_for_ear(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
     """Compute a score with pyclarity's noise, and with its rounding of the rate to whole kHz.
 
     Single precision takes half the time, but may align a channel differently by one sample.
@@ -51,24 +51,27 @@ def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: 
     return {name: float(score(output.double(), item.clean.double(), item.ear, **options))}
 
 
-def _score_signal(name: str, score: Callable[..., float], item: Item, output: Tensor) -> Values:
+def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
     """Compute STOI or PESQ, which do not depend on the ear."""
     return {name: score(output, item.clean, item.sample_rate)}
 
 
-_SCORES = {
-    "haspi": (partial(_score_for_ear, "haspi", haspi), ["numpy"]),  # NumPy draws the ear's noise.
-    "hasqi": (partial(_score_for_ear, "hasqi", hasqi), ["numpy"]),
-    "haaqi": (partial(_score_for_ear, "haaqi", haaqi), ["numpy"]),
-    "stoi": (partial(_score_signal, "stoi", fidelity.stoi), ["pystoi", "scipy"]),
-    "pesq": (partial(_score_signal, "pesq", fidelity.pesq_wb), ["pesq"]),
-}
-
 MEASURES = {
     name: Measure(
-        name, compute, packages, uses_facts=False, scores=[name], may_crash=name == "pesq"
+        name,
+        partial(compute, name, score),
+        packages,
+        uses_facts=False,
+        scores=[name],
+        may_crash=name == "pesq",
     )
-    for name, (compute, packages) in _SCORES.items()
+    for name, compute, score, packages in (
+        ("haspi", _score_for_ear, haspi, ["numpy"]),  # NumPy draws the ear's noise.
+        ("hasqi", _score_for_ear, hasqi, ["numpy"]),
+        ("haaqi", _score_for_ear, haaqi, ["numpy"]),
+        ("stoi", _score_signal, fidelity.stoi, ["pystoi", "scipy"]),
+        ("pesq", _score_signal, fidelity.pesq_wb, ["pesq"]),
+    )
 }
 """The scores of ``--measures``, each under its name. Higher is better for all of them."""
 

@@ -45,9 +45,6 @@ _REQUIRED_COLUMNS = ("condition", "clean", "processed")
 _COLUMNS = (*_REQUIRED_COLUMNS, "listener", "ear", "item", "snr", "audiogram", "spl")
 """Columns of a manifest whose meaning is known, beside those of thresholds."""
 
-_Rows = Sequence[tuple[str, Mapping[str, str]]]
-"""Rows of a manifest: the place of each in messages, and its texts by column."""
-
 
 @dataclass(frozen=True)
 class RecordedItem:

@@ -109,19 +109,25 @@ def haspi_report(
     1.0
     """
     settings: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl, "seed": seed}
+    if conditions and (before is not None or after is not None):
+        raise ValueError(
+            "expected either the folders before and after or named conditions, got both; name all "
+            "folders as conditions"
+        )
     folders = {BEFORE: before, AFTER: after, **(conditions or {})}
-    folders_of_outputs = {name: folder for name, folder in folders.items() if folder is not None}
-    if manifest is not None:
-        if clean is not None or folders_of_outputs:
-            raise ValueError(
-                "expected either a manifest or folders, got both; leave out one of them"
-            )
+    outputs = {name: folder for name, folder in folders.items() if folder is not None}
+    if manifest is None and clean is not None and outputs:
+        if root is not None:
+            raise ValueError("root has no effect on folders; leave it out, or pass a manifest")
+        ears = _read_ears_of_folders(audiogram, audiograms)
+        recordings = read_folders(clean, outputs, ears, **settings)
+    elif manifest is not None and clean is None and not outputs:
         recordings = read_recordings(manifest, root, audiogram, audiograms, **settings)
     else:
-        _check_folders(clean, before, after, conditions, root)
-        assert clean is not None
-        ears = _read_ears_of_folders(audiogram, audiograms)
-        recordings = read_folders(clean, folders_of_outputs, ears, **settings)
+        raise ValueError(
+            "expected either a manifest, or the folder clean with the folder after (and before) or "
+            "with named conditions; pass one of the two"
+        )
     names = list(dict.fromkeys(name for r in recordings for name in r.outputs))
     if baseline is not None:
         if baseline not in names:
@@ -140,22 +146,6 @@ def haspi_report(
         listen=listen,
         **running,
     )
-
-
-def _check_folders(clean: Any, before: Any, after: Any, conditions: Any, root: Any) -> None:
-    """Raise ValueError unless the folders of clean speech and of outputs are complete."""
-    if conditions is not None and (before is not None or after is not None):
-        raise ValueError(
-            "expected either the folders before and after or named conditions, got both; name all "
-            "folders as conditions"
-        )
-    if clean is None or (after is None and not conditions):
-        raise ValueError(
-            "expected either a manifest, or the folder clean with the folder after (and before) or "
-            "with named conditions; pass one of the two"
-        )
-    if root is not None:
-        raise ValueError("root has no effect on folders; leave it out, or pass a manifest")
 
 
 def _read_ears_of_folders(

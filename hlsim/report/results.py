@@ -295,7 +295,9 @@ def detail_section(
 
 
 def score_details(evaluation: Evaluation) -> Section:
-    """Return the section "Details" of a page about scores, with comparisons, and means by SNR and degree of loss.
+    """Return the section "Details" of a page about scores.
+
+    It has all comparisons, and means by SNR and by degree of loss.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report

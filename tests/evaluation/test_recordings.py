@@ -216,7 +216,7 @@ def test_thresholds_between_the_eight_frequencies_are_in_the_key(corpus: Path) -
         ({"audiogram": N4, "measures": ["loudness"]}, "unknown measures: loudness"),
         ({"audiogram": N4, "baseline": "unaided"}, "no condition 'unaided'"),
         ({"audiogram": N4, "better_ear": True}, "one left and one right ear"),
-        ({"audiogram": N4, "manifest": "study.csv"}, "a manifest or folders, got both"),
+        ({"audiogram": N4, "manifest": "study.csv"}, "expected either a manifest, or"),
     ],
 )
 def test_invalid_settings_are_rejected_before_scoring(

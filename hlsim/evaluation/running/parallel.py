@@ -109,25 +109,20 @@ def run_parallel(
         finished = 0
         alone = len(tasks) if in_processes and jobs == 1 else 0
         while finished < len(tasks):
-            if not alone:
-                try:
-                    for result in pool(map(call, tasks[finished:])):
-                        yield tasks[finished], result
-                        finished += 1
-                except Exception as error:
-                    if type(error).__name__ not in DEAD_PROCESS_ERRORS:
-                        raise
-                    alone = _TASKS_IN_FLIGHT * joblib.cpu_count()
-                continue
+            workers, stop = (single_pool, finished + 1) if alone else (pool, len(tasks))
             try:
-                [result] = single_pool([call(tasks[finished])])
+                for result in workers(map(call, tasks[finished:stop])):
+                    yield tasks[finished], result
+                    finished += 1
             except Exception as error:
                 if type(error).__name__ not in DEAD_PROCESS_ERRORS:
                     raise
-                result = Crash()
-            yield tasks[finished], result
-            finished += 1
-            alone -= 1
+                if not alone:
+                    alone = _TASKS_IN_FLIGHT * joblib.cpu_count() + 1
+                else:
+                    yield tasks[finished], Crash()
+                    finished += 1
+            alone = max(0, alone - 1)
 
 
 def _connect(scheduler: str) -> Any:
