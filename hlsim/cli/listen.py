@@ -61,7 +61,7 @@ def _listen(options: argparse.Namespace) -> None:
     simulator = cache(partial(build_simulator, options))
     aid = cache(partial(build_compensator, options))
 
-    def perceive(waveform: Tensor, rate: int) -> dict[str, Tensor]:
+    def make_sounds(waveform: Tensor, rate: int) -> dict[str, Tensor]:
         sounds = {"original": waveform}
         for name, ear in ears.items():
             sounds[f"{name} unaided" if options.compensator else name] = simulator(rate)(
@@ -84,19 +84,19 @@ def _listen(options: argparse.Namespace) -> None:
     )
     with ProgressLine("files", "starting", "writing the page"):
         files = track(options.files, "files", len(options.files))
-        sections = [_make_section(options, file, perceive) for file in files]
+        sections = [_make_section(options, file, make_sounds) for file in files]
         page = Page(title, text + " ".join(thresholds), sections)
         write_atomically(options.out, page.html())
     print(f"The page: {options.out.resolve().as_uri()}")
 
 
-def _make_section(options: argparse.Namespace, file: Path, perceive: Any) -> Section:
+def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> Section:
     """Return the section of a file, with its player.
 
     Args:
         options: Options of the command.
         file: Audio file.
-        perceive: Function from samples at the scale of the file and their rate in Hz to the sounds
+        make_sounds: Function from samples at the scale of the file and their rate in Hz to the sounds
             by their labels.
     """
     import torch
@@ -113,7 +113,7 @@ def _make_section(options: argparse.Namespace, file: Path, perceive: Any) -> Sec
     stop = min(recording.samples, max(1, round(options.seconds * rate)))
     (waveform,) = read_parts(recording, [(0, stop)])
     with torch.no_grad():
-        sounds = perceive(waveform * 10.0 ** ((target_level - level) / 20.0), rate)
+        sounds = make_sounds(waveform * 10.0 ** ((target_level - level) / 20.0), rate)
     gain = gain_to_pascals(options.full_scale_spl)
     player = make_player({"": {label: gain * sound for label, sound in sounds.items()}}, rate)
     text = f"{file}, {target_level:.0f} dB SPL, {stop / rate:.1f} s"

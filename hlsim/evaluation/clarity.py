@@ -178,7 +178,8 @@ def evaluate_scenes(
     levels = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
     conditions = _make_conditions(aids, folders, enhancers, linked, **levels)
     look_ahead_ms = {
-        c.name: _measure_look_ahead(c, pairs[0], rate, microphones) for c in conditions
+        c.name: _measure_look_ahead(c, pairs[0], rate, microphones)
+        for c in track(conditions, "conditions", len(conditions))
     }
     write = partial(_write_signals, Path(out), conditions, folders, microphones, rate)
     parallel = {name: running[name] for name in ("jobs", "dask") if name in running}

@@ -27,8 +27,8 @@ from hlsim.report.results import (
     Columns,
     comparison_table,
     detail_section,
+    fact_tables,
     score_columns,
-    split_rows,
     statistic,
     summary_table,
 )
@@ -66,6 +66,13 @@ _COLUMN_NOTES = (
     "ear, so that p is too small and intervals are too narrow; the tests of the means of each "
     "ear take that into account. The two ears of a person count as two.",
 )
+_FACTS = {
+    "input_level": "By input level (dB SPL)",
+    "severity": "By MSBG's degree of loss",
+    "snr": "By SNR (dB)",
+}
+"""Captions of tables by the property of items that they show."""
+
 _GAP = (
     "The loss is that of HearingLossLoss with the criterion bands, once with the Neuro-MSBG "
     "{simulator} and once with the exact MSBG. A compensator that has learned to exploit the "
@@ -106,7 +113,9 @@ def compensators_page(evaluation: Evaluation) -> Page:
         if c.planned
     ]
     names = evaluation.aids
-    tables = [summary_table(_GROUPS[name], *_rows(group)) for name, group in groups.items()]
+    tables = [
+        summary_table(_GROUPS[name], group.table, _columns(group)) for name, group in groups.items()
+    ]
     means = [
         picture
         for name, group in groups.items()
@@ -137,9 +146,9 @@ def _about(evaluation: Evaluation) -> str:
     )
 
 
-def _rows(group: Evaluation, fact: str = "") -> tuple[Any, Columns]:
-    """Return the rows and the columns of a table of scores, see ``split_rows``."""
-    return split_rows(group.table, fact), {**score_columns(group), **_COLUMNS}
+def _columns(group: Evaluation) -> Columns:
+    """Return the columns of a table of scores."""
+    return {**score_columns(group), **_COLUMNS}
 
 
 def _details(evaluation: Evaluation) -> Section:
@@ -147,16 +156,8 @@ def _details(evaluation: Evaluation) -> Section:
     gap = _GAP.format(simulator=evaluation.settings["simulator"])
     sections = []
     for name, group in evaluation.groups.items():
-        tables = [
-            summary_table(f"By {title}", *_rows(group, fact))
-            for fact, title in {
-                "input_level": "input level (dB SPL)",
-                "severity": "MSBG's degree of loss",
-                "snr": "SNR (dB)",
-            }.items()
-            if group.table[fact].nunique() > 1
-        ]
-        gaps = summary_table("Mean loss", split_rows(group.table), _GAP_COLUMNS)
+        tables = fact_tables(group.table, _columns(group), _FACTS)
+        gaps = summary_table("Mean loss", group.table, _GAP_COLUMNS)
         tests = comparison_table(
             [c for c in group.comparisons if c.after in group.aids],
             "All items; p adjusted by Holm within each measure but for a planned comparison",

@@ -96,7 +96,7 @@ def result_table(evaluation: Evaluation) -> Table:
         "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     }
     count = len(evaluation.items)
-    return summary_table(f"Means of {count} utterances", split_rows(evaluation.table), columns)
+    return summary_table(f"Means of {count} utterances", evaluation.table, columns)
 
 
 def _cards(evaluation: Evaluation) -> list[Card]:

@@ -20,7 +20,6 @@ from hlsim.report.results import (
     mean_level,
     score_columns,
     score_details,
-    split_rows,
     statistic,
     summary_table,
 )
@@ -75,8 +74,8 @@ def report_page(evaluation: Evaluation) -> Page:
     >>> report_page(evaluation).title
     'STOI: after'
     """
-    rows, columns = split_rows(evaluation.table), score_columns(evaluation)
-    tables = [summary_table("Means of all items", rows, columns)]
+    columns = score_columns(evaluation)
+    tables = [summary_table("Means of all items", evaluation.table, columns)]
     texts = [GAIN_NOTE] if "haspi" in evaluation.scores else []
     headline = evaluation.headline
     if headline is None:
@@ -164,4 +163,4 @@ def _conditions_table(evaluation: Evaluation) -> Table:
     caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
     look_ahead = evaluation.details["look_ahead_ms"]
     columns["Look-ahead (ms)"] = (lambda rows: look_ahead[rows["condition"].iloc[0]], ".1f")
-    return summary_table(caption, split_rows(table), columns)
+    return summary_table(caption, table, columns)

@@ -132,28 +132,54 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
 
 
 def summary_table(
-    caption: str, rows: Mapping[str, DataFrame], columns: Columns, first: str = "Condition"
+    caption: str, table: DataFrame, columns: Columns, fact: str = "", first: str = "Condition"
 ) -> Table:
-    """Return a table with one row of statistics for each part of a study's table.
+    """Return a table with one row of statistics for each condition of a study.
 
     Args:
         caption: Caption of the table.
-        rows: Parts of the study's table, each under its name, see ``split_rows``.
+        table: Table of the study.
         columns: Statistics by the title of their column.
+        fact: Column by whose values the rows are split, too, see ``split_rows``.
         first: Title of the first column, which contains the names.
 
     >>> import pandas
-    >>> rows = {"unaided": pandas.DataFrame({"haspi": [0.2, 0.4]})}
+    >>> rows = pandas.DataFrame({"condition": ["unaided"] * 2, "haspi": [0.2, 0.4]})
     >>> summary_table("Means", rows, {"HASPI": (statistic("haspi"), ".2f")}).rows
     [['unaided', '0.30']]
     """
     cells = []
-    for name, part in rows.items():
+    for name, part in split_rows(table, fact).items():
         values = {
             title: format_number(compute(part), form) for title, (compute, form) in columns.items()
         }
         cells.append({first: name, **values})
     return Table.from_rows(caption, cells)
+
+
+def fact_tables(
+    table: DataFrame, columns: Columns, captions: Mapping[str, str], first: str = "Items"
+) -> list[Table]:
+    """Return a table of statistics by each property of the items that has several values.
+
+    Args:
+        table: Table of the study.
+        columns: Statistics by the title of their column.
+        captions: Caption of the table by the column with the property, such as ``"snr"``.
+        first: Title of the first column, see ``summary_table``.
+
+    >>> import pandas
+    >>> rows = [("aid", 5.0, 0.2), ("aid", 0.0, 0.4)]
+    >>> table = pandas.DataFrame(rows, columns=["condition", "snr", "haspi"])
+    >>> captions, columns = {"snr": "By SNR", "ear": "By ear"}, {"HASPI": (statistic("haspi"), "")}
+    >>> [part.caption for part in fact_tables(table, columns, captions)]
+    ['By SNR']
+    """
+    return [
+        summary_table(caption, table, columns, fact, first)
+        for fact, caption in captions.items()
+        if fact in table and table[fact].nunique() > 1
+    ]
 
 
 def format_number(value: Any, form: str) -> str:
@@ -318,10 +344,8 @@ def score_details(evaluation: Evaluation) -> Section:
     if evaluation.settings.get("better_ear"):
         notes.append("Each score is that of the better ear, by each measure.")
     sections = _comparison_sections(evaluation)
-    facts = {"snr": ("SNR (dB)", []), "severity": ("degree of loss", [SEVERITY_NOTE])}
-    for fact, (title, texts) in facts.items():
-        if fact in evaluation.table and evaluation.table[fact].nunique() > 1:
-            rows = split_rows(evaluation.table, fact)
-            table = summary_table(f"Means by {title}", rows, score_columns(evaluation))
-            sections.append(Section(f"By {title}", texts, [table]))
+    captions = {"snr": "Means by SNR (dB)", "severity": "Means by degree of loss"}
+    tables = fact_tables(evaluation.table, score_columns(evaluation), captions)
+    if tables:
+        sections.append(Section("Parts of the items", [SEVERITY_NOTE], tables))
     return detail_section(evaluation, sections, notes)

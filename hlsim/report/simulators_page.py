@@ -14,7 +14,7 @@ from hlsim.report.results import (
     Columns,
     comparison_table,
     detail_section,
-    split_rows,
+    fact_tables,
     statistic,
     summary_table,
 )
@@ -80,19 +80,15 @@ def simulators_page(evaluation: Evaluation) -> Page:
     """
     sections, details = [], []
     for treatment, group in evaluation.groups.items():
-        title, rows = _TREATMENTS[treatment], split_rows(group.table)
-        table = summary_table("Simulators side by side", rows, COLUMNS, first="Simulator")
+        title = _TREATMENTS[treatment]
+        caption = "Simulators side by side"
+        table = summary_table(caption, group.table, COLUMNS, first="Simulator")
         comparisons = []
         if group.comparisons:
             caption = "SNR compared with the first; p adjusted by Holm"
             comparisons.append(comparison_table(group.comparisons, caption))
         sections.append(Section(title, tables=[table, *comparisons]))
-        fact_tables = [
-            summary_table(caption, split_rows(group.table, fact), COLUMNS, first="Items")
-            for fact, caption in _FACTS.items()
-            if group.table[fact].nunique() > 1
-        ]
-        details.append(Section(title, tables=fact_tables))
+        details.append(Section(title, tables=fact_tables(group.table, COLUMNS, _FACTS)))
     sections += listening_sections(evaluation, _LISTEN)
     sections.append(detail_section(evaluation, details, [_about(evaluation)]))
     return Page("Simulators", _verdict(evaluation), sections)

@@ -70,7 +70,7 @@ def test_verdict_and_scores_come_first_and_details_are_folded(tmp_path: Path) ->
     titles = [section.title for section in page.sections]
     assert titles == ["Scores", "Listen", "Details"] and page.sections[-1].folded
     details = [section.title for section in page.sections[-1].sections]
-    assert details[:3] == ["All comparisons", "Items and listeners", "By SNR (dB)"]
+    assert details[:3] == ["All comparisons", "Items and listeners", "Parts of the items"]
     listen = page.sections[1].sections
     labels = [[sound.label for sound in section.player.sounds] for section in listen]
     assert labels == [["normal ear (the goal)", *NAMES]] * 2
