@@ -96,8 +96,8 @@ def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> 
     Args:
         options: Options of the command.
         file: Audio file.
-        make_sounds: Function from samples at the scale of the file and their rate in Hz to the sounds
-            by their labels.
+        make_sounds: Function from samples at the scale of the file and their rate in Hz to the
+            sounds by their labels.
     """
     import torch
 
