@@ -50,6 +50,9 @@ class Triplets(NamedTuple):
         noise: Noise with RMS 1 and the long-term spectrum of the digits, (triplets, time).
         internal: Noise of a normal ear in pascals, (triplets, time).
         digits: Spoken digits, (triplets, 3).
+
+    >>> draw_triplets(2, torch.Generator().manual_seed(0)).speech.shape
+    torch.Size([2, 48000])
     """
 
     speech: Tensor

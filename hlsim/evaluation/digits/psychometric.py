@@ -68,7 +68,7 @@ def estimate_threshold(snr: Array, right: Array, asked: int = 3) -> Estimate:
 
     >>> snr = np.linspace(-20.0, 20.0, 200)
     >>> estimate = estimate_threshold(snr, np.where(snr > 0.0, 3.0, 0.0))
-    >>> abs(estimate.value) < 1.0
+    >>> abs(estimate.value) < 2.0
     True
     """
     points = np.meshgrid(_THRESHOLDS, _SLOPES, _LAPSES, indexing="ij")

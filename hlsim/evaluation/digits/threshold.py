@@ -67,6 +67,11 @@ class ReceptionThreshold:
         benefit: Unaided minus aided threshold in dB, or None without an aid. Its interval counts
             the errors of both thresholds as independent, although both come from the same triplets.
         pta: Pure-tone average in dB HL, the mean threshold at 500, 1000, 2000 and 4000 Hz.
+
+    >>> import hlsim
+    >>> result = hlsim.reception_threshold("N2", simulator="attenuation", triplets=30)
+    >>> result.aided is None
+    True
     """
 
     unaided: Estimate
@@ -169,7 +174,7 @@ def reception_threshold(
             sliders without an aid, or the output of the aid has another shape or is not finite.
 
     >>> import hlsim
-    >>> result = hlsim.reception_threshold("N3", "nalr", triplets=30)
+    >>> result = hlsim.reception_threshold("N3", "nalr", simulator="attenuation", triplets=30)
     >>> bool(result.unaided.low < result.unaided.value < result.unaided.high)
     True
     """
