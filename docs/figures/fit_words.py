@@ -1,26 +1,28 @@
 """Fit and cross-validate the curve from HASPI to words in ``hlsim/metrics/words.json``.
 
-    python docs/figures/fit_words.py [FILE]
+    python docs/figures/fit_words.py TABLE [FILE]
 
-It requires pyclarity, takes about two minutes, and writes the fit to FILE. The data are those of
-the Clarity prediction challenges in pyclarity: responses of hearing-impaired listeners to sentences
-through ten aids (CPC1), and HASPI v2 of the better ear of the same signals, for standard ears of
-three severities (CPC3).
+It takes some minutes, and writes the fit to FILE. TABLE is a CSV file with one row per response
+of a listener to a sentence: ``challenge`` (CEC1 or CEC2), ``listener``, ``system`` (hearing aid),
+``scene`` (sentence), ``words_correct_percent`` and ``haspi_better_ear``, its HASPI v2. The shipped
+fit is that of responses from Clarity's first two enhancement challenges, which their
+prediction challenges publish. They are not part of hlsim.
 
 The number of understood words of a sentence is beta-binomial. The logit of its mean is
 
-    intercept + within (h - m) + between (m - 0.5) + listener + slope (h - 0.5) + aid
+    intercept + within (h - m) + between (m - 0.5) + challenge c + listener + slope (h - 0.5) + aid
 
-where h is the HASPI of the sentence, and m the mean HASPI of its aid. Listeners, their slopes and
-aids have normal deviations. ``between`` differs from ``within``, because two aids whose mean HASPI
-differs by 0.1 differ by more words than two sentences of one aid do. The fit maximises Laplace's
-approximation of the marginal likelihood.
+where h is the HASPI of the sentence, m the mean HASPI of its aid, and c = 1 for the first and -1
+for the second challenge, whose scenes were harder to understand at the same HASPI. The intercept is
+therefore that of the mean of the two. Listeners, their slopes and aids have normal deviations.
+``between`` differs from ``within``, because two aids whose mean HASPI differs by 0.1 differ by more
+words than two sentences of one aid do. The fit maximises Laplace's approximation of the marginal
+likelihood.
 """
 
 import json
 import sys
 from collections.abc import Iterator
-from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -32,8 +34,14 @@ from scipy.special import betaln, digamma, expit, polygamma
 
 from hlsim.metrics.words import Curve, simulate_proportions
 
-START = (0.4, 3.2, 5.0, 0.5, -0.6, -1.0, -1.0)
+FIXED = 4
+"""Number of fixed coefficients, of which the last is the effect of the challenge."""
+
+START = (0.4, 3.2, 5.0, 0.0, 0.5, -0.6, -1.0, -1.0)
 """Initial values: fixed coefficients, and logarithms of the dispersion and of three deviations."""
+
+WORDS = range(7, 11)
+"""Possible numbers of words in a sentence."""
 
 
 class Fit(NamedTuple):
@@ -43,28 +51,41 @@ class Fit(NamedTuple):
     start: np.ndarray
 
 
-def read_responses() -> pd.DataFrame:
-    """Read one row per response: listener, system, hits, n_words, haspi and its mean per system."""
-    spec = find_spec("recipes")
-    if spec is None or not spec.submodule_search_locations:
-        raise SystemExit("pyclarity is not installed: pip install 'pyclarity==0.9.*'")
-    recipes = Path(spec.submodule_search_locations[0])
-    haspi_path = recipes / "cpc3/baseline/precomputed_haspi/clarity_data.train.haspi.jsonl"
-    with haspi_path.open() as file:
-        scores = {row["signal"]: row["haspi"] for row in map(json.loads, file)}
-    responses_path = recipes / "cpc1/test_listener_responses/CPC1.test.json"
-    rows = pd.DataFrame(json.loads(responses_path.read_text()))
-    rows["haspi"] = ("CEC1_" + rows.system + "_" + rows.scene + "_" + rows.listener).map(scores)
-    rows = rows.dropna(subset="haspi").reset_index(drop=True)
+def read_responses(path: str | Path) -> pd.DataFrame:
+    """Read one row per response: listener, system, sign, hits, n_words, haspi, mean per system.
+
+    ``challenge`` is 1 or 2, and ``sign`` is 1 for the first challenge and -1 for the second one.
+    """
+    rows = pd.read_csv(path)
+    rows["system"] = rows.challenge + " " + rows.system
+    rows["challenge"] = rows.challenge.map({"CEC1": 1, "CEC2": 2})
+    rows["sign"] = 3.0 - 2.0 * rows.challenge
+    rows["haspi"] = rows.haspi_better_ear
     rows["mean"] = rows.groupby("system").haspi.transform("mean")
+    scenes = rows.groupby(["challenge", "scene"]).words_correct_percent
+    rows["n_words"] = scenes.transform(count_words)
+    rows["hits"] = np.rint(rows.n_words * rows.words_correct_percent / 100.0)
     return rows
+
+
+def count_words(percentages: pd.Series) -> int:
+    """Return the smallest number of words of a sentence that the shares of its words allow.
+
+    Where nobody, or everybody, understood each word, it is 8, near the mean.
+    """
+    shares = percentages.to_numpy() / 100.0
+    if set(shares) <= {0.0, 1.0}:
+        return 8
+    errors = [np.abs(shares * words - np.rint(shares * words)).max() for words in WORDS]
+    matching = [words for words, error in zip(WORDS, errors, strict=True) if error < 2e-3]
+    return matching[0] if matching else WORDS[int(np.argmin(errors))]
 
 
 def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fit:
     """Fit the curve to responses, from initial values."""
     hits, words = rows.hits.to_numpy(float), rows.n_words.to_numpy(float)
     haspi, mean = rows.haspi.to_numpy(), rows["mean"].to_numpy()
-    fixed = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1)
+    fixed = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5, rows.sign], 1)
     listeners, systems = (
         pd.get_dummies(rows[name]).to_numpy(float) for name in ("listener", "system")
     )
@@ -92,9 +113,9 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
             matrix of the deviations.
         """
         nonlocal mode
-        base, dispersion = fixed @ x[:3], float(np.exp(x[3]))
+        base, dispersion = fixed @ x[:FIXED], float(np.exp(x[FIXED]))
         design = np.concatenate(
-            [np.exp(s) * group for s, group in zip(x[4:], groups, strict=True)], 1
+            [np.exp(s) * group for s, group in zip(x[FIXED + 1 :], groups, strict=True)], 1
         )
 
         def joint(deviations: np.ndarray) -> float:
@@ -118,23 +139,27 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
         hessian = design.T @ (weights[:, None] * design) + np.eye(len(mode))
         return float(0.5 * np.linalg.slogdet(hessian)[1]) - value
 
-    bounds = [(-15.0, 15.0)] * 3 + [(-3.0, 4.0)] + [(-5.0, 2.0)] * 3
+    bounds = [(-15.0, 15.0)] * FIXED + [(-3.0, 4.0)] + [(-5.0, 2.0)] * 3
     x = minimize(negative_marginal, np.array(start), method="L-BFGS-B", bounds=bounds).x
     _, weights, design = at_mode(x)
     full_design = np.concatenate([fixed, design], 1)
-    prior_precision = np.diag([0.0] * 3 + [1.0] * len(mode))
+    prior_precision = np.diag([0.0] * FIXED + [1.0] * len(mode))
     information = full_design.T @ (weights[:, None] * full_design) + prior_precision
     covariance = np.linalg.inv(information)[:3, :3]
-    scales = np.exp(x[3:])
-    return Fit(Curve(tuple(x[:3]), tuple(map(tuple, covariance)), *scales, float(words.mean())), x)
+    *coefficients, challenge = x[:FIXED]
+    dispersion, *deviations = np.exp(x[FIXED:])
+    table = tuple(map(tuple, covariance))
+    curve = Curve(
+        tuple(coefficients), table, dispersion, *deviations, float(words.mean()), challenge
+    )
+    return Fit(curve, x)
 
 
 def predict(curve: Curve, rows: pd.DataFrame) -> np.ndarray:
     """Predict the share of words understood of each sentence, averaged over listeners and aids."""
     haspi, mean = rows.haspi.to_numpy(), rows["mean"].to_numpy()
-    logit = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1) @ np.array(
-        curve.coefficients
-    )
+    predictors = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5, rows.sign], 1)
+    logit = predictors @ np.array([*curve.coefficients, curve.challenge])
     variance = curve.listener**2 + curve.aid**2 + (curve.listener_slope * (haspi - 0.5)) ** 2
     return expit(logit / np.sqrt(1.0 + 0.346 * variance))  # nearly the mean over a normal law
 
@@ -152,16 +177,51 @@ def differences_between_aids(
     Yields:
         The measured difference in the share of words, and simulated differences.
     """
-    for _, responses in rows.groupby("listener"):
+    for (_, challenge), responses in rows.groupby(["listener", "challenge"]):
         aids = dict(tuple(responses.groupby("system")))
         names = sorted(aids, key=lambda name: aids[name]["mean"].iloc[0])
         for before, after in combinations(names, 2):
             if system is not None and system not in (before, after):
                 continue
             pair = [(aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)]
-            measured = aids[after].correctness.mean() - aids[before].correctness.mean()
-            first, second = simulate_proportions(curve, pair)
-            yield measured / 100.0, second - first
+            shares = [aids[name].words_correct_percent.mean() for name in (before, after)]
+            of_challenge = curve.of_challenge(challenge)
+            first, second = simulate_proportions(of_challenge, pair)
+            yield (shares[1] - shares[0]) / 100.0, second - first
+
+
+def leave_out_systems(rows: pd.DataFrame, start: np.ndarray) -> pd.DataFrame:
+    """Predict each aid with the curve of the others, in its challenge and in any.
+
+    Args:
+        rows: Responses.
+        start: Initial values of the fits.
+
+    Returns:
+        One row per aid: challenge, system, mean HASPI, measured share of words, predicted shares,
+        and the share of its listeners whose own share lies in the interval of 90 %.
+    """
+    table = []
+    for system, responses in rows.groupby("system"):
+        curve = fit(rows[rows.system != system].reset_index(drop=True), start).curve
+        challenge, mean = responses.challenge.iloc[0], responses["mean"].iloc[0]
+        row = {"challenge": challenge, "system": system, "haspi": mean}
+        row["measured"] = (responses.hits / responses.n_words).mean()
+        for name, variant in (
+            ("in its challenge", curve.of_challenge(challenge)),
+            ("in any", curve),
+        ):
+            [shares] = simulate_proportions(variant, [(responses.haspi.to_numpy(), mean)])
+            row[f"predicted {name}"] = shares.mean()
+            is_inside = []
+            for _, part in responses.groupby("listener"):
+                [shares] = simulate_proportions(variant, [(part.haspi.to_numpy(), mean)])
+                low, high = np.quantile(shares, [0.05, 0.95])
+                is_inside.append(low <= (part.hits / part.n_words).mean() <= high)
+            row[f"inside {name}"] = np.mean(is_inside)
+        row["listeners"] = len(is_inside)
+        table.append(row)
+    return pd.DataFrame(table)
 
 
 def cross_validate(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]:
@@ -206,8 +266,8 @@ def cross_validate(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, 
     }
 
 
-def main(path: str | None = None) -> None:
-    rows = read_responses()
+def main(table: str, path: str | None = None) -> None:
+    rows = read_responses(table)
     result = fit(rows)
     listeners, systems = rows.listener.nunique(), rows.system.nunique()
     print(f"{len(rows)} responses, {listeners} listeners, {systems} aids\n{result.curve}")
@@ -216,6 +276,7 @@ def main(path: str | None = None) -> None:
             json.dumps(result.curve._asdict()), parse_float=lambda digits: round(float(digits), 6)
         )
         Path(path).write_text(json.dumps(rounded, indent=2) + "\n")
+    print(leave_out_systems(rows, result.start).round(3).to_string())
     for by in ("listener", "system"):
         print(f"without each {by} in turn: {cross_validate(rows, by, result.start)}", flush=True)
 

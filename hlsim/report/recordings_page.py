@@ -107,9 +107,9 @@ def _words(evaluation: Evaluation, c: ConditionComparison) -> list[str]:
         f"In words: a listener would understand {before} % of the words of these sentences "
         f"under {c.before} and {after} % under {c.after}, a change of {after - before:+d} points. "
         f"For nine of ten listeners the change lies between {low:+d} and {high:+d} points.",
-        "Words are predicted from HASPI by a curve that was fitted to 22 listeners with ten "
-        "hearing aids (hlsim.metrics.words). HASPI ranks aids well, but says little about single "
-        "listeners.",
+        "Words are predicted from HASPI by a curve that was fitted to 26 listeners with "
+        "twelve hearing aids (hlsim.metrics.words). HASPI ranks aids well, but says little about "
+        "single listeners.",
     ]
 
 
