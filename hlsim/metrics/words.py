@@ -127,9 +127,7 @@ def load_curve() -> Curve:
     return Curve(**json.loads(path.read_text(encoding="utf-8")))
 
 
-def words_change(
-    before: ArrayLike, after: ArrayLike, challenge: int | None = None
-) -> WordsChange:
+def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = None) -> WordsChange:
     """Predict from HASPI how many words a new listener understands with two aids.
 
     The interval of 90 % contains the differences between listeners, aids and sentences, and the

@@ -43,6 +43,19 @@ def test_smearing_equals_pyclaritys_sample_by_sample(severity: str, length: int)
 
 
 @pytest.mark.parametrize("severity", BROADENING)
+@pytest.mark.parametrize("hz", [700.0, 1300.0])
+def test_a_steady_tone_stays_as_narrow_as_it_is(severity: str, hz: float) -> None:
+    time = torch.arange(44100, dtype=torch.float64) / 44100.0
+    smeared = smear(torch.sin(2.0 * np.pi * hz * time), torch.from_numpy(smearing_matrix(severity)))
+    window = torch.hann_window(32768, dtype=torch.float64)
+    power = torch.fft.rfft(smeared[2000:][:32768] * window).abs().square().numpy()
+    distance = np.abs(np.fft.rfftfreq(32768, 1.0 / 44100.0) - hz)
+    # The frames keep the phase of the tone, so that they add up to it again.
+    assert power[distance > 10.0].sum() < 1e-4 * power.sum()
+    assert power[(distance > 10.0) & (distance < 600.0)].sum() < 1e-6 * power.sum()
+
+
+@pytest.mark.parametrize("severity", BROADENING)
 def test_gradients_are_exact(severity: str) -> None:
     wave = torch.randn(1, 320, dtype=torch.float64, requires_grad=True)
     matrix = torch.from_numpy(smearing_matrix(severity))

@@ -1,0 +1,468 @@
+"""Compare simulated ears with people: uncomfortable levels, tuning, and words at a HASPI.
+
+    python examples/people.py PEOPLE [OUT]
+
+It prints the tables of docs/people.md and draws its figures to the folder OUT, by default
+``people``. PEOPLE is a folder with up to three tables; a comparison without its table is left out.
+
+- ``thresholds_in_noise.csv``: ``person``, thresholds (``left_500``) and uncomfortable levels
+  (``ucl_left_500``) in dB HL, such as those of the Oldenburg Hearing Health Record (Jafri et al.
+  2025, doi 10.5281/zenodo.16919812, CC BY 4.0).
+- ``tuning.csv``: ``ear``, ``group`` (normal or impaired), ``frequency_hz``,
+  ``threshold_500ms_db_spl`` and ``tuning_depth_db``, as measured by Lecluyse et al. (2013).
+- ``clarity_responses.csv``: see ``docs/figures/fit_words.py``.
+
+It takes about ten minutes on one core. Simulated values are kept in OUT and used
+again; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers
+only, and the tables show the others, unless they say otherwise.
+"""
+
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import people_recruitment as recruitment
+import people_tuning as tuning
+from matplotlib.figure import Figure
+from PIL import Image
+from torch import nn
+
+from hlsim import MSBG, Audiogram, load_pretrained
+from hlsim.audiogram.scale import SEVERITY_LIMITS
+from hlsim.simulators import Attenuation
+
+sys.path.append(str(Path(__file__).parents[1] / "docs" / "figures"))
+import fit_words
+
+SIMULATORS: dict[str, Callable[[], nn.Module]] = {
+    "MSBG": MSBG,
+    "MSBG without smearing": lambda: MSBG(smearing=False),
+    "linear ear": Attenuation,
+    "neuro-msbg": lambda: load_pretrained("neuro-msbg"),
+}
+
+TUNED = ("MSBG", "MSBG without smearing", "linear ear")
+"""Simulators whose tuning is measured. Networks have not learned from tones that short."""
+
+COLOURS = dict(zip(SIMULATORS, ("tab:blue", "tab:cyan", "tab:gray", "tab:purple"), strict=True))
+
+LOSS_GROUPS = ((-10, 20), (20, 40), (40, 60), (60, 101))
+"""Thresholds in dB HL from and below which loudness is compared."""
+
+TUNING_GROUPS = ((-20, 20), (20, 30), (30, 40), (40, 50), (50, 75))
+"""Thresholds in dB SPL from and below which tuning is compared."""
+
+INTENDED = {"intended smearing": False, "intended, continuous": True}
+"""Calculated tuning by name, and whether it follows the loss continuously."""
+
+FULL_RECRUITMENT_SPL = 105.0
+"""Level in dB SPL at which MSBG's loudness is normal."""
+
+
+def is_fitted(names: pd.Series) -> pd.Series:
+    """Return which of the persons or ears, such as P013, have odd numbers: they are fitted to."""
+    return names.str[1:].astype(int) % 2 == 1
+
+
+def simulate(
+    path: Path,
+    keys: pd.DataFrame,
+    simulators: Sequence[str],
+    compute: Callable[[nn.Module], np.ndarray],
+) -> None:
+    """Add one column per simulator to a table, unless a file of an earlier run has them.
+
+    Args:
+        path: File of the simulated values.
+        keys: Columns that identify the rows, to which the simulated values are added.
+        simulators: Names of the simulators.
+        compute: Function that returns the values of all rows for a simulator.
+    """
+    names = [*keys.columns]
+    if path.is_file():
+        stored = pd.read_csv(path)
+        if len(stored) == len(keys) and (stored[names].to_numpy() == keys.to_numpy()).all():
+            return
+    table = keys.copy()
+    for name in simulators:
+        print(f"simulating {path.stem}: {name}", file=sys.stderr, flush=True)
+        table[name] = compute(SIMULATORS[name]())
+    table.to_csv(path, index=False)
+
+
+def print_table(title: str, table: pd.DataFrame) -> None:
+    """Print a table in Markdown."""
+    print(f"\n{title}\n")
+    print("| " + " | ".join(table.columns) + " |")
+    print("|" + "---|" * len(table.columns))
+    for row in table.itertuples(index=False):
+        print("| " + " | ".join(map(str, row)) + " |")
+
+
+def in_groups(
+    values: pd.Series, groups: tuple[tuple[int, int], ...]
+) -> list[tuple[str, pd.Series]]:
+    """Return a title and a mask of the values per group."""
+    return [(f"{low} to {high}", (values >= low) & (values < high)) for low, high in groups]
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Save a figure with 48 colours, which need a third of the space."""
+    data = BytesIO()
+    figure.savefig(data, dpi=110, format="png")
+    picture = Image.open(data).convert("RGB").quantize(48, Image.Quantize.MAXCOVERAGE)
+    picture.save(path, optimize=True)
+
+
+# Loudness
+
+
+def simulated_levels(rows: pd.DataFrame, out: Path) -> tuple[pd.DataFrame, dict[int, float]]:
+    """Add the UCL of each simulated ear, and return the UCL of the normal ear per frequency, too.
+
+    The latter is that of a censored line at 0 dB HL through the persons with odd numbers.
+    """
+    odd = rows[is_fitted(rows.person)]
+    normal = {int(hz): float(censored_line(part).coefficients[0]) for hz, part in odd.groupby("hz")}
+
+    def compute(simulator: nn.Module) -> np.ndarray:
+        levels = np.empty(len(rows))
+        for hz, ucl in normal.items():
+            is_hz = (rows.hz == hz).to_numpy()
+            ears = list(rows.audiogram[is_hz])
+            levels[is_hz] = recruitment.simulated_uncomfortable_levels(simulator, ears, hz, ucl)
+        return levels
+
+    path = out / "simulated-ucl.csv"
+    simulate(path, rows[["person", "ear", "hz", "threshold"]], [*SIMULATORS], compute)
+    stored = pd.read_csv(path)
+    return rows.assign(**{name: stored[name].to_numpy() for name in SIMULATORS}), normal
+
+
+def censored_line(rows: pd.DataFrame) -> recruitment.CensoredFit:
+    """Fit the line of UCL over the threshold."""
+    design = recruitment.line(rows.threshold.to_numpy())
+    return recruitment.fit_censored(design, rows.ucl.to_numpy())
+
+
+def slope_without_censored(rows: pd.DataFrame) -> float:
+    """Return the slope of the levels that were reached, as if there were no others."""
+    reached = rows[rows.ucl < recruitment.NOT_REACHED]
+    return float(np.polyfit(reached.threshold, reached.ucl, 1)[0])
+
+
+def simulated_slope(rows: pd.DataFrame, name: str) -> float:
+    return float(np.polyfit(rows.threshold, rows[name], 1)[0])
+
+
+def bias(rows: pd.DataFrame, name: str) -> float:
+    """Return the simulated level minus the measured one in dB, where some are not reached."""
+    simulated = rows[name].to_numpy()
+    limit = recruitment.NOT_REACHED - simulated
+    difference = rows.ucl.to_numpy() - simulated
+    constant = np.ones((len(rows), 1))
+    return -float(recruitment.fit_censored(constant, difference, limit).coefficients[0])
+
+
+def full_recruitment(rows: pd.DataFrame) -> float:
+    """Return the level in dB SPL of full recruitment with which MSBG would have people's slope.
+
+    In MSBG the slope is (R - level in the channels) / R, where R is the level of full recruitment.
+    The level in the channels follows from the slope of MSBG without smearing at 105 dB SPL.
+    """
+    channel_level = FULL_RECRUITMENT_SPL * (1.0 - simulated_slope(rows, "MSBG without smearing"))
+    slope = float(censored_line(rows).coefficients[1])
+    return recruitment.full_recruitment(channel_level, slope)
+
+
+def with_interval(
+    rows: pd.DataFrame, statistic: Callable[[pd.DataFrame], float], digits: int = 2
+) -> str:
+    """Return a statistic with its interval of 95 %, by bootstrap over persons."""
+    low, high = recruitment.bootstrap(rows, lambda part: [statistic(part)])[:, 0]
+    return f"{statistic(rows):.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def compare_recruitment(path: Path, out: Path) -> None:
+    """Compare uncomfortable levels of simulated ears with those of people."""
+    rows, normal = simulated_levels(recruitment.read_uncomfortable_levels(path), out)
+    print("\nFitted to persons with odd numbers: UCL of a normal ear in dB HL,", normal)
+    is_odd = is_fitted(rows.person)
+    lines = {}
+    for hz, part in rows[is_odd].groupby("hz"):
+        intercept, slope = lines[hz] = censored_line(part).coefficients
+        print(f"and the line of UCL over threshold: {hz} Hz {intercept:.1f} + {slope:.3f} T")
+    rows["line"] = [lines[row.hz] @ [1.0, row.threshold] for row in rows.itertuples()]
+
+    table = []
+    for hz, part in rows.groupby("hz"):
+        row = {
+            "Hz": hz,
+            "ears": len(part),
+            "not reached": f"{(part.ucl >= recruitment.NOT_REACHED).mean():.0%}",
+            "people": with_interval(part, lambda p: censored_line(p).coefficients[1]),
+            "people, left out": with_interval(part, slope_without_censored),
+        }
+        for name in SIMULATORS:
+            row[name] = f"{simulated_slope(part, name):.2f}"
+        row["full recruitment (dB SPL)"] = with_interval(part, full_recruitment, 0)
+        table.append(row)
+    print_table("Slope of UCL over threshold, dB per dB, all persons", pd.DataFrame(table))
+
+    even = rows[~is_odd]
+    names = [*SIMULATORS, "line"]
+    for title, column, groups in (
+        ("dB HL", "threshold", in_groups(even.threshold, LOSS_GROUPS)),
+        ("Hz", "hz", [(str(hz), even.hz == hz) for hz in normal]),
+    ):
+        table = []
+        for label, mask in [*groups, ("all", even[column].notna())]:
+            part = even[mask]
+            row = {title: label, "values": len(part)}
+            row["not reached"] = f"{(part.ucl >= recruitment.NOT_REACHED).mean():.0%}"
+            for name in names:
+                row[name] = with_interval(part, lambda p, name=name: bias(p, name), 1)
+            table.append(row)
+        print_table("UCL minus that of people in dB, even numbers", pd.DataFrame(table))
+
+    draw_recruitment(rows, out / "people-recruitment.png")
+
+
+def draw_recruitment(rows: pd.DataFrame, path: Path) -> None:
+    """Draw UCL over the threshold: people as means of groups, simulated ears as lines."""
+    figure = Figure(figsize=(9.2, 6.4), layout="constrained")
+    places = figure.subplots(2, 2).ravel()
+    random = np.random.default_rng(0)
+    for axes, (hz, part) in zip(places, rows.groupby("hz"), strict=False):
+        jitter = random.uniform(-1.5, 1.5, (2, len(part)))
+        axes.scatter(
+            part.threshold + jitter[0], part.ucl + jitter[1], s=4, color="tab:orange", alpha=0.3
+        )
+        points = np.array([-10.0, 100.0])
+        people = recruitment.line(points) @ censored_line(part).coefficients
+        axes.plot(points, people, color="tab:orange", linewidth=3, label="people, censored line")
+        centres = part.threshold.round(-1)
+        for name, colour in COLOURS.items():
+            means = part.groupby(centres)[name].mean()
+            axes.plot(means.index, means, color=colour, label=name)
+        axes.axhline(recruitment.NOT_REACHED, color="black", linewidth=0.5, linestyle=":")
+        axes.set(ylim=(60, 130), xlim=(-12, 102), title=f"{hz} Hz")
+        axes.set(xlabel="threshold (dB HL)", ylabel="uncomfortable level (dB HL)")
+    axes.legend(fontsize="small", loc="lower right")
+    save(figure, path)
+
+
+# Tuning
+
+
+def compare_tuning(path: Path, out: Path) -> None:
+    """Compare the tuning depth of simulated ears with that of people."""
+    rows = tuning.read_tuning(path)
+    stored = out / "simulated-tuning.csv"
+    ears, hz = list(rows.audiogram), list(rows.hz)
+    simulate(
+        stored,
+        rows[["ear", "hz"]],
+        TUNED,
+        lambda simulator: tuning.tuning_depths(simulator, ears, hz),
+    )
+    for name, values in pd.read_csv(stored)[[*TUNED]].items():
+        rows[name] = values.to_numpy()
+
+    for name, is_continuous in INTENDED.items():
+        rows[name] = tuning.intended_depths(
+            ears, hz, rows.hearing_level, rows["MSBG without smearing"].to_numpy(), is_continuous
+        )
+    names = [*TUNED, *INTENDED]
+
+    table = []
+    for frequency, part in rows.groupby("hz"):
+        row = {"Hz": frequency, "ears": len(part)}
+        row["line on the threshold"] = f"{-part.depth.corr(part.threshold):.2f}"
+        for name in names:
+            row[name] = correlation(part, name)
+        table.append(row)
+    print_table("r with the measured tuning depth", pd.DataFrame(table))
+
+    table = []
+    for label, mask in in_groups(rows.threshold, TUNING_GROUPS):
+        part = rows[mask]
+        row = {
+            "threshold (dB SPL)": label,
+            "values": len(part),
+            "people": f"{part.depth.mean():.1f}",
+        }
+        for name in names:
+            row[name] = f"{part[name].mean():.1f}"
+        table.append(row)
+    print_table("Mean tuning depth in dB, 0.5 to 4 kHz", pd.DataFrame(table))
+
+    is_odd = is_fitted(rows.ear)
+    table = []
+    for name in ["threshold", *names]:
+        row = {"predicted from": name}
+        for label, is_line in (("offset per frequency", False), ("line per frequency", True)):
+            if name == "threshold" and not is_line:
+                row[label] = "-"
+                continue
+            errors = [
+                held_out_errors(part, name, is_line, is_odd[part.index])
+                for _, part in rows.groupby("hz")
+            ]
+            row[label] = f"{np.sqrt(np.square(np.concatenate(errors)).mean()):.1f}"
+        table.append(row)
+    print_table("RMS error of the depth in dB, fitted to odd ears, even ears", pd.DataFrame(table))
+    compare_steps(rows, out)
+
+    table = []
+    for sound in ("tone", "noise"):
+        for frequency in (1000, 2000, 4000):
+            levels = tuning.passed_by_filters(sound, frequency, "severe")
+            row = {"sound": sound, "Hz": frequency}
+            titles = ("before smearing", "after smearing", "wide filter")
+            row |= {title: f"{level:.1f}" for title, level in zip(titles, levels, strict=True)}
+            table.append(row)
+    print_table("Part of a sound that passes a filter beside it, in dB", pd.DataFrame(table))
+
+
+def correlation(rows: pd.DataFrame, name: str) -> str:
+    """Return r of the measured with the simulated depth, or a dash if that does not vary."""
+    if rows[name].std() < 0.5:
+        return "-"
+    is_missing = rows[name].isna().sum()
+    return f"{rows.depth.corr(rows[name]):.2f}" + (f" ({is_missing} lost)" if is_missing else "")
+
+
+def held_out_errors(rows: pd.DataFrame, name: str, is_line: bool, is_odd: pd.Series) -> np.ndarray:
+    """Fit an offset or a line to the odd ears, and return the errors of the even ones in dB."""
+    rows = rows[rows[name].notna()]
+    odd, even = rows[is_odd[rows.index]], rows[~is_odd[rows.index]]
+    slope, offset = np.polyfit(odd[name], odd.depth, 1) if is_line else (1.0, np.nan)
+    if not is_line:
+        offset = (odd.depth - odd[name]).mean()
+    return (even.depth - offset - slope * even[name]).to_numpy()
+
+
+def compare_steps(rows: pd.DataFrame, out: Path) -> None:
+    """Estimate the change of the tuning depth at MSBG's limits of severity, and draw it."""
+    levels = {
+        *range(0, 81, 5),
+        *(round(limit) + side for limit in SEVERITY_LIMITS for side in (-1, 1)),
+    }
+    ears = [Audiogram((float(level),) * 8) for level in sorted(levels)]
+    keys = pd.DataFrame(
+        [(hz, ear.levels[0]) for hz in tuning.NOISE_SPECTRUM_LEVEL for ear in ears],
+        columns=["hz", "threshold"],
+    )
+    flat = ears * len(tuning.NOISE_SPECTRUM_LEVEL)
+    path = out / "simulated-tuning-flat.csv"
+    simulate(
+        path, keys, TUNED, lambda simulator: tuning.tuning_depths(simulator, flat, list(keys.hz))
+    )
+    simulated = pd.read_csv(path)
+
+    rows["mean loss"] = [mean_loss(ear) for ear in rows.audiogram]
+    rows["person"] = rows.ear
+    table = []
+    for name in ("depth", "MSBG", "MSBG without smearing", "intended smearing"):
+        row = {"tuning depth of": "people" if name == "depth" else name}
+        steps = estimate_steps(rows, name)
+        low, high = recruitment.bootstrap(rows, lambda part, name=name: estimate_steps(part, name))
+        for limit, *values in zip(SEVERITY_LIMITS, steps, low, high, strict=True):
+            row[f"at {limit:g} dB HL"] = "{:.1f} [{:.1f}, {:.1f}]".format(*values)
+        table.append(row)
+    print_table("Step of the tuning depth at a mean loss, in dB", pd.DataFrame(table))
+
+    figure = Figure(figsize=(9.2, 6.4), layout="constrained")
+    places = figure.subplots(2, 2).ravel()
+    for axes, (hz, part) in zip(places, rows.groupby("hz"), strict=False):
+        axes.scatter(part.hearing_level, part.depth, s=10, color="tab:orange", label="people")
+        for name in TUNED:
+            curve = simulated[simulated.hz == hz]
+            axes.plot(curve.threshold, curve[name], color=COLOURS[name], label=f"{name}, flat loss")
+        for limit in SEVERITY_LIMITS:
+            axes.axvline(limit, color="black", linewidth=0.5, linestyle=":")
+        axes.set(xlabel="threshold (dB HL)", ylabel="tuning depth (dB)", title=f"{hz} Hz")
+        axes.set(ylim=(-12, 42))
+    places[0].legend(fontsize="small", loc="upper right")
+    save(figure, out / "people-tuning.png")
+
+
+def mean_loss(ear: Audiogram) -> float:
+    """Return the mean threshold from 2 to 8 kHz in dB HL, which decides MSBG's severity, or NaN."""
+    is_high = [2000.0 <= hz <= 8000.0 for hz in ear.frequencies]
+    return float(np.mean(np.array(ear.levels)[is_high])) if any(is_high) else float("nan")
+
+
+def estimate_steps(rows: pd.DataFrame, name: str) -> np.ndarray:
+    """Regress the depth on frequency, threshold, mean loss and steps; return the steps in dB."""
+    rows = rows[rows[name].notna() & rows["mean loss"].notna()]
+    loss = rows["mean loss"].to_numpy()
+    columns = [(rows.hz == hz).to_numpy(float) for hz in tuning.NOISE_SPECTRUM_LEVEL]
+    columns += [rows.hearing_level.to_numpy(), loss]
+    columns += [(loss > limit).astype(float) for limit in SEVERITY_LIMITS]
+    coefficients, *_ = np.linalg.lstsq(np.stack(columns, 1), rows[name].to_numpy(), rcond=None)
+    return coefficients[-len(SEVERITY_LIMITS) :]
+
+
+# Words
+
+
+def compare_words(path: Path, out: Path) -> None:
+    """Compare the words that are predicted from HASPI with those that people understood."""
+    responses = fit_words.read_responses(path)
+    result = fit_words.fit(responses)
+    print("\nFitted to all responses:", result.curve)
+    systems = fit_words.leave_out_systems(responses, result.start)
+    print_table("Each aid left out: share of words", systems.round(2))
+    table = []
+    for name in ("in its challenge", "in any"):
+        errors = systems[f"predicted {name}"] - systems.measured
+        row = {"predicted": name}
+        for challenge, values in errors.groupby(systems.challenge):
+            row[f"bias, challenge {challenge}"] = f"{values.mean():+.3f}"
+        row["RMS error"] = f"{np.sqrt(np.square(errors).mean()):.3f}"
+        inside = np.average(systems[f"inside {name}"], weights=systems.listeners)
+        row["inside 90 %"] = f"{inside:.1%} of {systems.listeners.sum()}"
+        table.append(row)
+    print_table("Summary", pd.DataFrame(table))
+
+    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    for axes, challenge in zip(figure.subplots(1, 2), (1, 2), strict=True):
+        part = systems[systems.challenge == challenge].sort_values("haspi")
+        axes.plot(part.haspi, part.measured, "o", color="tab:orange", label="people")
+        for name, style in (("in its challenge", "-"), ("in any", ":")):
+            values = part[f"predicted {name}"]
+            label = f"predicted {name}, aid left out"
+            axes.plot(part.haspi, values, style, color="tab:blue", label=label)
+        axes.set(xlabel="mean HASPI of an aid", ylabel="share of words", ylim=(0, 1))
+        axes.set_title(f"challenge {challenge}", fontsize="medium")
+    axes.legend(fontsize="small")
+    save(figure, out / "people-words.png")
+
+
+COMPARISONS = {
+    "thresholds_in_noise.csv": compare_recruitment,
+    "tuning.csv": compare_tuning,
+    "clarity_responses.csv": compare_words,
+}
+
+
+def main(people: str, out: str = "people") -> None:
+    warnings.filterwarnings("ignore", message="waveform has a level")
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, compare in COMPARISONS.items():
+        path = Path(people) / file
+        if path.is_file():
+            compare(path, folder)
+        else:
+            print(f"left out: there is no {path}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
