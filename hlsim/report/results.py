@@ -233,25 +233,6 @@ def comparison_table(
     return Table.from_rows(caption, rows)
 
 
-def paired_table(caption: str, rows: Mapping[str, PairedComparison]) -> Table:
-    """Return a table with one row per paired comparison.
-
-    The columns are the label of the comparison, the number of pairs n, the means before and after,
-    their change with its 95 % interval, the t-test, Wilcoxon's test, and Cohen's d. The p values
-    are not corrected for multiple comparisons.
-
-    Args:
-        caption: Caption of the table.
-        rows: Comparisons, each under the label that begins its row.
-
-    >>> from hlsim.evaluation.statistics import paired_comparison
-    >>> paired_table("Ears", {"N3": paired_comparison([0.2, 0.4], [0.3, 0.5])}).rows[0][:2]
-    ['N3', '2']
-    """
-    cells = [{"Items": name, **_paired_cells(c, c.p_t, c.p_w)} for name, c in rows.items()]
-    return Table.from_rows(f"{caption}; p not adjusted", cells)
-
-
 def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> dict[str, str]:
     """Return the cells of a paired comparison by title, with p values that may be adjusted."""
     interval = "" if c.ci_low is None else f" [{c.ci_low:+.3f}, {c.ci_high:+.3f}]"
@@ -284,8 +265,10 @@ def _comparison_sections(evaluation: Evaluation) -> list[Section]:
         table = comparison_table(evaluation.comparisons, caption)
         sections.append(Section("All comparisons", plan if headline.planned else [], [table]))
     if headline.unit_means is not None:
-        rows = {"all items": headline.overall, f"{headline.unit} means": headline.unit_means}
-        sections.append(Section(f"Items and {headline.unit}s", tables=[paired_table(pair, rows)]))
+        parts = {"all items": headline.overall, f"{headline.unit} means": headline.unit_means}
+        rows = [{"Items": name, **_paired_cells(c, c.p_t, c.p_w)} for name, c in parts.items()]
+        table = Table.from_rows(f"{pair}; p not adjusted", rows)
+        sections.append(Section(f"Items and {headline.unit}s", tables=[table]))
     return sections
 
 
