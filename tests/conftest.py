@@ -4,6 +4,7 @@ import os
 import random
 import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -116,8 +117,14 @@ def speech_dir() -> Path:
     return SPEECH_DIR
 
 
+@cache
+def read_speech(name: str) -> tuple[Tensor, int]:
+    """Read a bundled utterance and its rate in Hz, once for all tests. Shape: (1, time)."""
+    return read_audio(SPEECH_DIR / f"{name}.flac")
+
+
 @pytest.fixture
-def speech(speech_dir: Path) -> list[tuple[Tensor, int]]:
+def speech() -> list[tuple[Tensor, int]]:
     """Four utterances by four voices, two at 16 kHz and two at 22.05 kHz, with their rates in Hz.
 
     The level is 68 dB SPL where RMS 1.0 is 94 dB SPL.
@@ -130,4 +137,5 @@ def speech(speech_dir: Path) -> list[tuple[Tensor, int]]:
         "valid/flite-rms-01",
         "valid/espeak-us-annie-01",
     )
-    return [read_audio(speech_dir / f"{name}.flac") for name in names]
+    utterances = [read_speech(name) for name in names]
+    return [(waveform.clone(), rate) for waveform, rate in utterances]

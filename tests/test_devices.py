@@ -42,11 +42,13 @@ class Call(NamedTuple):
         build: Function that returns the module on the CPU.
         call: Function of the module, output and clean speech (4, time), and ears (4, 8).
         waits: Number of times that the host may wait for the device.
+        samples: Duration of the signals.
     """
 
     build: Callable[[], nn.Module]
     call: Callable[[Any, Tensor, Tensor, Tensor], Tensor]
     waits: int = 0
+    samples: int = 4000
 
 
 def simulate(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
@@ -90,13 +92,14 @@ CALLS: dict[str, Call] = {
     "linked wdrc": Call(partial(WDRC, linked=True), in_pairs(simulate)),
 }
 # the number of waits does not depend on the number of items, except for MBSTOI
-CALLS["haspi"] = Call(nn.Identity, score(haspi), waits=6)
-CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=7)
-CALLS["haaqi"] = Call(nn.Identity, score(haaqi), waits=7)
+CALLS["haspi"] = Call(nn.Identity, score(haspi), waits=6, samples=12000)
+CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=7, samples=12000)
+CALLS["haaqi"] = Call(nn.Identity, score(haaqi), waits=7, samples=12000)
 CALLS["mbstoi"] = Call(
     nn.Identity,
     in_pairs(lambda module, wave, clean, ears: mbstoi(wave, clean)),
     waits=5,
+    samples=12000,
 )
 for name in ("neuro-msbg", "neuro-msbg-mamba", "neuro-msbg-transformer"):
     CALLS[name] = Call(partial(load_pretrained, name), simulate)
@@ -127,7 +130,7 @@ def test_module_keeps_to_its_device_and_does_not_wait(name: str) -> None:
     call = CALLS[name]
     torch.manual_seed(0)
     module = call.build()
-    signals = 0.02 * torch.randn(2, 4, 12000)
+    signals = 0.02 * torch.randn(2, 4, call.samples)
     # two unlike ears of a pair, or differences between the ears would be next to nothing
     signals[0, 1::2] += 0.5 * signals[0, 0::2]
     on_cpu = value_and_gradient(call, module, *signals, EARS)
@@ -170,7 +173,7 @@ def test_operations_and_shapes_do_not_depend_on_the_signal(name: str) -> None:
         module.to(DEVICE)
         ears = EARS.to(DEVICE)
         for scale in (0.02, 0.02, 1.0, 0.0):
-            signals = (scale * torch.randn(2, 4, 12000)).to(DEVICE)
+            signals = (scale * torch.randn(2, 4, call.samples)).to(DEVICE)
             device.waits.clear()
             with Operations() as operations:
                 value_and_gradient(call, module, *signals, ears)

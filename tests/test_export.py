@@ -65,7 +65,7 @@ def open_onnx(path: Path) -> tuple[Call, dict[str, list[int]]]:
 
 @pytest.mark.parametrize(
     ("name", "items", "samples"),
-    [("neuro-msbg", 1, 17600), ("neuro-msbg-mamba", 2, 4000)],
+    [("neuro-msbg", 1, 17600), ("neuro-msbg-mamba", 2, 1600)],
 )
 def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: int) -> None:
     simulator = load_pretrained(name, full_scale_spl=100.0)
@@ -76,8 +76,7 @@ def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: 
     assert_close(perceived, simulator(waveform, ears), 1e-4)
 
 
-@wearables
-@pytest.mark.parametrize(("items", "hops"), [(2, 1), (1, 5)])
+@pytest.mark.parametrize(("name", "items", "hops"), [("wdrc", 2, 1), ("wdrc", 1, 5), ("aid", 2, 3)])
 def test_a_program_of_hops_gives_the_outputs_of_the_stream(
     name: str, items: int, hops: int
 ) -> None:

@@ -108,9 +108,9 @@ def evaluate_compensators(
         MissingExtraError: A package is not installed.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
-    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "jobs": 1}
+    >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "levels": [65.0]}
     >>> evaluation = evaluate_compensators(
-    ...     {"mine": NALR()}, speech=speech, audiogram=Audiogram.standard("N3"), **settings
+    ...     {"mine": NALR()}, speech=speech, audiogram=Audiogram.standard("N3"), jobs=1, **settings
     ... )
     >>> evaluation.names[:3], evaluation.names[3:]
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])

@@ -21,8 +21,8 @@ def test_demo_writes_a_page_that_agrees_with_the_table(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(DurationEstimate, "last_step", 15)
-    text = run_short_demo(tmp_path, speech_dir, steps=20)
+    monkeypatch.setattr(DurationEstimate, "last_step", 12)
+    text = run_short_demo(tmp_path, speech_dir, steps=13)
     assert capsys.readouterr().out.count("The demo will take about ") == 1
     out = tmp_path / "out"
     report = json.loads((out / "report.json").read_text())

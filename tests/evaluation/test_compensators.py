@@ -44,9 +44,11 @@ def options(
 ) -> dict[str, Any]:
     """Return settings of an evaluation that takes seconds."""
     monkeypatch.setattr(aid_properties, "TONES", (1000,))
-    monkeypatch.setattr(aid_properties, "CHANGE_POSITIONS", range(8000, 40000, 16001))
+    monkeypatch.setattr(aid_properties, "CHANGE_POSITIONS", [24001])
+    monkeypatch.setattr("hlsim.evaluation.compensators.UTTERANCES", 2)
     folders = {"speech": speech_dir / "valid", "noise": speech_dir / "train"}
-    return {**folders, "seconds": 0.4, "jobs": 1, "gain_ears": ("N3",)}
+    settings = {"seconds": 0.4, "levels": (60.0, 75.0), "gain_ears": ("N3",)}
+    return {**folders, **settings, "jobs": 1}
 
 
 def test_perception_is_that_of_the_exact_model_and_of_the_loss(

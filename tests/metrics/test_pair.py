@@ -26,7 +26,7 @@ def test_signals_of_nearly_equal_lengths_are_cut() -> None:
 
 @pytest.mark.parametrize("score", [haspi, hasqi, haaqi])
 def test_scores_of_arrays_are_arrays(score: Callable[..., Any]) -> None:
-    clean = 0.02 * torch.randn(2, 12000)
+    clean = 0.02 * torch.randn(2, 11200)
     output = 0.5 * clean
     expected = score(output, clean, "N3")
     scores = score(output.numpy(), clean.numpy(), "N3")
@@ -43,7 +43,8 @@ def test_mbstoi_and_prepared_references_take_arrays() -> None:
     clean = 0.02 * torch.randn(2, 12000)
     output = (0.5 * clean).numpy()
     assert mbstoi(output, clean) == mbstoi(0.5 * clean, clean).item()
-    haspi_of = HaspiReference(clean.numpy())
-    assert haspi_of.score(output, "N3").tolist() == haspi(0.5 * clean, clean, "N3").tolist()
-    hasqi_of = HasqiReference(clean.numpy(), "N3")
-    assert hasqi_of.score(output).tolist() == hasqi_of.parts(output).combined.tolist()
+    left, left_output = clean[:1], output[:1]
+    haspi_of = HaspiReference(left.numpy())
+    assert haspi_of.score(left_output, "N3").tolist() == haspi(0.5 * left, left, "N3").tolist()
+    hasqi_of = HasqiReference(left.numpy(), "N3")
+    assert hasqi_of.score(left_output).tolist() == hasqi_of.parts(left_output).combined.tolist()

@@ -34,7 +34,7 @@ def test_calls_run_alone_in_other_threads_in_the_same_mode(mode: type) -> None:
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_scores_do_not_depend_on_the_cores(mode: type) -> None:
-    clean = hlsim.example_speech()[:48000].unflatten(0, (3, -1))
+    clean = hlsim.example_speech()[8000:42560].unflatten(0, (3, -1))
     output: Tensor = clean + 0.01 * torch.randn(clean.shape)
     with mode():
         on_two_cores = hasqi(output, clean, "N3")

@@ -17,10 +17,7 @@ MAX_ERRORS = {(1.4, 2.6): 5e-4, (1.1, 1.1): 1.5e-3, (1.6, 1.6): 4e-3}
 # bands.
 @pytest.mark.parametrize("name", ["mild", "moderate", "severe"])
 @pytest.mark.parametrize("highest", [22050.0, 10000.0, 9000.0, 8000.0])
-@pytest.mark.parametrize("ratios", MAX_ERRORS)
-def test_rate_bands_equal_all_channels_at_44_khz(
-    name: str, highest: float, ratios: tuple[float, float]
-) -> None:
+def test_rate_bands_equal_all_channels_at_44_khz(name: str, highest: float) -> None:
     bank = BANKS[name]
     rate_divisor = 1 if highest > 11025.0 else 2
     bins = round(highest / 44100.0 * POINTS) + 1
@@ -28,18 +25,18 @@ def test_rate_bands_equal_all_channels_at_44_khz(
     noise[4000:40000] = 0.03 * torch.randn(36000, dtype=torch.float64)
     spectrum = torch.fft.rfft(noise)[None]
     spectrum[:, bins:] = 0.0
-    channel_ratios = torch.linspace(*ratios, bank.channels, dtype=torch.float64)[None]
 
     # The spectrum of a signal at half the rate is half as large.
     slow_spectrum = spectrum[:, : POINTS // rate_divisor // 2 + 1] / rate_divisor
     slow_noise = torch.fft.irfft(slow_spectrum, POINTS // rate_divisor)
     options = {"rate_divisor": rate_divisor, "highest": highest, "corrects_kinks": False}
-    output = simulate_cochlea(slow_noise, channel_ratios, bank, POINTS, **options)
-    output = output[:, :bins] * rate_divisor
-
     response = torch.from_numpy(gammatone_response(bank, POINTS))
     channels = torch.fft.irfft(spectrum.unsqueeze(-2) * response, POINTS)
     envelopes = envelope(channels, torch.from_numpy(envelope_lowpass(bank, POINTS)))
-    expected = torch.fft.rfft(expand(channels, envelopes, channel_ratios))[:, :bins]
-    error = torch.linalg.norm(output - expected) / torch.linalg.norm(expected)
-    assert error < MAX_ERRORS[ratios]
+    for ratios, max_error in MAX_ERRORS.items():
+        channel_ratios = torch.linspace(*ratios, bank.channels, dtype=torch.float64)[None]
+        output = simulate_cochlea(slow_noise, channel_ratios, bank, POINTS, **options)
+        output = output[:, :bins] * rate_divisor
+        expected = torch.fft.rfft(expand(channels, envelopes, channel_ratios))[:, :bins]
+        error = torch.linalg.norm(output - expected) / torch.linalg.norm(expected)
+        assert error < max_error, ratios

@@ -69,7 +69,7 @@ def test_items_and_blocks_one_by_one_equal_processing_at_once(
     # Random weights make every layer depend on its whole receptive field.
     for parameter in model.parameters():
         parameter.data += 0.05 * torch.randn_like(parameter)
-    waveforms, ears = 0.02 * torch.randn(2, 40_000, dtype=torch.float64), draw_thresholds(2)
+    waveforms, ears = 0.02 * torch.randn(2, 24_000, dtype=torch.float64), draw_thresholds(2)
     shapes: list[torch.Size] = []
     process: Any = model.process_items
 
@@ -79,10 +79,10 @@ def test_items_and_blocks_one_by_one_equal_processing_at_once(
 
     monkeypatch.setattr(model, "process_items", process_and_record)
     expected = output_and_gradient(model, waveforms, ears)
-    monkeypatch.setattr(network, "_CPU_SAMPLES", 12_000)
+    monkeypatch.setattr(network, "_CPU_SAMPLES", 7_200)
     results = output_and_gradient(model, waveforms, ears)
-    assert shapes[0] == (2, 40_000)
-    assert len(shapes) == 7 and all(items == 1 and time < 20_000 for items, time in shapes[1:])
+    assert shapes[0] == (2, 24_000)
+    assert len(shapes) == 7 and all(items == 1 and time < 16_000 for items, time in shapes[1:])
     for result, expected_result in zip(results, expected, strict=True):
         assert float((result - expected_result).norm() / expected_result.norm()) < 1e-12
 
@@ -167,8 +167,9 @@ def test_the_phase_factor_equals_its_formula_and_has_exact_gradients() -> None:
     log_gain = torch.randn(2, 9, 17, dtype=torch.float64, requires_grad=True)
     expected = torch.polar(log_gain.exp(), torch.atan2(maps[:, 1], 1.0 + maps[:, 0]))
     torch.testing.assert_close(phase_factor(maps, log_gain), expected, atol=1e-12, rtol=1e-12)
-    assert torch.autograd.gradcheck(phase_factor, (maps, log_gain))
-    assert torch.autograd.gradgradcheck(phase_factor, (maps, log_gain))
+    few = maps[..., :3, :4], log_gain[..., :3, :4]
+    assert torch.autograd.gradcheck(phase_factor, few)
+    assert torch.autograd.gradgradcheck(phase_factor, few)
     undefined = torch.stack((-torch.ones(1, 3, 3), torch.zeros(1, 3, 3)), 1).requires_grad_()
     phase_factor(undefined, torch.zeros(1, 3, 3)).abs().sum().backward()
     assert undefined.grad is not None and undefined.grad.isfinite().all()
