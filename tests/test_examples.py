@@ -144,6 +144,7 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     assert len(table) == 3 and table[2].startswith("| N3 |")
 
 
+@pytest.mark.slow
 def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) -> None:
     """The example ranks some degradations of one synthetic voice as HASPI and HASQI do."""
     example = load_figure("validity.py")
