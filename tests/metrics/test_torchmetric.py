@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
+from hlsim.audiogram.thresholds import as_thresholds
 
 pytest.importorskip("torchmetrics")
 
@@ -41,11 +42,10 @@ def compute_quickly(
     ends = torch.tensor([time] if lengths is None else lengths)
     if int(ends.min()) < 0.7 * sample_rate:
         raise ValueError("too short")
-    is_signal = torch.arange(time) < ends[:, None]
+    is_signal = torch.arange(time) < ends.reshape(-1, *[1] * (clean.ndim - 1))
     error = ((output - clean) * is_signal).square().sum(-1)
     ratio = error / (clean * is_signal).square().sum(-1)
-    thresholds = torch.as_tensor(getattr(audiogram, "thresholds", audiogram))
-    return highest / (1.0 + ratio + thresholds.mean(-1) / 100.0)
+    return highest / (1.0 + ratio + as_thresholds(audiogram).mean(-1) / 100.0)
 
 
 @pytest.fixture
