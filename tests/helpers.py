@@ -38,10 +38,10 @@ def write_ears(path: Path, *names: str) -> Path:
 
 
 def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
-    """Run the demo for an N4 ear, with a second of two bundled utterances of each voice."""
+    """Run the demo for an N4 ear, with a second of the last bundled utterances."""
     from hlsim.cli.demo_study import run_demo
 
-    for path in speech_dir.rglob("*-0[12].flac"):
+    for path in speech_dir.rglob("*-0[34].flac"):
         samples, rate = soundfile.read(path)
         target = folder / path.relative_to(speech_dir)
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -26,12 +26,12 @@ def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
         torchtools, "without_modes", lambda function, *args, **kwargs: function(*args, **kwargs)
     )
     monkeypatch.setattr(torchtools, "_STORE", torchtools._Store(torchtools.STORE_BYTES))
-    # so small that four items need several groups of channels
-    monkeypatch.setattr(ear_model, "GPU_CHUNK", 2**20)
+    # so small that two items need several groups of channels
+    monkeypatch.setattr(ear_model, "GPU_CHUNK", 2**19)
 
 
 EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N1", "N3", "NH", "N1")])
-LENGTHS = [12000, 11500, 11987, 11400]
+LENGTHS = [12000, 11500]
 N3 = Audiogram.standard("N3")
 
 
@@ -48,7 +48,7 @@ class Call(NamedTuple):
     build: Callable[[], nn.Module]
     call: Callable[[Any, Tensor, Tensor, Tensor], Tensor]
     waits: int = 0
-    samples: int = 4000
+    samples: int = 2000
 
 
 def simulate(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
@@ -73,7 +73,8 @@ def in_pairs(call: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def score(measure: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    return lambda module, wave, clean, ears: measure(wave, clean, ears, lengths=LENGTHS)
+    """Return a call that scores the first two items."""
+    return lambda module, *tensors: measure(*(x[:2] for x in tensors), lengths=LENGTHS)
 
 
 CALLS: dict[str, Call] = {
@@ -93,8 +94,8 @@ CALLS: dict[str, Call] = {
 }
 # the number of waits does not depend on the number of items, except for MBSTOI
 CALLS["haspi"] = Call(nn.Identity, score(haspi), waits=6, samples=12000)
-CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=7, samples=12000)
-CALLS["haaqi"] = Call(nn.Identity, score(haaqi), waits=7, samples=12000)
+CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=5, samples=12000)
+CALLS["haaqi"] = Call(nn.Identity, score(haaqi), waits=5, samples=12000)
 CALLS["mbstoi"] = Call(
     nn.Identity,
     in_pairs(lambda module, wave, clean, ears: mbstoi(wave, clean)),

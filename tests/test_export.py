@@ -65,7 +65,10 @@ def open_onnx(path: Path) -> tuple[Call, dict[str, list[int]]]:
 
 @pytest.mark.parametrize(
     ("name", "items", "samples"),
-    [("neuro-msbg", 1, 17600), ("neuro-msbg-mamba", 2, 1600)],
+    [
+        ("neuro-msbg", 1, 17600),
+        pytest.param("neuro-msbg-mamba", 2, 1600, marks=pytest.mark.slow),
+    ],
 )
 def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: int) -> None:
     simulator = load_pretrained(name, full_scale_spl=100.0)

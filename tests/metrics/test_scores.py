@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -91,8 +92,12 @@ PARITY: dict[str, tuple[Audiogram, int, Callable[[Tensor], Tensor]]] = {
     "hasqi, 48000 Hz": (N3, 48000, lambda noisy: 5.0 * noisy),
     "hasqi, 44100 Hz": (N3, 44100, lambda noisy: 0.5 * noisy),
 }
-for kind, rate in (("music", 16000), ("speech", 24000), ("music", 32000), ("speech", 44100)):
+for kind, rate in product(("music", "speech"), (16000, 24000, 32000, 44100)):
     PARITY[f"haaqi, {kind}, {rate} Hz"] = (N4, rate, degrade)
+
+SLOW = {f"haaqi, music, {rate} Hz" for rate in (24000, 44100)}
+SLOW |= {f"haaqi, speech, {rate} Hz" for rate in (16000, 32000)}
+"""Cases whose rate is that of another kind of sound in the other tests, too."""
 
 
 def signals_of(key: str) -> tuple[Tensor, Tensor]:
@@ -108,7 +113,9 @@ def signals_of(key: str) -> tuple[Tensor, Tensor]:
     return clean, change(noisy)
 
 
-@pytest.mark.parametrize("key", PARITY)
+@pytest.mark.parametrize(
+    "key", [pytest.param(key, marks=[pytest.mark.slow] * (key in SLOW)) for key in PARITY]
+)
 def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, key: str) -> None:
     name = key.partition(",")[0]
     ear, rate, _ = PARITY[key]
@@ -254,9 +261,13 @@ def test_full_scale_is_pyclaritys_level1_and_rates_are_exact_by_default() -> Non
     [
         ("haspi", "expected"),
         ("haspi", "seeded"),
+        pytest.param("haspi", "none", marks=pytest.mark.slow),
+        pytest.param("hasqi", "expected", marks=pytest.mark.slow),
         ("hasqi", "seeded"),
         ("hasqi", "none"),
         ("haaqi", "expected"),
+        pytest.param("haaqi", "seeded", marks=pytest.mark.slow),
+        pytest.param("haaqi", "none", marks=pytest.mark.slow),
     ],
 )
 def test_a_batch_equals_its_items(name: str, noise: str) -> None:
