@@ -308,7 +308,7 @@ def test_references_of_inference_mode_serve_training_and_autocast_has_no_effect(
 
 @pytest.mark.parametrize(("ear", "gain"), [(N2, 1.0), (N3, 3.0)])
 def test_expected_noise_is_the_mean_over_seeds(ear: Audiogram, gain: float) -> None:
-    clean, noisy = (signal[0].double() for signal in pair())
+    clean, noisy = (signal[0] for signal in pair())
     prepared, output = HaspiReference(clean), gain * noisy
     scores = [float(prepared.score(output, ear, noise="seeded", seed=s)) for s in range(12)]
     error = max(3.0 * np.std(scores) / 12**0.5, 2e-4)
