@@ -111,6 +111,14 @@ class Attenuation(nn.Module):
             return filter_without_delay(waveform.to(dtype), taps * window).to(waveform.dtype)
 
 
+BUILT_IN: dict[str, Callable[..., nn.Module]] = {
+    EXACT: MSBG,
+    UNSMEARED: partial(MSBG, smearing=False),
+    LINEAR: Attenuation,
+}
+"""Simulators that need no checkpoint, by name."""
+
+
 class PluginSimulator(nn.Module):
     """Simulator of hearing loss of your own, loaded by its name.
 
@@ -216,7 +224,7 @@ def load_simulator(
             or delays its output.
 
     >>> load_simulator("msbg")
-    MSBG(sample_rate=16000, full_scale_spl=94, aligned=True)
+    MSBG(sample_rate=16000, full_scale_spl=94, aligned=True, rescale_active=False, smearing=True)
     """
     if isinstance(simulator, nn.Module):
         settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
@@ -226,13 +234,8 @@ def load_simulator(
                 raise ValueError(f"expected a simulator with {attribute}={value}, got {setting}")
         return simulator
     name = str(simulator)
-    kinds: dict[str, Callable[..., nn.Module]] = {
-        EXACT: MSBG,
-        UNSMEARED: partial(MSBG, smearing=False),
-        LINEAR: Attenuation,
-    }
-    if name in kinds:
-        return kinds[name](sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    if name in BUILT_IN:
+        return BUILT_IN[name](sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     if ":" in name and not Path(name).is_dir():
         return PluginSimulator(name, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)

@@ -192,7 +192,11 @@ class Parser(argparse.ArgumentParser):
 
     def simulator(self, default: str) -> None:
         """Declare ``--simulator``, the simulator of what an ear perceives."""
-        self.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", default)
+        text = (
+            "msbg (exact), msbg-unsmeared, attenuation (a linear ear), a checkpoint's name or "
+            "folder, or a simulator of your own, package.module:name or file.py:name"
+        )
+        self.option("--simulator", str, text, default)
 
     def levels(self, signal: str) -> None:
         """Declare ``--full-scale-spl`` and ``--spl``, of which a user sets at most one.

@@ -29,10 +29,7 @@ def srt(parser: Parser) -> None:
     text = "aid to compare with none: nalr, wdrc, or a checkpoint's name or folder"
     parser.option("--compensator", str, text)
     parser.sliders()
-    text = (
-        "msbg (exact), msbg-unsmeared, attenuation (a linear ear), or a checkpoint's name or folder"
-    )
-    parser.option("--simulator", str, text, "msbg")
+    parser.simulator("msbg")
     parser.option("--noise-spl", sound_level, "level of the noise in dB SPL, 40 to 90", 65.0)
     parser.option("--triplets", count, "triplets of digits per test, 30 to 3000", 120)
     parser.option("--seed", seed, "seed of digits and noises", 0)

@@ -201,7 +201,8 @@ class MSBG(nn.Module):
     def extra_repr(self) -> str:
         return (
             f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
-            f"aligned={self.aligned}"
+            f"aligned={self.aligned}, rescale_active={self.rescale_active}, "
+            f"smearing={self.smearing}"
         )
 
     def _simulate(

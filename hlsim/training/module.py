@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.checkpoint import read_record
-from hlsim.simulators import EXACT, LINEAR, PluginSimulator, load_simulator
+from hlsim.simulators import BUILT_IN, PluginSimulator, load_simulator
 from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
 
@@ -182,9 +182,9 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
         simulator: Name, folder or module, see ``load_simulator``.
 
     Returns:
-        The name of the simulator, or its class, under ``role``. For a network, a hash of its
-        weights follows under ``role`` with ``_sha256``, because a folder may contain another
-        network when the training resumes.
+        The name of the simulator, or its class with its settings, under ``role``. For a network, a
+        hash of its weights follows under ``role`` with ``_sha256``, because a folder may contain
+        another network when the training resumes.
 
     Raises:
         ValueError: There is no such simulator.
@@ -198,7 +198,8 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     if isinstance(simulator, nn.Module):
         state = {name: tensor.cpu().contiguous() for name, tensor in loaded.state_dict().items()}
         digest = hashlib.sha256(safetensors.torch.save(state)).hexdigest()
-        return {role: type(simulator).__name__, f"{role}_sha256": digest}
-    if str(simulator) in (EXACT, LINEAR):
+        name = f"{type(simulator).__name__}({simulator.extra_repr()})"
+        return {role: name, f"{role}_sha256": digest}
+    if str(simulator) in BUILT_IN:
         return {role: str(simulator)}
     return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}

@@ -10,11 +10,13 @@ import torch
 pytest.importorskip("lightning")
 
 from compensators import load_compensator
-from hlsim import Audiogram
+from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
+from hlsim.simulators import BUILT_IN
 from hlsim.training.batches import Batch, TrainingData, compensator_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
+from hlsim.training.module import describe_simulator
 from hlsim.training.recipes import CompensatorRecipe
 from tests.helpers import write_table
 from tests.training.gradients import check_gradients
@@ -75,6 +77,13 @@ def test_another_simulator_needs_another_folder(data: TrainingData, tmp_path: Pa
     torch.nn.init.ones_(next(other.parameters()))
     with pytest.raises(ValueError, match="differs in simulator_sha256;"):
         train(data, SMALL, tmp_path / "module", simulator=other)
+
+
+def test_every_built_in_simulator_and_its_settings_are_in_the_record() -> None:
+    for name in BUILT_IN:
+        assert describe_simulator("simulator", name) == {"simulator": name}
+    smeared, unsmeared = (describe_simulator("teacher", MSBG(smearing=s)) for s in (True, False))
+    assert smeared != unsmeared
 
 
 def test_a_simulator_of_your_own_is_named_in_the_record(data: TrainingData, tmp_path: Path) -> None:
