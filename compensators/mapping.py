@@ -137,9 +137,16 @@ class MappingCompensator(Aid, EarNetwork):
     _amplify = process_items
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
-        """Return the correction in nepers, smooth over time and frequency.
+        """Return the correction of NAL-R's gain in nepers, smooth over time and frequency.
 
-        Shape: (items, channels, ...) -> (items, frames, frequencies).
+        It lies between plus and minus ``config.reach_db``.
+
+        Args:
+            features: Features after the last block. Shape: (items, channels, ...).
+            size: Number of frames and of frequencies of the spectrum.
+
+        Returns:
+            Correction. Shape: (items, frames, frequencies).
         """
         bands = self.config.bands, self.config.fft
         into_bands = _into_bands(*bands, like=features)

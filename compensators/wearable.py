@@ -66,8 +66,9 @@ class Wearable(Aid):
     16 ms, every 4 ms, and interpolated linearly between these times.
 
     A slider is a control that the user may set from 0 to 1, such as the strength of noise
-    reduction. Subclasses define ``bands``, ``limit_spl`` and ``compute_gains``; if they have
-    sliders, ``SLIDERS``; and if their gains depend on the past, ``state_shapes``.
+    reduction. Subclasses define ``bands``, ``limit_spl``, ``compute_gains`` and ``state_shapes``,
+    which is empty if their gains do not depend on the past; if they have sliders, they define
+    ``SLIDERS``, too.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
@@ -87,7 +88,7 @@ class Wearable(Aid):
         latency: Delay of a stream in samples at 16 kHz.
 
     Raises:
-        ValueError: A rate or level is out of range.
+        ValueError: A rate or level is out of range, or an ear is not valid.
 
     >>> from compensators import WDRC
     >>> aid = WDRC()
@@ -341,14 +342,15 @@ class Stream:
 
     Sliders of the aid, such as ``noise_reduction``, may be set at any time. They take 0.1 s from 0
     to 1, so that nothing clicks. For more than eight items, a chunk needs at least nine samples,
-    because a smaller one looks like an array with time first.
+    because a smaller one looks like an array with time first. At the end of a signal, ``flush``
+    returns the last ``aid.latency`` samples of its output.
 
     Chunks are tensors or NumPy arrays, and so are the outputs.
 
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
 
     Attributes:
-        sliders: Present value of each slider by its name.
+        sliders: Value of each slider by its name, to which it moves.
 
     Args:
         aid: Aid at 16 kHz.
@@ -357,10 +359,12 @@ class Stream:
         sliders: Value from 0 to 1 under each slider's name, one number or one value per item.
 
     Raises:
-        ValueError: The aid has another sample rate, or rejects the ear; a call rejects the value of
-            a slider, other leading dimensions than before, and samples that are NaN or infinite,
-            which would affect all later output. After a rejected chunk, the stream goes on as if
-            there had been none. The aid has no such slider.
+        ValueError: For the constructor: the aid has another sample rate, rejects the ear or has no
+            such slider. For a call: a slider is outside 0 to 1, the leading dimensions differ from
+            those of earlier chunks, there are no samples, or a sample is NaN or infinite, which
+            would affect all later output. A rejected chunk leaves the stream as it was. A rejected
+            value of a slider stays until ``set`` replaces it.
+        RuntimeError: Values of a slider do not broadcast to the items.
 
     >>> import hlsim
     >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")

@@ -74,10 +74,13 @@ STATELESS_INPUTS = ("samples", "fitted", "sliders")
 def export_program(
     simulator: nn.Module, *, seconds: float = 1.0, items: int = 1
 ) -> torch.export.ExportedProgram:
-    """Convert a Neuro-MSBG to a ``torch.export`` program for signals of a fixed length.
+    """Convert a Neuro-MSBG to a ``torch.export`` program for a fixed number and length of signals.
 
-    ``program.module()`` is a function of ``waveform`` (items, time) and ``thresholds`` (items, 8)
-    in dB HL. It returns a dictionary with ``perceived`` (items, time), what the ears perceive.
+    ``program.module()`` is a function of ``waveform`` (items, time), whose RMS of 1.0 is
+    ``simulator.full_scale_spl`` dB SPL, and ``thresholds`` (items, 8) in dB HL. It returns a
+    dictionary with ``perceived`` (items, time), what the ears perceive, in the scale of
+    ``waveform``. The program does not validate its inputs. All tensors have the dtype and device of
+    the simulator's weights.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
@@ -92,11 +95,15 @@ def export_program(
     >>> inputs = {"waveform": torch.zeros(1, 1600), "thresholds": torch.full((1, 8), 40.0)}
     >>> perceived = program.module()(**inputs)["perceived"]
     """
-    if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
+    if not isinstance(simulator, NeuroMSBG):
         raise ValueError(
-            f"expected a NeuroMSBG with sample_rate {NEURO_RATE}, got a "
-            f"{type(simulator).__name__}; the exact MSBG cannot be exported, because its filters "
-            "depend on the audiogram's values"
+            f"expected a NeuroMSBG, got a {type(simulator).__name__}; the exact MSBG cannot be "
+            "exported, because its filters depend on the audiogram's values"
+        )
+    if simulator.sample_rate != NEURO_RATE:
+        raise ValueError(
+            f"expected a Neuro-MSBG with sample_rate {NEURO_RATE}, got {simulator.sample_rate}; "
+            f"load it at {NEURO_RATE} Hz"
         )
     weight = next(simulator.parameters())
     inputs = {

@@ -81,7 +81,9 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a+")
     except OSError as error:
-        raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise ValueError(
+            f"{folder}: cannot write to this folder ({error.strerror or error}); choose another one"
+        ) from error
     with file:
         try:
             _lock(file)

@@ -191,7 +191,14 @@ _load_numbers = itertools.count()
 
 @lru_cache(maxsize=16)
 def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
-    """Load a pickled plug-in in another process, once for all pickles of the same object."""
+    """Load a plug-in again when it is unpickled or copied.
+
+    Args:
+        name: Name of the plug-in.
+        kind: Noun for the plug-in in error messages.
+        number: Number of the original object. In a process, all copies of it are one object, as
+            long as it is one of the last 16 that were loaded.
+    """
     return WaveformPlugin(name, kind)
 
 

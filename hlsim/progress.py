@@ -83,7 +83,8 @@ class ProgressLine:
 
         Args:
             text: Line to print.
-            file: stderr; by default stdout.
+            file: Stream to which the line is printed, such as ``sys.stderr``; by default
+                ``sys.stdout``.
         """
         with self._lock:
             clear_line(sys.stderr)

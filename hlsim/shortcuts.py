@@ -146,7 +146,8 @@ def compensate(
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
         audiogram: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
-            mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
+            mapping of frequencies in Hz to thresholds, a ``Listener`` for ``(..., 2, time)``, or
+            a sequence with one ear per item.
         sample_rate: Sample rate in Hz, 16000 (default) to 48000.
         compensator: ``"nalr"`` or ``"wdrc"``, or the name or folder of a checkpoint, such as
             ``"hearing-aid"``.
@@ -154,8 +155,9 @@ def compensate(
             are in pascals.
 
     Returns:
-        The output of the aid, of the type and shape of ``audio``. It is as loud as the ear needs:
-        turn the volume down before you play it.
+        The output of the aid, of the type of ``audio`` and time-aligned with it. Its shape is that
+        of ``audio``; for several ears and one signal there is one output per ear. It is as loud as
+        the ear needs: turn the volume down before you play it.
 
     Raises:
         ValueError: The audio, the ear, the rate or the compensator is not valid.

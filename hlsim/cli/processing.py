@@ -189,10 +189,14 @@ def _plan_outputs(source: Path, target: Path, names: Sequence[str]) -> list[tupl
     Args:
         source: File, or folder of files, to read.
         target: File to write, or folder for the files to write.
-        names: Names of the ears. Those of several ears end the names of the files to write.
+        names: Names of the ears. If there are several, the name of each output ends with that of
+            its ear.
+
+    Outputs of a folder keep their subfolders, and end in .wav.
 
     Raises:
-        ValueError: A file would replace an input or another output.
+        ValueError: The target is a folder and the source is a file, one of two folders contains the
+            other, or a file would replace an input or another output.
     """
     from hlsim.audio import find_audio
 

@@ -91,8 +91,9 @@ def equalise(
 def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     """Compress the dynamic range of signals, as hearing aids do.
 
-    The level of segments of 10 ms approaches the mean level of the signal: a difference of R dB
-    becomes one of R / ratio dB.
+    The level in a running window of 10 ms approaches the mean level of the signal: a difference of
+    d dB becomes one of about d / ratio dB. Parts that are more than 30 dB below the mean level are
+    amplified as much as parts 30 dB below it, so that silence is not amplified without limit.
 
     Args:
         waveform: Signals with shape (items, time).

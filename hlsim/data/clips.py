@@ -42,9 +42,10 @@ _LOWEST_PEAK = 1e-9
 class Clips:
     """Clips of equal length from the first channels of recordings, at one sample rate.
 
-    Recordings are decoded when they are first drawn, and kept as 16-bit samples, up to 2 GB. A file
-    that is broken or has an unsupported sample rate causes a warning, and another one is drawn
-    instead.
+    Recordings are scaled to a peak of 1.0, so that clips have no calibrated level. They are decoded
+    when they are first drawn, and kept as 16-bit samples, up to 2 GB; beyond that, the one that was
+    decoded first is dropped, and decoded again when it is drawn. A file that is broken or has an
+    unsupported sample rate causes a warning, and another one is drawn instead.
 
     Args:
         source: Folder or files, see ``AudioFiles``.

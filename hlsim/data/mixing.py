@@ -52,7 +52,12 @@ def mix(
     signal = as_samples(speech)
     masker = as_samples(noise)[..., : signal.shape[-1]].to(signal)
     ratio = torch.as_tensor(snr, device=signal.device)
-    if masker.shape != signal.shape or signal.ndim < 1 + channels:
+    if signal.ndim < 1 + channels:
+        raise ValueError(
+            "expected speech of shape (..., channels, time) with channels=True, got "
+            f"{tuple(signal.shape)}; leave out channels for a single channel"
+        )
+    if masker.shape != signal.shape:
         raise ValueError(
             "expected speech and noise of the same shape (..., time), or longer noise, got "
             f"{tuple(signal.shape)} and {tuple(as_samples(noise).shape)}; repeat short noise, or "

@@ -222,14 +222,14 @@ def score_recordings(
 
 
 def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
-    """Return the number of the utterance of each recording, which its two ears share.
+    """Return for each recording the number of its utterance, from 0, which two ears share.
 
-    Ears of one utterance have the same listener, utterance and SNR, and, if these do not identify
-    the utterance, the same clean file.
+    Recordings with the same listener, utterance and SNR belong together. If these are more than
+    two, those with the same clean file do.
 
     Raises:
-        ValueError: An utterance has not one left and one right ear, or these have the clean speech
-            of different sentences.
+        ValueError: A group is not one left and one right ear, or the clean files of its ears differ
+            in speech or are shifted by more than 2 ms.
     """
     groups: dict[Any, list[RecordedItem]] = {}
     for recording in recordings:

@@ -123,6 +123,8 @@ class Evaluation:
     def check_scores(self) -> None:
         """Raise ValueError, with the reason for the first item, if the table has no score."""
         if self.table.reindex(columns=self.scores).isna().all(axis=None):
+            if self.failures.empty:
+                raise ValueError("the measures returned no score; return one or more numbers")
             first = self.failures.iloc[0]
             raise ValueError(
                 f"none of {self.table['item'].nunique()} items could be scored; the first, "
@@ -221,10 +223,14 @@ def _replace_nonfinite(value: Any) -> Any:
 
 
 def predict_words(scores: Iterable[float]) -> float:
-    """Predict from HASPI which share of words a listener understands, from 0 to 1.
+    """Predict which share of words, 0 to 1, a new listener understands with one aid, from HASPI.
 
     Args:
-        scores: HASPI of one or more items; NaN is ignored.
+        scores: HASPI v2 of one or more sentences. NaN is ignored, and other values are limited to 0
+            to 1.
+
+    Raises:
+        ValueError: There are no scores, or all are NaN.
 
     >>> predict_words([0.2]) < predict_words([0.8, math.nan])
     True

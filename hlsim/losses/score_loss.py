@@ -54,11 +54,11 @@ def score_loss(
     output = torch.where(finite.unsqueeze(-1), output, 0.0)
     scores = scores_or_errors(SCORES[name], output, clean, ears, lengths, sample_rate=sample_rate)
     losses = []
-    for score, signal in zip(scores, output, strict=True):
+    for index, (score, signal) in enumerate(zip(scores, output, strict=True)):
         if isinstance(score, Tensor):
             losses.append(1.0 - score)
         elif isinstance(score, UnscorableError):
             losses.append((0.0 * signal).sum())
         else:
-            raise score
+            raise ValueError(f"item {index}: {score}") from score
     return torch.where(finite, torch.stack(losses), torch.nan)

@@ -138,16 +138,18 @@ def _resample(signals: Tensor, rate: int) -> Tensor:
 def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
     """Remove the frames where clean speech is silent at both ears, and overlap and add the others.
 
+    A frame is silent at an ear if it is 40 dB or more below the loudest frame of that ear.
+
     Args:
-        signals: Clean signals of the left and the right ear, then the outputs. Shape:
-            (2, 2, items, time).
+        signals: Clean signals of the left and the right ear, then the outputs, at 10 kHz. Shape:
+            (2: clean and output, 2: left and right, items, time).
 
     Returns:
         Windowed frames of the shortened signals, those of all items one after another, (2, 2,
         frames, 256), and the number of frames of each item.
 
     Raises:
-        ValueError: Too few frames remain for a segment.
+        ValueError: 30 frames or fewer remain of an item.
     """
     window = _window(like=signals)
     missing = FRAME + 1 - signals.shape[-1]
@@ -194,14 +196,17 @@ def _window() -> NDArray[np.float64]:
 
 
 def _band_features(frames: Tensor) -> Tensor:
-    """Compute the four features of each band in each frame, see ``LEFT_PAIR``.
+    """Compute four features of each band in each frame.
+
+    They are the power of the left ear, that of the right ear, and the real and the imaginary part
+    of their cross-spectrum.
 
     Args:
         frames: Windowed frames of clean speech, then of the output, at the left, then the right
             ear. Shape: (2, 2, frames, 256).
 
     Returns:
-        Features of clean speech, then of the output. Shape: (frames, bands, 8).
+        Four features of clean speech, then those of the output. Shape: (frames, bands, 8).
     """
     left, right = rfft(functional.pad(frames, (0, POINTS - FRAME))).unbind(1)
     cross = left * right.conj()

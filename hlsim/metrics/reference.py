@@ -155,9 +155,14 @@ class Reference(ABC):
 
     @abstractmethod
     def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
-        """Return the sound that reaches an ear, in multiples of 20 uPa, and the ear's hair cells.
+        """Return the clean signals as they reach the ear of the reference, and its hair cells.
 
-        Shape of the sound: (items, padded).
+        The ear of HASPI is normal. That of HASQI and HAAQI is the impaired one, for which the
+        signals are amplified by NAL-R unless they are already.
+
+        Returns:
+            Sound before the middle ear at 24 kHz, in multiples of 20 uPa, (items, padded); and hair
+            cells, (32,) or (items, 32).
         """
 
     @abstractmethod

@@ -167,10 +167,11 @@ def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = No
 
 
 def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
-    """Return scores as an array, and their mean.
+    """Return scores as a float64 array, (items,), and their mean.
 
     Raises:
-        ValueError: There are no scores, or they are not HASPI scores.
+        ValueError: There are no scores, they do not have the shape (items,), or one is NaN or
+            outside 0 to 1.
     """
     array = np.asarray(scores, dtype=np.float64)
     if array.ndim != 1 or not len(array):

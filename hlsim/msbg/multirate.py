@@ -77,8 +77,9 @@ class RateBand:
         response: Frequency responses of the channels, (channels, points // 2 + 1), or of their
             analytic signals, (channels, points).
         mean_weights: Weights for ``hlsim.msbg.envelope.partial_means``, (3, samples per step).
-        interpolation: Weights for ``hlsim.msbg.recruitment.interpolate``, repeated for the real and
-            imaginary parts of analytic signals.
+        interpolation: Weights for ``hlsim.msbg.recruitment.interpolate``. For the detector
+            ``"modulus"`` each is repeated, for the real and the imaginary part; of the analytic
+            signals of ``"harmonics"`` only the real part is used.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> device = torch.device("cpu")
@@ -153,9 +154,12 @@ def _assign_rates(
 ) -> list[tuple[slice, int, str]]:
     """Choose the sample rate and the detector of the lowest ``count`` channels of a filter bank.
 
+    A rate is stated in samples per step. A step is the time between two values of an envelope: 24
+    samples at 44.1 kHz, or 24.5 if the signals have 22.05 kHz.
+
     Args:
         bank: Filter bank.
-        count: Number of channels.
+        count: Number of channels, from the lowest up.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
         highest: Highest frequency in Hz that the output needs.
 

@@ -184,9 +184,11 @@ class DualPathNeuroMSBG(NeuroMSBG):
         return self._simulate(signals / rms, ears) * rms
 
     def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Compute what ears perceive, from signals in pascals or scaled to an RMS of 1.
+        """Compute what ears perceive, from signals in pascals or, unless level-aware, of RMS 1.
 
-        Shape: (items, time), (items, 8) -> (items, time).
+        The output has the scale of the input.
+
+        Shape: (items, time), (items, 8) in dB HL -> (items, time).
         """
         samples = signals.shape[-1]
         severity = severity_index(ears)

@@ -203,7 +203,11 @@ def _tone_pictures(evaluation: Evaluation) -> list[Picture]:
 
 
 def _wearing_table(evaluation: Evaluation) -> Table:
-    """Return a table of look-ahead, quiet noise, sidebands and cost for each ear and aid."""
+    """Return a table, by ear and aid, of properties that decide whether an aid can be worn.
+
+    These are its look-ahead in ms, its gain for quiet noise in dB, its worst sidebands in dB
+    relative to the tone, and the processor time in ms for one second of sound.
+    """
     sidebands = {
         (row["ear"], row["aid"]): max(map(max, row["sidebands_db"]))
         for row in evaluation.details["steady_tones"]

@@ -250,10 +250,11 @@ def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> 
 
 
 def _comparison_sections(evaluation: Evaluation) -> list[Section]:
-    """Return the sections of a page with the comparisons that the verdict leaves out.
+    """Return the sections of a page with all comparisons, and with the verdict's by unit.
 
-    These are all pairs of conditions, and the verdict's pair by the means of listeners or another
-    unit.
+    The first section is a table of all comparisons, if there is more than one. The second one
+    compares the verdict's pair over all items and over the means of a unit, such as listeners, if
+    these were tested. Without comparisons there are no sections.
     """
     headline, sections = evaluation.headline, []
     if headline is None:

@@ -101,7 +101,11 @@ def _teacher(evaluation: Evaluation) -> str:
 
 
 def _verdict(evaluation: Evaluation) -> str:
-    """Return a sentence about the simulator that is closest to the teacher by median SNR."""
+    """Return a sentence about the simulator closest to the teacher for the first treatment.
+
+    The simulator with the highest median SNR is named with its worst tenth; the others with their
+    medians, in dB.
+    """
     first = next(iter(evaluation.groups.values()))
     snr = first.wide("snr").dropna(axis=1, how="all")
     medians = snr.median().sort_values(ascending=False)

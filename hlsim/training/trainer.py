@@ -167,7 +167,8 @@ def train_network(
         out: Folder for the checkpoint, Lightning's state and TensorBoard's events. If it contains a
             state, the training resumes from it.
         about: Description of data and teacher for the checkpoint's ``config.json``. A training
-            resumes only with the same description and recipe.
+            resumes only with the same description, recipe, start network, number of devices and
+            version of hlsim.
         callbacks: Additional callbacks of Lightning.
         max_minutes: Time limit in minutes, including the time before a resumption. A training that
             reaches it ends before the recipe's last step. By default, there is no limit.

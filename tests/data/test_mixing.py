@@ -55,7 +55,7 @@ def test_arrays_give_arrays_and_longer_noise_is_cut() -> None:
     [
         ({"noise": torch.ones(999)}, "repeat short noise"),
         ({"noise": torch.ones(2, 1000)}, "repeat short noise"),
-        ({"channels": True}, "repeat short noise"),
+        ({"channels": True}, "leave out channels for a single channel"),
         ({"noise": torch.zeros(1000)}, "expected noise, got silence"),
         ({"noise": torch.full((1000,), torch.inf)}, "expected finite samples"),
         ({"speech": torch.full((1000,), torch.nan)}, "expected finite samples"),

@@ -299,14 +299,19 @@ class CochlearOutput:
 def simulate_cochlea(
     signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, motion: bool = False
 ) -> CochlearOutput:
-    """Filter and compress a sound in some channels, as the inner ear does.
+    """Filter and compress a sound in some channels, as the cochlea with its outer hair cells does.
 
     Args:
-        signal: Sound behind the middle ear, in multiples of 20 uPa. Shape: (items, padded).
+        signal: Sound behind the middle ear at 24 kHz, in multiples of 20 uPa. Shape: (items,
+            padded), where ``padded`` is a multiple of 64 samples.
         ear: Hair cells of all channels. Shape: (items, 32) or (32,).
         channels: Channels to compute.
-        extent: Number of samples of each item before padding.
-        motion: Return the motion of the basilar membrane and the long-term level, too.
+        extent: Number of samples at 24 kHz of each item without its padding.
+        motion: Whether to return the motion of the basilar membrane and the long-term level, which
+            are empty otherwise.
+
+    Returns:
+        Response of the channels, see ``CochlearOutput``. Shape: (items, channels, padded).
 
     >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
     >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)

@@ -131,13 +131,22 @@ def _recursion(
     device: torch.device,
     dtype: torch.dtype,
 ) -> Recursion:
-    """Return a filter in state-space form as matrices for blocks, on a device in a precision.
+    """Return a filter in state-space form as matrices for blocks of 64 samples.
 
-    With the input u, the output is y = c x + d u, and the next state is a x + b u. The state is
-    balanced, so that single precision suffices.
+    With the input u and the state x, the output is y = c x + d u, and the next state is a x + b u.
+    The state is balanced, so that single precision suffices.
+
+    Args:
+        a: Matrix from a state to the next one, of a stable filter. Shape: (states, states).
+        b: Column from the input to the state. Shape: (states, 1).
+        c: Row from the state to the output. Shape: (1, states).
+        d: Factor from the input to the output.
+        memory: Number of samples after which the influence of an input sample has vanished.
+        device: Device of the matrices.
+        dtype: Precision of the matrices.
     """
-    # Balancing makes all states equally large. Otherwise a large and a small state of a slow
-    # filter, such as adaptation, would cancel in single precision.
+    # Balancing makes each state as easily reached as observed. Otherwise a large and a small state
+    # of a slow filter, such as adaptation, would cancel in single precision.
     root = scipy.linalg.cholesky(scipy.linalg.solve_discrete_lyapunov(a, b @ b.T), lower=True)
     observability = scipy.linalg.solve_discrete_lyapunov(a.T, c.T @ c)
     rotation, singular_values, _ = np.linalg.svd(root.T @ observability @ root)
