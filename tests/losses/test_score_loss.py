@@ -43,5 +43,5 @@ def test_nan_affects_only_its_item_and_short_items_are_rejected(clean: Tensor) -
     outputs[0, 300] = torch.nan
     arguments = outputs, clean.expand(2, -1), N3.expand(2, -1)
     assert score_loss("haspi", *arguments, [TIME] * 2, 16000).isnan().tolist() == [True, False]
-    with pytest.raises(ValueError, match="^item 1: clean has an item of 0"):
+    with pytest.raises(ValueError, match=r"^item 1: clean has an item of 0"):
         score_loss("haspi", *arguments, [TIME, 8000], 16000)
