@@ -31,8 +31,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
     tensor([0.+0.j, 2.+0.j, 0.+0.j])
     """
     points = signals.shape[-1] if points is None else points
-    spectrum: Tensor = _RFFT.apply(signals[..., :points], points)
-    return spectrum
+    return _RFFT.apply(signals[..., :points], points)
 
 
 class _RFFT(torch.autograd.Function):
@@ -94,8 +93,7 @@ def power(spectrum: Tensor) -> Tensor:
     >>> power(torch.tensor([3.0 + 4.0j]))
     tensor([25.])
     """
-    powers: Tensor = _Power.apply(spectrum)
-    return powers
+    return _Power.apply(spectrum)
 
 
 class _Power(torch.autograd.Function):
@@ -135,5 +133,4 @@ def fade_out_weights(bins: int, spacing: float, end: float) -> NDArray[np.float6
     [1.  1.  1.  0.5 0. ]
     """
     distance_to_end = np.clip((end - spacing * np.arange(bins)) / FADE_HZ, 0.0, 1.0)
-    weights: NDArray[np.float64] = np.sin(0.5 * np.pi * distance_to_end) ** 2
-    return weights
+    return np.sin(0.5 * np.pi * distance_to_end) ** 2

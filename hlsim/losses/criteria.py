@@ -54,7 +54,7 @@ class Comparison:
     >>> signals = dict.fromkeys(_SIGNALS, torch.zeros(1, 800))
     >>> further = {"ears": torch.zeros(1, 8), "lengths": [500], "sample_rate": 16000}
     >>> comparison = Comparison(**signals, **further)
-    >>> comparison.without_padding(0).output.shape
+    >>> comparison.without_padding(slice(0, 1)).output.shape
     torch.Size([1, 500])
     """
 
@@ -67,11 +67,11 @@ class Comparison:
     lengths: Sequence[int]
     sample_rate: int
 
-    def without_padding(self, item: int) -> Comparison:
-        """Return the signals of one item, (1, time), cut to its length."""
-        length = self.lengths[item]
-        signals = {name: getattr(self, name)[item, None, :length] for name in _SIGNALS}
-        return replace(self, **signals, ears=self.ears[item, None], lengths=[length])
+    def without_padding(self, items: slice) -> Comparison:
+        """Return the signals of some items that have one length, cut to this length."""
+        lengths = self.lengths[items]
+        signals = {name: getattr(self, name)[items, : lengths[0]] for name in _SIGNALS}
+        return replace(self, **signals, ears=self.ears[items], lengths=lengths)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +85,9 @@ class Criterion:
             compares the output of the aid with clean speech.
         limits_gradient: Whether spikes of the gradient with respect to the output are limited.
         handles_padding: Whether ``compute`` takes account of ``Comparison.lengths``. Otherwise the
-            items of a padded batch are cut and compared one by one.
-        two_ears: Whether successive items are the left and the right ear of a listener.
+            items of a padded batch are cut and compared one by one, or both ears at once.
+        two_ears: Whether successive items are the left and the right ear of a listener, which have
+            the same length.
 
     >>> CRITERIA["interaural"].two_ears
     True
@@ -105,9 +106,12 @@ class Criterion:
         is_padded = any(length < time for length in comparison.lengths)
         if self.handles_padding or not is_padded:
             return self.compute(comparison)
-        indices = range(len(comparison.lengths))
-        items = [self.compute(comparison.without_padding(item)) for item in indices]
-        return {part: torch.cat([item[part] for item in items]) for part in self.weights}
+        at_once = 2 if self.two_ears else 1
+        results = [
+            self.compute(comparison.without_padding(slice(start, start + at_once)))
+            for start in range(0, len(comparison.lengths), at_once)
+        ]
+        return {part: torch.cat([result[part] for result in results]) for part in self.weights}
 
 
 def _coherent_bands(signals: Comparison) -> dict[str, Tensor]:
@@ -143,14 +147,7 @@ def _score(name: str, signals: Comparison) -> dict[str, Tensor]:
 def _interaural(signals: Comparison) -> dict[str, Tensor]:
     output = signals.limited_output.unflatten(0, (-1, 2))
     clean = signals.clean.unflatten(0, (-1, 2))
-    ends = signals.lengths[::2]  # both ears have the same length
-    if set(ends) == {output.shape[-1]}:
-        changes = interaural_loss(output, clean, signals.sample_rate)
-    else:
-        # Means over frames would contain the silence after the end of an item.
-        pairs = zip(output, clean, ends, strict=True)
-        values = [interaural_loss(o[..., :n], c[..., :n], signals.sample_rate) for o, c, n in pairs]
-        changes = torch.stack(values)
+    changes = interaural_loss(output, clean, signals.sample_rate)
     return {"interaural": changes.repeat_interleave(2)}
 
 
@@ -185,7 +182,6 @@ CRITERIA = {
         weights={"interaural": 1.0},
         compute=_interaural,
         reference=None,
-        handles_padding=True,
         two_ears=True,
     ),
 }

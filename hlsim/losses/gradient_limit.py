@@ -54,8 +54,7 @@ def limit_gradient_spikes(
     >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
     True
     """
-    limited: Tensor = _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
-    return limited
+    return _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
 
 
 class _GradientLimiter(torch.autograd.Function):

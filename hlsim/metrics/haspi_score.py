@@ -151,7 +151,7 @@ class HaspiReference(Reference):
     ) -> None:
         super().__init__(
             clean,
-            None,
+            "NH",
             sample_rate=sample_rate,
             full_scale_spl=full_scale_spl,
             lengths=lengths,
@@ -270,10 +270,6 @@ def _cepstrum(clean: _Channels, output: Tensor, ear: HairCells, extent: Extent) 
     return envelopes.cepstrum(frames, channels)
 
 
-FRAMES_AT_ONCE = 2048
-"""Frames of noise whose cepstrum is computed at once."""
-
-
 def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Tensor:
     """Draw the internal noise of the ear for clean speech and for the output, as pyclarity does.
 
@@ -289,27 +285,12 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
     for item, (samples, frames) in enumerate(zip(extent.ends, audible.ends, strict=True)):
         random = np.random.RandomState(seed)
-        # the noise of other scores, which pyclarity draws before
-        _skip_normal_numbers(random, 2 * CHANNELS * samples)
+        for _ in range(2 * CHANNELS):  # the noise of other scores, which pyclarity draws before
+            random.standard_normal(samples)
         for signal in (0, 1):
             levels = torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like.dtype)
-            parts = [envelopes.cepstrum(part.mT) for part in levels.split(FRAMES_AT_ONCE)]
-            noise[signal, item, :, :frames] = envelopes.NOISE_DB * torch.cat(parts, -1)
+            noise[signal, item, :, :frames] = envelopes.NOISE_DB * envelopes.cepstrum(levels.mT)
     return noise.to(like.device)
-
-
-def _skip_normal_numbers(random: np.random.RandomState, count: int) -> None:
-    """Bring a generator to the state after an even number of normally distributed numbers.
-
-    The generator draws points in a square until one lies in the unit circle, which gives two
-    numbers. To count these points takes half the time of computing the numbers.
-    """
-    missing_points = count // 2
-    while missing_points:
-        points = 2.0 * random.random_sample((min(missing_points, 2**14), 2)) - 1.0
-        points *= points
-        square = points[:, 0] + points[:, 1]
-        missing_points -= int(np.count_nonzero((square > 0.0) & (square < 1.0)))
 
 
 # -- networks --------------------------------------------------------------------------------------

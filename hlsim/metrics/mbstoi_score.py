@@ -191,8 +191,7 @@ def _frames_to_end(counts: list[int], device: torch.device) -> Tensor:
 @constant
 def _window() -> NDArray[np.float64]:
     """Return a Hann window without the zeros at its ends."""
-    window: NDArray[np.float64] = np.hanning(FRAME + 2)[1:-1]
-    return window
+    return np.hanning(FRAME + 2)[1:-1]
 
 
 def _band_features(frames: Tensor) -> Tensor:

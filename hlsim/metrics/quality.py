@@ -113,8 +113,6 @@ class QualityReference(Reference):
     True
     """
 
-    _needs_ear = True
-
     envelope_segment: ClassVar[int]
     """Samples of a segment of the smoothed envelopes at 24 kHz."""
 

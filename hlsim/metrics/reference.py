@@ -62,7 +62,7 @@ class Reference(ABC):
     Args:
         clean: Clean signals. The scores have their dtype and their device. Their gradient is not
             computed. Shape: (..., time).
-        audiogram: Ear that receives the clean signals, or one for each item; None for a normal ear.
+        audiogram: Ear that receives the clean signals, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
@@ -81,12 +81,10 @@ class Reference(ABC):
     True
     """
 
-    _needs_ear = False  # Whether the features of clean signals depend on the ear.
-
     def __init__(
         self,
         clean: Samples,
-        audiogram: AudiogramLike | None,
+        audiogram: AudiogramLike,
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
@@ -114,8 +112,7 @@ class Reference(ABC):
                 "because a score means nothing below; pass longer signals"
             )
         check_finite("clean", self._rows)
-        if self._needs_ear or audiogram is not None:
-            self._ears = self._thresholds(audiogram)
+        self._ears = self._thresholds(audiogram)
         self._groups = [slice(0, items)]
         if clean.device.type == "cpu":
             self._groups = [slice(item, item + 1) for item in range(items)]
@@ -123,11 +120,11 @@ class Reference(ABC):
         if keep:
             self._batches = map_on_cores(self._prepare, self._groups, self._clean)
 
-    def _thresholds(self, audiogram: AudiogramLike | None) -> Tensor:
+    def _thresholds(self, audiogram: AudiogramLike) -> Tensor:
         """Return the thresholds in dB HL of the ear of each item. Shape: -> (items, 8).
 
         Args:
-            audiogram: One ear, or one for each item; None raises ValueError.
+            audiogram: One ear, or one for each item.
         """
         shape = self._clean.shape[:-1]
         ears = resolve_thresholds(None, audiogram, self._clean, highest=HIGHEST_LEVEL)

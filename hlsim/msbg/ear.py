@@ -72,7 +72,4 @@ def lowpass_filter() -> NDArray[np.float64]:
     >>> lowpass_filter().shape
     (133,)
     """
-    taps: NDArray[np.float64] = scipy.signal.firwin(
-        133, 18000.0, window=("kaiser", 8.0), fs=MSBG_RATE
-    )
-    return taps
+    return scipy.signal.firwin(133, 18000.0, window=("kaiser", 8.0), fs=MSBG_RATE)

@@ -73,8 +73,7 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
     tensor(1.+0.j)
     """
     # Autocast may return maps of lower precision.
-    factor: Tensor = _PhaseFactor.apply(log_gain, *maps.to(log_gain.dtype).unbind(1))
-    return factor
+    return _PhaseFactor.apply(log_gain, *maps.to(log_gain.dtype).unbind(1))
 
 
 class _PhaseFactor(torch.autograd.Function):

@@ -57,8 +57,7 @@ class AudiogramEncoder(nn.Module):
     def forward(self, thresholds: Tensor) -> Tensor:
         """Encode audiograms in dB HL. Shape: (items, 8) -> (items, frequencies)."""
         features = torch.relu(self.conv(thresholds.unsqueeze(1) / 100.0))
-        encoded: Tensor = self.project(self.pool(features).flatten(1))
-        return encoded
+        return self.project(self.pool(features).flatten(1))
 
 
 class Unit(nn.Sequential):
@@ -144,5 +143,4 @@ class DenseEncoder(nn.Module):
         self.dense = DenseBlock(channels, depth, normalise)
 
     def forward(self, features: Tensor) -> Tensor:
-        encoded: Tensor = self.dense(self.enter(features))
-        return encoded
+        return self.dense(self.enter(features))

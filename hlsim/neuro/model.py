@@ -91,8 +91,7 @@ class NeuroMSBG(EarNetwork):
         if cls is NeuroMSBG:
             is_bands = config is not None and config.structure == "bands"
             kind = BandNeuroMSBG if is_bands else DualPathNeuroMSBG
-        network: Self = super().__new__(kind)
-        return network
+        return super().__new__(kind)
 
     def __init__(
         self,

@@ -42,8 +42,7 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
 
 @constant
 def _step_response(points: int) -> NDArray[np.complex128]:
-    step: NDArray[np.complex128] = np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
-    return step
+    return np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
 
 
 def _lag_points(extent: Extent) -> int:
@@ -107,8 +106,7 @@ def shift(
     >>> shift(signal, torch.tensor([1]), ends=(3,), stops=(3,), size=4)
     tensor([[0., 1., 2., 0.]])
     """
-    delayed: Tensor = _Shift.apply(signal, delays, ends, stops, size)
-    return delayed
+    return _Shift.apply(signal, delays, ends, stops, size)
 
 
 class _Shift(torch.autograd.Function):

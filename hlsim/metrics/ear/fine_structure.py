@@ -109,8 +109,7 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
 def _half_windows(segment: int) -> NDArray[np.float64]:
     """Return the rising and the falling half of a Hann window, each of sum 1: (segment / 2, 2)."""
     window = np.hanning(segment).reshape(2, segment // 2).T
-    halves: NDArray[np.float64] = window / window.sum(0)
-    return halves
+    return window / window.sum(0)
 
 
 def envelope_correlation(

@@ -131,10 +131,7 @@ def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
 @constant
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
     sections = scipy.signal.cheby2(7, 30, 21000.0 / rate, output="sos")
-    response: NDArray[np.complex128] = scipy.signal.sosfreqz(
-        sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points
-    )[1]
-    return response
+    return scipy.signal.sosfreqz(sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points)[1]
 
 
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:

@@ -90,8 +90,7 @@ def centre_frequencies() -> NDArray[np.float64]:
     steps = np.linspace(
         math.log(MIN_CENTRE_HZ + offset), math.log(MAX_CENTRE_HZ + offset), CHANNELS
     )
-    centres: NDArray[np.float64] = np.exp(steps) - offset
-    return centres
+    return np.exp(steps) - offset
 
 
 @constant

@@ -66,5 +66,4 @@ class Mamba(nn.Module):
                 z=gate.to(dtype).mT,
                 delta_bias=self.dt_proj.bias,
             )
-        output: Tensor = self.out_proj(y.mT)
-        return output
+        return self.out_proj(y.mT)

@@ -70,10 +70,7 @@ def selective_scan(
     """
     kernel = _kernel_for(u)
     if kernel is not None:
-        output: Tensor = kernel(
-            u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=True
-        )
-        return output
+        return kernel(u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=True)
     steps = functional.softplus(delta + delta_bias.unsqueeze(-1))
     y = _SelectiveScan.apply(steps.mT, u.mT, B.mT, C.mT, A.mT.contiguous()).mT
     return torch.addcmul(y, u, D.unsqueeze(-1)) * functional.silu(z)
@@ -136,8 +133,7 @@ class _SelectiveScan(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        gradients: tuple[Tensor, ...] = _ScanGradient.apply(gradient, *ctx.saved_tensors)
-        return gradients
+        return _ScanGradient.apply(gradient, *ctx.saved_tensors)
 
 
 class _ScanGradient(torch.autograd.Function):
