@@ -66,7 +66,12 @@ def _srt(options: argparse.Namespace) -> None:
             show=progress,
             **sliders,
         )
-    tests = {"unaided": result.unaided, "aided": result.aided, "benefit": result.benefit}
+    tests = {
+        "unaided": result.unaided,
+        "aided": result.aided,
+        "benefit": result.benefit,
+        "people with this mean loss": result.people,
+    }
     for number, name in enumerate(ears):
         texts = [f"{test} {_in_words(value, number)}" for test, value in tests.items() if value]
         print(f"{name}, {result.pta[number]:.0f} dB HL: {', '.join(texts)}")

@@ -22,6 +22,7 @@ from hlsim.evaluation.digits.material import (
     perceive,
     present,
 )
+from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
 from hlsim.simulators import load_simulator
 
@@ -147,6 +148,14 @@ def test_the_same_call_has_the_same_bits_and_ears_are_independent() -> None:
     assert reception_threshold("N4", seed=1, **QUICK).unaided.value != alone.unaided.value
 
 
+def test_people_have_the_two_lines_that_were_fitted() -> None:
+    people = people_threshold([0.0, 30.0, 50.0])  # docs/figures/digits_people.py
+    np.testing.assert_allclose(people.value, [-9.21, -6.24, -0.62], atol=0.01)
+    assert (np.diff(people.high - people.low) > 0.0).all()
+    result = reception_threshold(["NH", "N3"], **QUICK)
+    np.testing.assert_array_equal(result.people.value, people_threshold([0.0, 46.25]).value)
+
+
 def test_sliders_reach_the_aid() -> None:
     gains = []
 
@@ -192,7 +201,7 @@ def test_command_prints_a_line_per_ear(capsys: pytest.CaptureFixture[str], tmp_p
     assert main([*words, *quick]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(",")[0] for line in lines] == ["N2", "N4"]
-    assert all(word in lines[1] for word in ("unaided", "aided", "benefit", "62 dB HL"))
+    assert all(word in lines[1] for word in ("unaided", "aided", "benefit", "people", "62 dB HL"))
     table = tmp_path / "ears.csv"
     table.write_text("listener,L500,L4000,R500,R4000\nA,20,30,50,60\n")
     assert main(["srt", "--listener", str(table), *quick]) == 0

@@ -28,6 +28,7 @@ from hlsim.checkpoint import DIGIT_LISTENER
 from hlsim.checks import check_number, loud_outputs
 from hlsim.evaluation.digits.listener import DigitListener, load_listener
 from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
+from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import (
     HIGHEST_SNR,
     LOWEST_SNR,
@@ -67,6 +68,8 @@ class ReceptionThreshold:
         benefit: Unaided minus aided threshold in dB, or None without an aid. Its interval counts
             the errors of both thresholds as independent, although both come from the same triplets.
         pta: Pure-tone average in dB HL, the mean threshold at 500, 1000, 2000 and 4000 Hz.
+        people: Unaided threshold of people with this mean loss, and the range of 95 % of them, in
+            the same noise of 65 dB SPL. The simulated listener differs from them (docs/digits.md).
 
     >>> import hlsim
     >>> result = hlsim.reception_threshold("N2", simulator="attenuation", triplets=30)
@@ -78,6 +81,7 @@ class ReceptionThreshold:
     aided: Estimate | None
     benefit: Estimate | None
     pta: Any
+    people: Estimate
 
 
 @dataclass(frozen=True)
@@ -216,4 +220,4 @@ def reception_threshold(
     aided = None if aid is None else conditions[1]
     benefit = None if aided is None else subtract(unaided, aided)
     pta = in_shape_of_ears(ears.double()[:, _PTA].mean(-1).numpy())
-    return ReceptionThreshold(unaided, aided, benefit, pta)
+    return ReceptionThreshold(unaided, aided, benefit, pta, people_threshold(pta))

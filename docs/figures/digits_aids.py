@@ -1,0 +1,44 @@
+"""Measure the benefit of aids in the digit test, and print a table.
+
+    python docs/figures/digits_aids.py [--ears N3 N4] [--simulator msbg] [--triplets 120]
+        [--listener FOLDER]
+
+Each cell is the unaided minus the aided threshold in dB, with its interval of 95 %.
+"""
+
+import argparse
+
+from hlsim import reception_threshold
+
+AIDS = {
+    "NAL-R": ("nalr", {}),
+    "`hearing-aid` without noise reduction": ("hearing-aid", {"noise_reduction": 0.0}),
+    "`hearing-aid`, half of it": ("hearing-aid", {"noise_reduction": 0.5}),
+    "`hearing-aid`, all of it": ("hearing-aid", {"noise_reduction": 1.0}),
+    "`compensator-general`": ("compensator-general", {}),
+}
+"""Name of the checkpoint and sliders of each aid."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--ears", nargs="+", default=["N2", "N3", "N4", "N5", "S2"])
+    parser.add_argument("--simulator", default="msbg")
+    parser.add_argument("--listener", default="digit-listener")
+    parser.add_argument("--triplets", type=int, default=120)
+    options = parser.parse_args()
+    settings = {name: getattr(options, name) for name in ("simulator", "listener", "triplets")}
+    print(f"| aid | {' | '.join(options.ears)} |\n|---|{'---|' * len(options.ears)}")
+    for label, (name, sliders) in AIDS.items():
+        result = reception_threshold(options.ears, name, **settings, **sliders)
+        if label == "NAL-R":
+            print(f"| unaided threshold | {' | '.join(f'{x:.1f}' for x in result.unaided.value)} |")
+        cells = [
+            f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+            for value, low, high in zip(*result.benefit, strict=True)
+        ]
+        print(f"| {label} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

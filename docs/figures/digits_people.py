@@ -1,0 +1,218 @@
+"""Compare thresholds of simulated ears in the digit test with those of people, and draw them.
+
+    python docs/figures/digits_people.py thresholds_in_noise.csv --out digits-people [--every 3]
+
+The table has a row per person with audiograms (``left_500``, ..., dB HL) and the threshold of a
+test with digit triplets in noise of 65 dB SPL, free field (``srt_db_snr``). It was made from the
+Oldenburg Hearing Health Record (Jafri et al. 2025, doi 10.5281/zenodo.16919812, CC BY 4.0). Each
+person is tested with the ear of the lower pure-tone average (PTA), behind three simulators.
+``--every 3`` takes every third person in the order of PTA. Tests that OUT.jsonl has are not
+repeated. docs/digits-people.png is the figure.
+
+Only one number is fitted, the difference between the skill of the listener and that of people. For
+the error of each person, it is the mean difference of all others.
+"""
+
+import argparse
+import csv
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib import pyplot
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+
+from hlsim import Audiogram, reception_threshold
+from hlsim.audiogram import HIGHEST_SIMULATED
+from hlsim.progress import ProgressLine
+
+Array = NDArray[np.float64]
+
+SIMULATORS = {
+    "attenuation": "linear ear",
+    "msbg-unsmeared": "MSBG without smearing",
+    "msbg": "MSBG",
+}
+"""Names for the tables by simulator."""
+
+HERTZ = (125, 250, 500, 750, 1000, 1500, 2000, 4000)
+
+GROUPS = {"below 20": (-99, 20), "20 to 35": (20, 35), "35 to 50": (35, 50), "from 50": (50, 999)}
+"""Limits of the PTA in dB HL of groups of people."""
+
+AT_ONCE = 8
+"""Number of people per call of ``reception_threshold``."""
+
+BENDS = np.arange(15.0, 56.0)
+"""Bends in dB HL among which the best one is found."""
+
+DRAWS = 300
+"""Bootstrap samples of people."""
+
+
+def read_people(path: Path) -> list[tuple[str, float, Audiogram]]:
+    """Read name, threshold in noise and better ear of each person, in the order of PTA."""
+    people = []
+    with path.open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            ears = []
+            for side in ("left", "right"):
+                measured = {hz: row[f"{side}_{hz}"] for hz in HERTZ if row[f"{side}_{hz}"]}
+                levels = {hz: min(float(x), HIGHEST_SIMULATED) for hz, x in measured.items()}
+                if {500, 1000, 2000, 4000} <= levels.keys():
+                    ears.append(Audiogram(tuple(levels.values()), tuple(levels)))
+            better = min(ears, key=lambda ear: ear.pta)
+            people.append((row["person"], float(row["srt_db_snr"]), better))
+    return sorted(people, key=lambda person: person[2].pta)
+
+
+def run_tests(people: list[tuple[str, float, Audiogram]], triplets: int, path: Path) -> None:
+    """Test each person behind each simulator, and append a line per test to a file."""
+    tests = {(name, simulator) for name, _, _ in people for simulator in SIMULATORS}
+    finished = tests & {(row["person"], row["simulator"]) for row in read_tests(path)}
+    total, done = len(tests), len(finished)
+    with ProgressLine("tests") as progress, path.open("a", encoding="utf-8") as file:
+        for start in range(0, len(people), AT_ONCE):
+            for name in SIMULATORS:
+                part = people[start : start + AT_ONCE]
+                part = [person for person in part if (person[0], name) not in finished]
+                if not part:
+                    continue
+                ears = [ear for _, _, ear in part]
+                result = reception_threshold(ears, simulator=name, triplets=triplets)
+                for (person, srt, ear), value in zip(part, result.unaided.value, strict=True):
+                    row = {"person": person, "simulator": name, "people": srt, "pta": ear.pta}
+                    row["hlsim"] = float(value)
+                    file.write(json.dumps(row) + "\n")
+                file.flush()
+                done += len(part)
+                progress(done, total)
+
+
+def read_tests(path: Path) -> list[dict]:
+    """Read the lines of ``run_tests``, none if there is no file."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def fit_two_lines(pta: Array, srt: Array) -> tuple[float, float, float]:
+    """Fit two lines that meet, and return the slope below, the slope above and the bend."""
+    fits = []
+    for bend in BENDS:
+        design = np.stack([np.ones_like(pta), pta, np.maximum(pta - bend, 0.0)], 1)
+        weights = np.linalg.lstsq(design, srt, rcond=None)[0]
+        error = np.square(design @ weights - srt).sum()
+        fits.append((error, weights[1], weights[1] + weights[2], bend))
+    return min(fits)[1:]
+
+
+def intervals(statistics: Callable[[Array], Sequence[float]], count: int) -> list[str]:
+    """Format statistics of people with their bootstrap intervals of 95 %.
+
+    Args:
+        statistics: Function of the indices of people.
+        count: Number of people.
+    """
+    rng = np.random.default_rng(0)
+    values = [statistics(rng.integers(count, size=count)) for _ in range(DRAWS)]
+    limits = np.quantile(values, [0.025, 0.975], axis=0)
+    estimates = zip(statistics(np.arange(count)), *limits, strict=True)
+    return [f"{value:.2f} [{low:.2f}, {high:.2f}]" for value, low, high in estimates]
+
+
+def compare(people: Array, hlsim: Array, error: Array) -> tuple[float, ...]:
+    """Compute rank correlation, correlation, median absolute error and root mean square error."""
+    rank, r = spearmanr(hlsim, people)[0], np.corrcoef(hlsim, people)[0, 1]
+    return rank, r, np.median(np.abs(error)), np.sqrt(np.square(error).mean())
+
+
+def print_table(head: str, rows: list[list[str]]) -> None:
+    """Print a table in Markdown."""
+    columns = head.count("|") + 1
+    print(f"\n| {head} |\n|{'---|' * columns}")
+    for row in rows:
+        print(f"| {' | '.join(row)} |")
+
+
+def report(tests: dict[str, list[dict]]) -> None:
+    """Print all tables."""
+    agreement, slopes, groups = [], [], []
+    for name, label in SIMULATORS.items():
+        pta, people, hlsim = (
+            np.array([row[key] for row in tests[name]]) for key in ("pta", "people", "hlsim")
+        )
+        count = len(pta)
+        difference = people - hlsim
+        offset = difference.mean()
+        error = (offset - difference) * count / (count - 1)  # with the offset of all others
+        columns = intervals(lambda i, x=(people, hlsim, error): compare(*(v[i] for v in x)), count)
+        agreement.append([label, *columns, f"{offset:+.1f}"])
+        sources = {label: hlsim, "people": people} if name == "msbg" else {label: hlsim}
+        for source, srt in sources.items():
+            columns = intervals(lambda i, x=(pta, srt): fit_two_lines(*(v[i] for v in x)), count)
+            slopes.append([source, *columns])
+        for group, (low, high) in GROUPS.items():
+            inside = error[(pta >= low) & (pta < high)]
+            groups.append(
+                [
+                    label,
+                    group,
+                    str(len(inside)),
+                    f"{inside.mean():+.1f}",
+                    f"{np.median(np.abs(inside)):.1f}",
+                    f"{np.sqrt(np.square(inside).mean()):.1f}",
+                ]
+            )
+    print(f"{len(tests['msbg'])} people")
+    print_table("ear | rank r | r | median absolute error | RMSE | offset", agreement)
+    print_table("source | slope below the bend | above | bend (dB HL)", slopes)
+    print_table("ear | PTA (dB HL) | people | bias | median absolute error | RMSE", groups)
+
+
+def draw(tests: dict[str, list[dict]], everybody: list[tuple[str, float, Audiogram]]) -> None:
+    """Draw people as dots and each ear as a line, the mean over five neighbours."""
+    figure, axes = pyplot.subplots(figsize=(8.0, 4.0), layout="constrained")
+    pta = [ear.pta for _, _, ear in everybody]
+    srt = [threshold for _, threshold, _ in everybody]
+    axes.plot(pta, srt, ".", color="0.65", label=f"people ({len(pta)})")
+    for name, label in SIMULATORS.items():
+        rows = tests[name]
+        offset = np.mean([row["people"] - row["hlsim"] for row in rows])
+        window = np.ones(5) / 5.0
+        smooth = [
+            np.convolve([row[key] for row in rows], window, "valid") for key in ("pta", "hlsim")
+        ]
+        axes.plot(smooth[0], smooth[1] + offset, label=label)
+    axes.set(xlabel="pure-tone average of the better ear (dB HL)", ylabel="threshold (dB SNR)")
+    axes.set(title="Digits in noise, unaided", ylim=(-13.0, 16.0))
+    axes.legend(fontsize="small")
+    figure.savefig(Path(__file__).parents[1] / "digits-people.png", dpi=110)
+    pyplot.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("table", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="path without the ending .jsonl")
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--triplets", type=int, default=100)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    everybody = read_people(options.table)
+    people = everybody[:: options.every]
+    path = options.out.with_suffix(".jsonl")
+    run_tests(people, options.triplets, path)
+    names = {person for person, _, _ in people}
+    rows = sorted(read_tests(path), key=lambda row: row["pta"])
+    tests = {
+        name: [row for row in rows if row["simulator"] == name and row["person"] in names]
+        for name in SIMULATORS
+    }
+    report(tests)
+    draw(tests, everybody)
+
+
+if __name__ == "__main__":
+    main()
