@@ -380,7 +380,13 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
     figure = Figure(figsize=(9.2, 6.4), layout="constrained")
     places = figure.subplots(2, 2).ravel()
     for axes, (hz, part) in zip(places, rows.groupby("hz"), strict=False):
-        axes.scatter(part.hearing_level, part.depth, s=10, color="tab:orange", label="people")
+        groups = part.groupby(part.hearing_level.round(-1))
+        is_group = groups.size() >= 3
+        means, deviations = groups.depth.mean()[is_group], groups.depth.std()[is_group]
+        style = {"fmt": "o", "color": "tab:orange", "capsize": 2}
+        axes.errorbar(
+            means.index, means, deviations, label="people, mean and SD of 3 or more", **style
+        )
         for name in TUNED:
             curve = simulated[simulated.hz == hz]
             axes.plot(curve.threshold, curve[name], color=COLOURS[name], label=f"{name}, flat loss")
