@@ -4,7 +4,7 @@ The insertion gain is the level of an aid's output minus that of its input in dB
 octave around a frequency. It is measured with noise that has the spectrum of average speech.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -17,10 +17,11 @@ from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
     has_listeners,
+    resolve_thresholds,
     store_thresholds,
 )
-from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import check_number
+from hlsim.calibration import PASCAL_SPL, check_full_scale
+from hlsim.checks import check_number, check_rate
 from hlsim.dsp.fft import power
 from hlsim.torchtools import constant
 
@@ -28,9 +29,15 @@ from hlsim.torchtools import constant
 class Aid(nn.Module):
     """Base class of aids, which may store an ear, and measure how much they amplify a noise.
 
-    Subclasses implement ``_amplify``.
+    Subclasses implement ``forward`` and ``_amplify``.
+
+    Args:
+        audiogram: One or more ears, which are used by all calls that pass none.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Attributes:
+        highest_level: Highest threshold that is accepted, in dB HL.
         thresholds: Thresholds in dB HL of the ears that calls without an audiogram use, (..., 8);
             None if there are none.
 
@@ -39,23 +46,49 @@ class Aid(nn.Module):
     True
     """
 
-    thresholds: Tensor | None
-    _two_ears: bool
+    highest_level: ClassVar[float] = HIGHEST_SIMULATED
 
-    def store_ears(
-        self, audiogram: AudiogramLike | None, highest: float = HIGHEST_SIMULATED
+    thresholds: Tensor | None
+
+    def __init__(
+        self,
+        audiogram: AudiogramLike | None = None,
+        *,
+        sample_rate: int = RATE,
+        full_scale_spl: float = PASCAL_SPL,
     ) -> None:
+        super().__init__()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+        self.store_ears(audiogram)
+
+    def store_ears(self, audiogram: AudiogramLike | None) -> None:
         """Store the ears that calls without an audiogram use.
 
         Args:
             audiogram: One or more ears, or None.
-            highest: Highest level allowed, in dB HL.
 
         Raises:
             ValueError: An ear is not valid.
         """
-        self.thresholds = store_thresholds(audiogram, highest=highest)
+        self.thresholds = store_thresholds(audiogram, highest=self.highest_level)
         self._two_ears = has_listeners(audiogram)
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+        """Return the output for whole signals, time-aligned with the input.
+
+        Args:
+            waveform: Input of the aid.
+            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
+                leading dimensions of the waveform; by default those of the constructor.
+
+        Shape: (..., time) -> (..., time).
+
+        Raises:
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (120 for
+                NAL-R), shapes do not fit, or the waveform is on another device than the weights.
+        """
+        raise NotImplementedError
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> Any:
         """Raise ValueError, because only ``WDRC`` and ``HearingAid`` process a signal in chunks."""
@@ -97,26 +130,27 @@ class Aid(nn.Module):
         )
         return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
 
-    def find_thresholds(
-        self, audiogram: AudiogramLike | None, highest: float = HIGHEST_SIMULATED
-    ) -> Tensor:
+    def find_thresholds(self, audiogram: AudiogramLike | None) -> Tensor:
         """Return the thresholds of the ears of a call, (..., 8), or else the stored ones.
 
         Args:
             audiogram: Ears that were passed with the call, or None.
-            highest: Highest level allowed, in dB HL.
 
         Raises:
             ValueError: There are no ears, or an ear is not valid.
         """
-        if audiogram is None and self.thresholds is not None:
-            return self.thresholds
-        if audiogram is None:
-            raise ValueError(
-                "expected an audiogram, got None; pass one, or build the aid with one, as in "
-                "WDRC('N3')"
-            )
-        return as_thresholds(audiogram, highest=highest)
+        ears = self.thresholds if audiogram is None else audiogram
+        return as_thresholds(ears, highest=self.highest_level)
+
+    def resolve_thresholds(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
+        """Return the thresholds with which a waveform is processed, see ``resolve_thresholds``."""
+        return resolve_thresholds(
+            self.thresholds,
+            audiogram,
+            waveform,
+            two_ears=self._two_ears,
+            highest=self.highest_level,
+        )
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Return the output for signals in pascals at 16 kHz, without noise reduction and limit.

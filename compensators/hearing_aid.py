@@ -144,24 +144,17 @@ class HearingAid(Wearable):
         noise_reduction: Slider = DEFAULT_NOISE_REDUCTION,
         amplification: Slider = 1.0,
     ) -> Tensor:
-        """Return the output for a whole signal, time-aligned with the input.
+        """Return the output for whole signals, see ``Aid.forward``.
 
         Args:
             waveform: Input of the aid.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform; by default those of the constructor.
+            audiogram: Ears of the signals, by default those of the constructor.
             noise_reduction: Share of the attenuation of noise that is applied, 0 to 1: one number,
                 or one value per item.
-            amplification: Share of the amplification that is applied, 0 to 1: one number, or one
-                value per item.
-
-        Shape: (..., time) -> (..., time).
-
-        Raises:
-            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, a slider is
-                outside 0 to 1, or shapes do not fit.
+            amplification: Share of the amplification that is applied, likewise.
         """
-        return self._process_signals(waveform, audiogram, (noise_reduction, amplification))
+        sliders = {"noise_reduction": noise_reduction, "amplification": amplification}
+        return super().forward(waveform, audiogram, **sliders)
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State

@@ -60,7 +60,6 @@ def process_blocks(
     margin = math.ceil(_MARGIN_SECONDS * rate / unit) * unit
     blocks = split_into_blocks(samples, round(_BLOCK_SECONDS * rate), 2 * margin, 2 * margin, unit)
     gain = gain_to_pascals(aid.full_scale_spl)
-    settings = {**aid.SLIDERS, **sliders}.values()
     state: State | None = None
     # Where a block is cut, resampling lacks context. The aid starts one margin later, with the
     # state that the block before had reached there.
@@ -70,7 +69,7 @@ def process_blocks(
     ):
         check_waveform(waveform, full_scale_spl=aid.full_scale_spl)
         batch, fitted = aid.prepare(waveform, audiogram)
-        values = aid.stack_sliders([*settings], batch, fitted)
+        values = aid.stack_sliders(sliders, batch, fitted)
         if state is None:
             state = aid.initial_state(values)
         signals = flatten_items(waveform, batch, fitted.dtype) * gain

@@ -77,7 +77,7 @@ class MappingCompensator(Aid, EarNetwork):
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
-        super().__init__(sample_rate, full_scale_spl)
+        EarNetwork.__init__(self, sample_rate, full_scale_spl)
         self.store_ears(audiogram)
         self.config = config = config or MappingConfig()
         self.stft = config.stft
@@ -95,22 +95,11 @@ class MappingCompensator(Aid, EarNetwork):
         self._additional_field = config.step - config.hop
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the output for whole signals, time-aligned with the input.
-
-        Args:
-            waveform: Input of the aid.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform; by default those of the constructor.
-
-        Shape: (..., time) -> (..., time).
-
-        Raises:
-            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
-                not fit, or the waveform is on another device than the weights.
-        """
+        """Return the output for whole signals, see ``Aid.forward``."""
         if audiogram is None and self._two_ears:
             check_two_channels(waveform)
-        return super().forward(waveform, self.thresholds if audiogram is None else audiogram)
+        ears = self.thresholds if audiogram is None else audiogram
+        return EarNetwork.forward(self, waveform, ears)
 
     def _finish(self, result: Tensor) -> Tensor:
         # The limit is the last step, because resampling can overshoot.

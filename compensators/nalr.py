@@ -7,9 +7,8 @@ from torch import Tensor
 from compensators.aid import Aid
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.prescription import nalr_gains_db
-from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
-from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import check_rate, check_waveform
+from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.checks import check_waveform
 from hlsim.dsp.fir import filters_with_gains
 
 ORDER = 220
@@ -43,36 +42,12 @@ class NALR(Aid):
     tensor(78.)
     """
 
-    def __init__(
-        self,
-        audiogram: AudiogramLike | None = None,
-        *,
-        sample_rate: int = 16000,
-        full_scale_spl: float = PASCAL_SPL,
-    ) -> None:
-        super().__init__()
-        self.sample_rate = check_rate(sample_rate)
-        self.full_scale_spl = check_full_scale(full_scale_spl)
-        self.store_ears(audiogram, highest=HIGHEST_LEVEL)
+    highest_level = HIGHEST_LEVEL
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the amplified waveform, time-aligned with the input.
-
-        Args:
-            waveform: Input of the aid.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform; by default those of the constructor.
-
-        Shape: (..., time) -> (..., time).
-
-        Raises:
-            ValueError: There is no audiogram, a threshold is outside -10 to 120 dB HL, or shapes do
-                not fit.
-        """
+        """Return the amplified signals, see ``Aid.forward``."""
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
-        thresholds = resolve_thresholds(
-            self.thresholds, audiogram, waveform, two_ears=self._two_ears, highest=HIGHEST_LEVEL
-        )
+        thresholds = self.resolve_thresholds(waveform, audiogram)
         with torch.autocast(waveform.device.type, enabled=False):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
@@ -100,4 +75,4 @@ class NALR(Aid):
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
         """
-        return nalr_gains_db(self.find_thresholds(audiogram, highest=HIGHEST_LEVEL))
+        return nalr_gains_db(self.find_thresholds(audiogram))

@@ -64,22 +64,6 @@ class WDRC(Wearable):
         self.limit_spl = limit_spl
         self.state_shapes = {"levels": (3, self.bands)}
 
-    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the output for a complete recording, time-aligned with the input.
-
-        Args:
-            waveform: Input of the aid.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
-                leading dimensions of the waveform; by default those of the constructor.
-
-        Shape: (..., time) -> (..., time).
-
-        Raises:
-            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes
-                do not fit.
-        """
-        return self._process_signals(waveform, audiogram, ())
-
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:

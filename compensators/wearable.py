@@ -14,7 +14,7 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import torch
@@ -37,10 +37,9 @@ from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     check_two_channels,
-    resolve_thresholds,
 )
-from hlsim.calibration import check_full_scale, gain_to_pascals
-from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.calibration import gain_to_pascals
+from hlsim.checks import check_names, check_number, check_waveform
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
 from hlsim.torchtools import Audio, as_samples, as_type_of, broadcast_shape, flatten_items
@@ -109,11 +108,34 @@ class Wearable(Aid):
         full_scale_spl: float,
         linked: bool,
     ) -> None:
-        super().__init__()
-        self.store_ears(audiogram)
+        super().__init__(audiogram, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
         self.linked = linked
-        self.sample_rate = check_rate(sample_rate)
-        self.full_scale_spl = check_full_scale(full_scale_spl)
+
+    def forward(
+        self, waveform: Tensor, audiogram: AudiogramLike | None = None, **sliders: Slider
+    ) -> Tensor:
+        """Return the output for whole signals, see ``Aid.forward``.
+
+        Args:
+            waveform: Input of the aid.
+            audiogram: Ears of the signals, by default those of the constructor.
+            sliders: Value from 0 to 1 under each slider's name, such as ``noise_reduction``, one
+                number or one value per item; by default those of ``SLIDERS``.
+        """
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
+        with torch.autocast(waveform.device.type, enabled=False):
+            batch, fitted = self.prepare(waveform, audiogram)
+            settings = self.stack_sliders(sliders, batch, fitted)
+            gain = gain_to_pascals(self.full_scale_spl)
+            signals = flatten_items(waveform, batch, fitted.dtype) * gain
+            low = resample(signals, self.sample_rate, RATE)
+            low_time = low.shape[-1]
+            padded = nn.functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
+            state = self.initial_state(settings)
+            delayed, gains, _ = self.process_portions(padded, fitted, settings, state)
+            aligned = delayed[:, DELAY : DELAY + low_time]
+            output = self.combine(signals, low, aligned, gains)
+            return (output / gain).reshape(*batch, -1).to(waveform.dtype)
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Slider) -> Stream:
         """Return a function that processes a signal in chunks of any size, as it arrives.
@@ -214,33 +236,6 @@ class Wearable(Aid):
         output = self.process_hops(signals, self.fit(ears), sliders, self.initial_state(sliders))[0]
         return output[::ears_per_gain]
 
-    def _process_signals(
-        self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
-    ) -> Tensor:
-        """Return the time-aligned output for whole signals.
-
-        Args:
-            waveform: Input of the aid.
-            audiogram: One audiogram, or (..., 8) that broadcasts over the leading dimensions.
-            sliders: Values of ``SLIDERS``.
-
-        Shape: (..., time) -> (..., time).
-        """
-        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
-        with torch.autocast(waveform.device.type, enabled=False):
-            batch, fitted = self.prepare(waveform, audiogram)
-            settings = self.stack_sliders(sliders, batch, fitted)
-            gain = gain_to_pascals(self.full_scale_spl)
-            signals = flatten_items(waveform, batch, fitted.dtype) * gain
-            low = resample(signals, self.sample_rate, RATE)
-            low_time = low.shape[-1]
-            padded = nn.functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
-            state = self.initial_state(settings)
-            delayed, gains, _ = self.process_portions(padded, fitted, settings, state)
-            aligned = delayed[:, DELAY : DELAY + low_time]
-            output = self.combine(signals, low, aligned, gains)
-            return (output / gain).reshape(*batch, -1).to(waveform.dtype)
-
     def process_portions(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, State]:
@@ -294,9 +289,7 @@ class Wearable(Aid):
         Raises:
             ValueError: An ear is not valid, or shapes do not fit.
         """
-        thresholds = resolve_thresholds(
-            self.thresholds, audiogram, waveform, two_ears=self._two_ears
-        )
+        thresholds = self.resolve_thresholds(waveform, audiogram)
         if self.linked:
             check_two_channels(waveform)
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
@@ -304,25 +297,32 @@ class Wearable(Aid):
         dtype = torch.promote_types(own_dtype, torch.float32)
         return batch, self.fit(flatten_items(thresholds, batch, dtype))
 
-    def stack_sliders(self, sliders: Sequence[Slider], batch: torch.Size, like: Tensor) -> Tensor:
+    def check_sliders(self, names: Iterable[str]) -> None:
+        """Raise ValueError unless the aid has sliders of these names."""
+        check_names(names, self.SLIDERS, f"sliders of {type(self).__name__}")
+
+    def stack_sliders(
+        self, sliders: Mapping[str, Slider], batch: torch.Size, like: Tensor
+    ) -> Tensor:
         """Stack the values of the sliders, such as noise reduction, to one row per item.
 
         Values on a GPU are not read, because the host would wait for the GPU. Those that are out of
         range become NaN instead of raising an error.
 
         Args:
-            sliders: Value of each slider in the order of ``SLIDERS``.
+            sliders: Value under each slider's name; by default those of ``SLIDERS``.
             batch: Leading dimensions of the signals and ears.
             like: Tensor whose dtype and device the result has.
 
         Returns: Values from 0 to 1, (items, sliders).
 
         Raises:
-            ValueError: A value is outside 0 to 1.
+            ValueError: A value is outside 0 to 1, or the aid has no such slider.
             RuntimeError: A shape does not broadcast to ``batch``.
         """
+        self.check_sliders(sliders)
         values = like.new_zeros(batch.numel(), len(self.SLIDERS))
-        for column, (name, slider) in enumerate(zip(self.SLIDERS, sliders, strict=True)):
+        for column, (name, slider) in enumerate({**self.SLIDERS, **sliders}.items()):
             if not isinstance(slider, Tensor):
                 check_number(name, slider, 0.0, 1.0)
                 slider = like.new_full((), slider)
@@ -397,10 +397,7 @@ class Stream:
         Raises:
             ValueError: The aid has no such slider.
         """
-        unknown = [name for name in sliders if name not in self.sliders]
-        if unknown:
-            aid, known = type(self._aid).__name__, ", ".join(self.sliders) or "no sliders"
-            raise ValueError(f"the stream of a {aid} has no slider {unknown[0]}; it has {known}")
+        self._aid.check_sliders(sliders)
         self.sliders |= sliders
 
     def __call__(self, chunk: Audio) -> Audio:
@@ -445,8 +442,7 @@ class Stream:
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
                 f"got {tuple(chunk.shape)}"
             )
-        values = [*self.sliders.values()]
-        self._sliders = self._aid.stack_sliders(values, self._batch, self._fitted)
+        self._sliders = self._aid.stack_sliders(self.sliders, self._batch, self._fitted)
         if is_first:
             self._state = self._aid.initial_state(self._sliders)
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)

@@ -47,7 +47,7 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
     unknown = sorted({str(name) for name in names} - set(known))
     if unknown:
         raise ValueError(
-            f"unknown {description}: {', '.join(unknown)}; expected some of {', '.join(known)}"
+            f"unknown {description}: {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}"
         )
 
 

@@ -175,7 +175,7 @@ def first_inputs(
     with torch.no_grad():
         samples = weight.new_zeros(items, hops * HOP)
         batch, fitted = aid.prepare(samples, audiogram)
-        sliders = aid.stack_sliders([*aid.SLIDERS.values()], batch, fitted)
+        sliders = aid.stack_sliders({}, batch, fitted)
         inputs = {
             "samples": samples,
             "fitted": fitted,

@@ -32,7 +32,7 @@ from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
-from hlsim.torchtools import broadcast_shape, flatten_items
+from hlsim.torchtools import pair_items
 
 EXACT = "msbg"
 """Name of the exact MSBG."""
@@ -191,11 +191,9 @@ class PluginSimulator(nn.Module):
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         thresholds = resolve_thresholds(None, audiogram, waveform)
-        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
+        batch, signals, ears = pair_items(waveform, thresholds, waveform.dtype)
         gain = gain_to_pascals(self.full_scale_spl)
-        signals = flatten_items(waveform, batch, waveform.dtype) * gain
-        ears = flatten_items(thresholds, batch, waveform.dtype)
-        inputs = resample(signals, self.sample_rate, self.plugin_rate)
+        inputs = resample(signals * gain, self.sample_rate, self.plugin_rate)
         perceived = self.plugin.call(inputs, ears)
         output = resample(perceived, self.plugin_rate, self.sample_rate)
         return output[..., : waveform.shape[-1]].reshape(*batch, -1) / gain

@@ -247,6 +247,27 @@ def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tens
     return tensor.to(dtype).expand(*batch, -1).reshape(-1, tensor.shape[-1])
 
 
+def pair_items(
+    waveform: Tensor, ears: Tensor, dtype: torch.dtype
+) -> tuple[torch.Size, Tensor, Tensor]:
+    """Broadcast signals and ears to a batch, and flatten its dimensions to one.
+
+    Args:
+        waveform: Signals, (..., time).
+        ears: Values of the ear of each signal, (..., n).
+        dtype: Type of the results.
+
+    Returns:
+        The leading dimensions of the batch; the signals, (items, time); and the ears, (items, n).
+
+    >>> batch, signals, ears = pair_items(torch.zeros(3, 1, 9), torch.zeros(2, 8), torch.float32)
+    >>> batch, signals.shape, ears.shape
+    (torch.Size([3, 2]), torch.Size([6, 9]), torch.Size([6, 8]))
+    """
+    batch = broadcast_shape(waveform.shape[:-1], ears.shape[:-1])
+    return batch, flatten_items(waveform, batch, dtype), flatten_items(ears, batch, dtype)
+
+
 def differentiable_once(gradient: Tensor, message: str) -> Tensor:
     """Return a gradient that raises an error if it is itself differentiated.
 

@@ -24,7 +24,7 @@ item, or a tensor or an array of thresholds in dB HL at the eight ``FREQUENCIES`
 
 
 def as_thresholds(
-    audiogram: AudiogramLike,
+    audiogram: AudiogramLike | None,
     *,
     highest: float = HIGHEST_SIMULATED,
 ) -> Tensor:
@@ -180,13 +180,8 @@ def resolve_thresholds(
     >>> resolve_thresholds(None, "N3", torch.zeros(2, 16000)).shape
     torch.Size([8])
     """
-    if audiogram is None and stored is None:
-        raise ValueError(
-            "expected an audiogram, got None; pass one, such as 'N3', after the signal or to the "
-            "module's constructor"
-        )
-    thresholds = stored if audiogram is None else as_thresholds(audiogram, highest=highest)
-    assert thresholds is not None
+    ears = stored if audiogram is None else audiogram
+    thresholds = as_thresholds(ears, highest=highest)
     if two_ears if audiogram is None else has_listeners(audiogram):
         check_two_channels(waveform)
     is_mono = waveform.ndim == 3 and waveform.shape[1] == 1

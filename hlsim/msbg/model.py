@@ -43,7 +43,7 @@ from hlsim.msbg.overlapping_blocks import in_blocks
 from hlsim.msbg.recruitment import expansion_ratios
 from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix
-from hlsim.torchtools import broadcast_shape, flatten_items, not_compiled, on_host
+from hlsim.torchtools import flatten_items, not_compiled, on_host, pair_items
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz, without smearing, by which ``aligned`` advances the output.
@@ -219,10 +219,9 @@ class MSBG(nn.Module):
             grids: Ears at other frequencies, from ``ears_on_other_grids``.
         """
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
-        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
+        batch, signals, ears = pair_items(waveform, thresholds, dtype)
         gain = gain_to_pascals(self.full_scale_spl)
-        signals = flatten_items(waveform, batch, dtype) * gain
-        ears = flatten_items(thresholds, batch, dtype)
+        signals = signals * gain
         if self.rescale_active:
             signals = signals * active_rescaling(signals, self.sample_rate)
 

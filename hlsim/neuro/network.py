@@ -14,7 +14,7 @@ from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NetworkConfig
-from hlsim.torchtools import broadcast_shape, flatten_items
+from hlsim.torchtools import pair_items
 
 # On a CPU, larger feature maps take time because the C library returns their memory to the system
 # after each operation.
@@ -91,9 +91,7 @@ class EarNetwork(nn.Module):
             )
         thresholds = resolve_thresholds(None, audiogram, waveform)
         with torch.autocast(waveform.device.type, enabled=False):
-            batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
-            signals = flatten_items(waveform, batch, weight.dtype)
-            ears = flatten_items(thresholds, batch, weight.dtype)
+            batch, signals, ears = pair_items(waveform, thresholds, weight.dtype)
             items = len(signals)
             if self.checkpoint or signals.device.type == "cpu":
                 samples_per_item = NEURO_RATE * signals.shape[-1]

@@ -114,7 +114,7 @@ def test_sound_above_8_khz_gets_the_gain_of_the_highest_band(name: str, rate: in
     middle = slice(rate // 4, -rate // 4)
     assert level_spl((outputs[0] - expected)[middle]) < level_spl(expected[middle]) - 60.0
     batch, fitted = at_16_khz.prepare(low, EAR)
-    settings = at_16_khz.stack_sliders([*aid.SLIDERS.values()], batch, fitted)
+    settings = at_16_khz.stack_sliders({}, batch, fitted)
     hops = low_at_16_khz[: 240 * 64].reshape(1, -1)
     _, gains, _ = at_16_khz.process_hops(hops, fitted, settings, at_16_khz.initial_state(settings))
     gain_db = float(20.0 * torch.log10(1.0 + gains[0, -1]))
