@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from hlsim.audiogram import Audiogram
@@ -36,16 +36,12 @@ Batch = dict[str, Tensor]
 
 - ``signal``: input of the network in pascals with shape (items, time)
 - ``thresholds``: ears in dB HL with shape (items, 8)
-- ``impaired`` (simulators): output of the teacher in pascals with shape (items, time)
 - ``clean`` (compensators): clean speech in pascals with shape (items, time)
 - ``noise_reduction`` (hearing aids): strength of noise reduction, 0 or 1, with shape (items,)
 """
 
 MAX_DEVICES = 64
 """Number of batches per training step, from which each training device has one of its own."""
-
-Teacher = Callable[[Tensor, Tensor], Tensor]
-"""Function from signals and thresholds to the ``impaired`` signals."""
 
 _VALIDATION_SECONDS = 2.0
 """Duration of the clips for validation."""
@@ -273,7 +269,6 @@ class BatchData(L.LightningDataModule):
     Args:
         training: Data set that returns a batch for each index.
         validation: Batches for validation.
-        teacher: Simulator that is called on the training device; None leaves batches as they are.
         workers: Number of processes that draw batches, in addition to the one that trains.
 
     >>> data = BatchData([], validation=[{"clean": Tensor([1.0])}])
@@ -286,13 +281,11 @@ class BatchData(L.LightningDataModule):
         training: Dataset[Batch],
         validation: Sequence[Batch],
         *,
-        teacher: Teacher | None = None,
         workers: int = 0,
     ) -> None:
         super().__init__()
         self.training = training
         self.validation = validation
-        self.teacher = teacher
         self.workers = workers
 
     def setup(self, stage: str) -> None:
@@ -312,16 +305,8 @@ class BatchData(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Any]:
         return DataLoader(self.validation, batch_size=None)  # type: ignore[arg-type]
 
-    @torch.no_grad()
-    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        if isinstance(self.teacher, nn.Module):
-            self.teacher.to(batch["signal"].device)
-        if self.teacher is None:
-            return batch
-        return batch | {"impaired": self.teacher(batch["signal"], batch["thresholds"])}
 
-
-def simulator_data(data: TrainingData, recipe: SimulatorRecipe, teacher: Teacher) -> BatchData:
+def simulator_data(data: TrainingData, recipe: SimulatorRecipe) -> BatchData:
     """Make the Lightning data module with the batches for the training of a Neuro-MSBG.
 
     Clips for validation are not equalised, amplified or compressed.
@@ -329,24 +314,22 @@ def simulator_data(data: TrainingData, recipe: SimulatorRecipe, teacher: Teacher
     Args:
         data: Speech, noise and ears.
         recipe: Settings of the training.
-        teacher: Simulator whose output is learnt.
 
     Returns:
-        Batches for training and validation, with the teacher.
+        Batches for training and validation.
 
     Raises:
         ValueError: Files are missing or invalid, or used for both training and validation.
 
-    >>> from hlsim import MSBG
     >>> from hlsim.data.bundled import SPEECH
-    >>> batches = simulator_data(TrainingData(SPEECH), SimulatorRecipe(), MSBG())
+    >>> batches = simulator_data(TrainingData(SPEECH), SimulatorRecipe())
     >>> list(batches.training[0])
     ['signal', 'thresholds']
     """
     levels = (50.0, 80.0) if recipe.treated else recipe.levels
     plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False)
     validation = _SimulatorBatches(plain, data.validation())
-    return _make_data(data, _SimulatorBatches(recipe, data), validation, teacher)
+    return _make_data(data, _SimulatorBatches(recipe, data), validation)
 
 
 def compensator_data(
@@ -384,10 +367,7 @@ def compensator_data(
 
 
 def _make_data(
-    data: TrainingData,
-    training: _RandomBatches,
-    validation: _RandomBatches,
-    teacher: Teacher | None = None,
+    data: TrainingData, training: _RandomBatches, validation: _RandomBatches
 ) -> BatchData:
     """Draw the batches for validation, whose speech must not be used for training.
 
@@ -395,7 +375,6 @@ def _make_data(
         data: Speech, noise and ears.
         training: Batches for training.
         validation: Batches from which those for validation are drawn once.
-        teacher: See ``BatchData``.
     """
     valid_files = {path.resolve() for path in validation.speech.files}
     shared = {path.resolve() for path in training.speech.files} & valid_files
@@ -410,4 +389,4 @@ def _make_data(
         validation.draw(_VALIDATION_BATCH, generator)
         for _ in range(0, recipe.validation_items, _VALIDATION_BATCH)
     ]
-    return BatchData(training, batches, teacher=teacher, workers=data.workers)
+    return BatchData(training, batches, workers=data.workers)

@@ -38,7 +38,7 @@ class CompensatorTraining(TrainingModule):
     >>> module = CompensatorTraining(CompensatorRecipe(model={"channels": 8, "blocks": 1}))
     >>> speech, ears = 0.02 * torch.randn(1, 8000), torch.full((1, 8), 40.0)
     >>> batch = {"signal": speech, "clean": speech, "thresholds": ears}
-    >>> bool(module.training_loss(batch) > 0.0)
+    >>> bool(module.compute_loss(batch) > 0.0)
     True
     """
 
@@ -58,7 +58,14 @@ class CompensatorTraining(TrainingModule):
         elif isinstance(network, HearingAid) and not recipe.trains_noise_reduction():
             network.noise_reduction_network.requires_grad_(False)
 
-    def training_loss(self, batch: Batch) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        return self.log_loss(self.compute_loss(batch))
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self.measured_values.append(self.compute_loss(batch)[None])
+
+    def compute_loss(self, batch: Batch) -> Tensor:
+        """Compute the loss of a batch, a scalar: the sum of the recipe's criteria."""
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
         loss = signal.new_zeros(())
         if self.denoising:
@@ -75,10 +82,6 @@ class CompensatorTraining(TrainingModule):
         # An ear without noise reduction should perceive the noisy speech.
         reference = torch.lerp(signal, clean, slider.unsqueeze(-1))
         return loss + self.loss(self.network(signal, ears, slider), reference, ears)
-
-    def evaluate(self, batch: Batch) -> Tensor:
-        """Compute the loss of a validation batch, with shape (1,)."""
-        return self.training_loss(batch)[None]
 
     def summarise(self, values: Tensor) -> dict[str, float]:
         """Compute ``valid_loss``, the mean over validation batches, and ``score``, minus that."""

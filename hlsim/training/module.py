@@ -18,7 +18,6 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.checkpoint import read_record
 from hlsim.simulators import BUILT_IN, PluginSimulator, load_simulator
-from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
 
 _WARM_UP_STEPS = 50
@@ -29,13 +28,15 @@ class TrainingModule(L.LightningModule):
     """Lightning module of both trainings: a network with its loss and its validation.
 
     The learning rate depends on the step alone, and the training ends with a validation after the
-    recipe's last step. Subclasses implement ``training_loss``, ``evaluate`` and ``summarise``.
+    recipe's last step. Subclasses implement ``training_step``, which returns the result of
+    ``log_loss``; ``validation_step``, which appends to ``measured_values``; and ``summarise``.
 
     Args:
         network: Network to train.
         recipe: Learning rate, number of steps, and settings of the subclass.
 
     Attributes:
+        measured_values: Values of the items of a validation, (items,) per batch, or their mean, (1,).
         validation: Results of the last validation by name. The best network has the highest
             ``score``.
 
@@ -50,33 +51,25 @@ class TrainingModule(L.LightningModule):
         self.network: Any = network
         self.recipe = recipe
         self.validation: dict[str, float] = {}
-        self._measured_values: list[Tensor] = []
-
-    def training_loss(self, batch: Batch) -> Tensor:
-        """Compute the loss of a batch, a scalar."""
-        raise NotImplementedError
-
-    def evaluate(self, batch: Batch) -> Tensor:
-        """Measure the network on a validation batch.
-
-        Returns:
-            Measured values with shape (items,) or, for a mean over items, (1,).
-        """
-        raise NotImplementedError
+        self.measured_values: list[Tensor] = []
 
     def summarise(self, values: Tensor) -> dict[str, float]:
         """Summarise the measured values of all validation batches.
 
         Args:
-            values: Values of all items, see ``evaluate``.
+            values: ``measured_values`` of all items.
 
         Returns:
             Named means or quantiles, and ``score``, which is highest for the best network.
         """
         raise NotImplementedError
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        loss = self.training_loss(batch)
+    def log_loss(self, loss: Tensor) -> Tensor:
+        """Log the loss of a training step, and return it.
+
+        Raises:
+            ValueError: The loss is not finite.
+        """
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ValueError(
@@ -93,13 +86,10 @@ class TrainingModule(L.LightningModule):
             self.trainer.should_stop = True
 
     def on_validation_epoch_start(self) -> None:
-        self._measured_values = []
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        self._measured_values.append(self.evaluate(batch))
+        self.measured_values = []
 
     def on_validation_epoch_end(self) -> None:
-        self.validation = self.summarise(torch.cat(self._measured_values))
+        self.validation = self.summarise(torch.cat(self.measured_values))
         if math.isnan(self.validation["score"]):  # which would count as the best score
             raise ValueError(
                 f"the validation score is NaN at step {self.global_step}; lower learning_rate in "

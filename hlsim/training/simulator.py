@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging
-from torch import Tensor
+from torch import Tensor, nn
 
 from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
@@ -28,34 +28,33 @@ _POWER_FLOOR = 1e-18
 class SimulatorTraining(TrainingModule):
     """Lightning module that trains a Neuro-MSBG on the output of a teacher.
 
-    A batch (``hlsim.training.batches.Batch``) has ``signal`` and ``impaired``, the teacher's output
-    for it, (items, time) in pascals at 16 kHz, and ``thresholds``, (items, 8) in dB HL.
-
     Args:
         recipe: Settings of the network and of the training run.
+        teacher: Simulator at 16 kHz, which is moved to the device of the training.
 
     Raises:
         ValueError: The network with which the recipe starts does not exist or has other settings.
 
     >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
     >>> signal, ears = 0.02 * torch.randn(1, 4000), torch.full((1, 8), 40.0)
-    >>> batch = {"signal": signal, "thresholds": ears, "impaired": 0.1 * signal}
-    >>> SimulatorTraining(recipe).evaluate(batch).shape
-    torch.Size([1])
+    >>> module = SimulatorTraining(recipe, load_simulator("msbg"))
+    >>> module.validation_step({"signal": signal, "thresholds": ears}, 0)
+    >>> len(module.measured_values)
+    1
     """
 
     recipe: SimulatorRecipe
 
-    def __init__(self, recipe: SimulatorRecipe) -> None:
+    def __init__(self, recipe: SimulatorRecipe, teacher: nn.Module) -> None:
         build = partial(NeuroMSBG, NeuroConfig.from_dict(recipe.model))
         network = initial_network(recipe, build, load_pretrained)
         network.autocast_dtype = None if recipe.precision == "float32" else torch.bfloat16
         super().__init__(network, recipe)
+        self._teacher = (teacher,)  # in a tuple, because it is neither trained nor saved
 
-    def training_loss(self, batch: Batch) -> Tensor:
-        signal, target = batch["signal"], batch["impaired"]
-        perceived = self.network(signal, batch["thresholds"])
-        unit = target if self.recipe.unit_power == "truth" else signal
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        target, perceived = self._simulate(batch)
+        unit = target if self.recipe.unit_power == "truth" else batch["signal"]
         scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
         target = target * scale
         perceived = perceived * scale
@@ -65,12 +64,20 @@ class SimulatorTraining(TrainingModule):
             parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
         if set(weights) - {"snr", "log_spectrum"}:
             parts |= paper_parts(perceived, target)
-        return weighted_sum(parts, weights).mean()
+        return self.log_loss(weighted_sum(parts, weights).mean())
 
-    def evaluate(self, batch: Batch) -> Tensor:
-        """Compute the ratio of the teacher's output to the network's error in dB for each item."""
-        perceived = self.network(batch["signal"], batch["thresholds"])
-        return -noise_to_signal_db(perceived, batch["impaired"])
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        # ratio of the teacher's output to the network's error in dB
+        target, perceived = self._simulate(batch)
+        self.measured_values.append(-noise_to_signal_db(perceived, target))
+
+    def _simulate(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Return the outputs of the teacher and of the network in pascals, (items, time) each."""
+        signal, ears = batch["signal"], batch["thresholds"]
+        (teacher,) = self._teacher
+        with torch.no_grad():
+            target = teacher.to(signal.device)(signal, ears)
+        return target, self.network(signal, ears)
 
     def summarise(self, values: Tensor) -> dict[str, float]:
         """Compute the median and the 10th percentile of the ratios, and a score for the network.
@@ -116,8 +123,8 @@ def train_simulator(
     ...     return load_pretrained(train_simulator(TrainingData(Path(speech)), recipe, out=out))
     """
     return train_network(
-        SimulatorTraining(recipe),
-        simulator_data(data, recipe, load_simulator(teacher)),
+        SimulatorTraining(recipe, load_simulator(teacher)),
+        simulator_data(data, recipe),
         SIMULATOR,
         out=out,
         about={"data": data.identity(), **describe_simulator("teacher", teacher)},

@@ -6,7 +6,7 @@ from hlsim.training.module import TrainingModule
 
 def check_gradients(module: TrainingModule, batch: Batch) -> float:
     """Check that loss and gradients of a batch are finite and precise, and return the loss."""
-    loss = module.training_loss(batch)
+    loss = module.training_step(batch, 0)
     loss.backward()
     assert bool(loss.isfinite())
     for parameter in module.network.parameters():

@@ -23,8 +23,7 @@ HUM_HZ = 1000.0
 
 
 def load(data: TrainingData, recipe: SimulatorRecipe = SMALL) -> BatchData:
-    """Return batches with a teacher that halves signals."""
-    return simulator_data(data, recipe, lambda signals, thresholds: 0.5 * signals)
+    return simulator_data(data, recipe)
 
 
 def hum(samples: int) -> Tensor:
@@ -62,17 +61,13 @@ def test_the_noise_of_a_manifest_is_noisy_minus_clean(manifest: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_each_device_loads_batches_of_its_own_and_computes_their_targets(
-    manifest: Path, workers: int
-) -> None:
+def test_each_device_loads_batches_of_its_own(manifest: Path, workers: int) -> None:
     data = load(TrainingData.from_manifest(manifest, workers=workers))
     data.trainer = SimpleNamespace(global_step=3, global_rank=1)  # type: ignore[assignment]
     batches = list(itertools.islice(data.train_dataloader(), 3))
     for batch, index in zip(batches, (3 * 64 + 1, 4 * 64 + 1, 5 * 64 + 1), strict=True):
         assert torch.equal(batch["signal"], data.training[index]["signal"])
     assert not torch.equal(batches[0]["signal"], data.training[3 * 64]["signal"])
-    batch = data.on_after_batch_transfer(batches[0], 0)
-    assert torch.equal(batch["impaired"], 0.5 * batch["signal"])
 
 
 def test_validation_is_on_other_speech_where_there_is_some(manifest: Path) -> None:

@@ -151,7 +151,7 @@ def test_parts_of_a_hearing_aid_without_a_criterion_are_frozen(
 ) -> None:
     recipe = replace(SMALL_AID, seconds=0.8, noisy=1.0, weights=weights, unreduced=0.5)
     module = CompensatorTraining(recipe, simulator="msbg")
-    module.training_loss(draw(recipe, noisy, 2)).backward()
+    module.compute_loss(draw(recipe, noisy, 2)).backward()
     trained = {
         name.split(".")[0]: parameter.requires_grad and parameter.grad is not None
         for name, parameter in module.network.named_parameters()

@@ -12,6 +12,7 @@ pytest.importorskip("lightning")
 from hlsim import MSBG
 from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
+from hlsim.simulators import Attenuation
 from hlsim.training.batches import Batch, TrainingData, simulator_data
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
@@ -32,8 +33,7 @@ ALL_CRITERIA |= {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
 
 
 def training_batch(data: TrainingData, recipe: SimulatorRecipe) -> Batch:
-    batches = simulator_data(data, recipe, MSBG())
-    return batches.on_after_batch_transfer(batches.training[0], 0)
+    return simulator_data(data, recipe).training[0]
 
 
 def test_a_training_leaves_the_best_average_with_its_record(
@@ -43,15 +43,14 @@ def test_a_training_leaves_the_best_average_with_its_record(
     folder = train_simulator(data, recipe, out=tmp_path, accelerator="cpu")
     about = read_record(folder)["about"]
     assert about["recipe"]["batch"] == 2 and about["steps"] == 8
-    module = SimulatorTraining(recipe)
+    module = SimulatorTraining(recipe, MSBG())
     for name in ("start_validation", "validation"):
-        batches = simulator_data(data, recipe, MSBG())
+        module.on_validation_epoch_start()
         with torch.no_grad():
-            values = [
-                module.evaluate(batches.on_after_batch_transfer(batch, 0))
-                for batch in batches.validation
-            ]
-        assert about[name] == pytest.approx(module.summarise(torch.cat(values)), abs=1e-3)
+            for batch in simulator_data(data, recipe).validation:
+                module.validation_step(batch, 0)
+        summary = module.summarise(torch.cat(module.measured_values))
+        assert about[name] == pytest.approx(summary, abs=1e-3)
         module.network = load_pretrained(folder)
     saved = module.network.state_dict()
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)
@@ -61,9 +60,9 @@ def test_a_training_leaves_the_best_average_with_its_record(
 
 
 def test_a_start_has_the_same_trained_parameters_as_random_weights_of_a_seed() -> None:
-    first, again = (SimulatorTraining(SMALL).network.state_dict() for _ in range(2))
+    first, again = (SimulatorTraining(SMALL, MSBG()).network.state_dict() for _ in range(2))
     assert all(torch.equal(first[name], again[name]) for name in first)
-    started = SimulatorTraining(replace(SMALL, model={}, start="neuro-msbg-cnn")).network
+    started = SimulatorTraining(replace(SMALL, model={}, start="neuro-msbg-cnn"), MSBG()).network
     random = NeuroMSBG(started.config)
     trained, expected = (
         {name for name, parameter in network.named_parameters() if parameter.requires_grad}
@@ -76,7 +75,7 @@ def test_bfloat16_is_near_and_keeps_gradients_precise(data: TrainingData) -> Non
     losses = []
     for precision in ("float32", "bfloat16"):
         recipe = replace(SMALL, precision=precision)  # type: ignore[arg-type]
-        module = SimulatorTraining(recipe)
+        module = SimulatorTraining(recipe, MSBG())
         losses.append(check_gradients(module, training_batch(data, recipe)))
     assert losses[1] == pytest.approx(losses[0], abs=0.02)
 
@@ -87,7 +86,7 @@ def test_all_criteria_train_with_noise_and_measured_ears(
     recipe = replace(SMALL, weights=ALL_CRITERIA)
     ears = write_ears(tmp_path / "ears.csv", "N5")
     sources = replace(data, noise=data.speech, audiograms=ears)
-    check_gradients(SimulatorTraining(recipe), training_batch(sources, recipe))
+    check_gradients(SimulatorTraining(recipe, MSBG()), training_batch(sources, recipe))
 
 
 def test_another_teacher_is_recorded_and_needs_another_folder(
@@ -109,3 +108,13 @@ def test_missing_data_is_named_before_anything_is_written(
     with pytest.raises(ValueError, match=f"^{tmp_path}/nowhere"):
         train_simulator(replace(data, **sources), SMALL, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_target_is_the_output_of_the_teacher(data: TrainingData) -> None:
+    teacher = Attenuation()
+    module = SimulatorTraining(SMALL, teacher)
+    for network in (teacher, MSBG()):
+        module.network = network
+        module.validation_step(training_batch(data, SMALL), 0)
+    by_teacher, by_another = module.measured_values
+    assert float(by_teacher.min()) > 100.0 > float(by_another.max())

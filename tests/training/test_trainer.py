@@ -66,20 +66,19 @@ class VectorTraining(TrainingModule):
         self.factor = factor
         self.steps_taken: list[int] = []
 
-    def training_loss(self, batch: Batch) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         self.steps_taken.append(self.global_step)
         if self.global_step == 5 and self.interrupt == "interrupted":
             raise KeyboardInterrupt
         if self.global_step == 4 and self.interrupt == "stopped":
             self.trainer.should_stop = True
         error = (self.network.values - batch["target"]).square().mean()
-        return error * self.factor if self.global_step == 3 else error
+        return self.log_loss(error * self.factor if self.global_step == 3 else error)
 
-    def evaluate(self, batch: Batch) -> Tensor:
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
         if self.global_step == 4 and self.interrupt == "cut off":
             raise KeyboardInterrupt
-        total: Tensor = self.network.values.detach().sum()[None]
-        return total
+        self.measured_values.append(self.network.values.detach().sum()[None])
 
     def summarise(self, values: Tensor) -> dict[str, float]:
         total = float(values)
