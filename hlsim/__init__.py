@@ -8,31 +8,34 @@ from typing import TYPE_CHECKING, Any
 from hlsim.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from compensators import NALR as NALR
-    from compensators import WDRC as WDRC
-    from compensators import HearingAid as HearingAid
-    from compensators import MappingCompensator as MappingCompensator
-    from compensators import load_compensator as load_compensator
-    from compensators import save_compensator as save_compensator
+    from compensators import (
+        NALR as NALR,
+        WDRC as WDRC,
+        HearingAid as HearingAid,
+        MappingCompensator as MappingCompensator,
+        load_compensator as load_compensator,
+        save_compensator as save_compensator,
+    )
     from hlsim.audiogram import Audiogram as Audiogram
     from hlsim.audiogram.listener import Listener as Listener
-    from hlsim.audiogram.table import read_audiograms as read_audiograms
-    from hlsim.audiogram.table import read_listeners as read_listeners
+    from hlsim.audiogram.table import (
+        read_audiograms as read_audiograms,
+        read_listeners as read_listeners,
+    )
     from hlsim.checkpoint import list_pretrained as list_pretrained
     from hlsim.data.mixing import mix as mix
     from hlsim.evaluation.digits import reception_threshold as reception_threshold
-    from hlsim.losses.hearing_loss import HASPILoss as HASPILoss
-    from hlsim.losses.hearing_loss import HearingLossLoss as HearingLossLoss
-    from hlsim.msbg import MSBG as MSBG
-    from hlsim.msbg import estimate_delay as estimate_delay
-    from hlsim.neuro import NeuroMSBG as NeuroMSBG
-    from hlsim.neuro import load_pretrained as load_pretrained
-    from hlsim.shortcuts import compensate as compensate
-    from hlsim.shortcuts import example_speech as example_speech
-    from hlsim.shortcuts import info as info
-    from hlsim.shortcuts import listen as listen
-    from hlsim.shortcuts import load_audio as load_audio
-    from hlsim.shortcuts import simulate as simulate
+    from hlsim.losses.hearing_loss import HASPILoss as HASPILoss, HearingLossLoss as HearingLossLoss
+    from hlsim.msbg import MSBG as MSBG, estimate_delay as estimate_delay
+    from hlsim.neuro import NeuroMSBG as NeuroMSBG, load_pretrained as load_pretrained
+    from hlsim.shortcuts import (
+        compensate as compensate,
+        example_speech as example_speech,
+        info as info,
+        listen as listen,
+        load_audio as load_audio,
+        simulate as simulate,
+    )
 
 # A name is imported when it is first used, so that the command line's help does not wait for torch.
 _NAMES = {

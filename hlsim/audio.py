@@ -204,15 +204,12 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     ...     read_audio(f"{folder}/noise.wav")[0].shape
     torch.Size([2, 16000])
     """
-    if Path(path).suffix.lower() != ".wav":
-        raise ValueError(f"{path}: expected the extension .wav; convert the file afterwards")
-    samples = torch.atleast_2d(check_waveform(waveform)).detach().to("cpu", torch.float32)
+    samples = torch.atleast_2d(check_waveform(waveform))
     if samples.ndim > 2:
         shape = tuple(samples.shape)
         raise ValueError(f"{path}: expected shape (channels, time) or (time,), got {shape}")
-    rate = check_rate(sample_rate)
     channels, time = samples.shape
-    write_parts(path, [samples], channels, time, rate)
+    write_parts(path, [samples], channels, time, sample_rate)
 
 
 def write_parts(

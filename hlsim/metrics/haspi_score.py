@@ -34,9 +34,7 @@ from torch import Tensor
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
-from hlsim.metrics.ear import alignment
-from hlsim.metrics.ear import envelope_modulation as envelopes
-from hlsim.metrics.ear import model as ear_model
+from hlsim.metrics.ear import alignment, envelope_modulation as envelopes, model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells

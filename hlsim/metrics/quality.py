@@ -20,8 +20,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import filters_with_gains
-from hlsim.metrics.ear import alignment, fine_structure
-from hlsim.metrics.ear import model as ear_model
+from hlsim.metrics.ear import alignment, fine_structure, model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells

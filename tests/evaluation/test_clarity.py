@@ -105,8 +105,7 @@ def score_by_pyclarity(folder: Path, scene: str, name: str) -> dict[str, float]:
     """Score the baseline by pyclarity, in the steps of its script of ICASSP 2023."""
     from clarity.evaluator.haspi import haspi_v2_be
     from clarity.evaluator.hasqi import hasqi_v2_better_ear
-    from clarity.utils.audiogram import Audiogram
-    from clarity.utils.audiogram import Listener as ClarityListener
+    from clarity.utils.audiogram import Audiogram, Listener as ClarityListener
 
     mix, target, anechoic = (
         soundfile.read(folder / "scenes" / f"{scene}_{kind}_CH1.wav")[0].T

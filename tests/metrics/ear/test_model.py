@@ -9,11 +9,13 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.metrics.ear import alignment
-from hlsim.metrics.ear import envelope_modulation as envelopes
-from hlsim.metrics.ear import input as ear_input
-from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear import recursions as recursions
+from hlsim.metrics.ear import (
+    alignment,
+    envelope_modulation as envelopes,
+    input as ear_input,
+    model as ear_model,
+    recursions as recursions,
+)
 from hlsim.metrics.ear.extent import Extent
 
 CPU = torch.device("cpu")
