@@ -153,8 +153,11 @@ class HearingAid(Wearable):
                 or one value per item.
             amplification: Share of the amplification that is applied, likewise.
         """
-        sliders = {"noise_reduction": noise_reduction, "amplification": amplification}
-        return super().forward(waveform, audiogram, **sliders)
+        sliders: dict[str, Slider] = {
+            "noise_reduction": noise_reduction,
+            "amplification": amplification,
+        }
+        return self.process_block(waveform, audiogram, sliders)[0]
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State

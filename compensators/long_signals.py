@@ -5,18 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-import torch
 from torch import Tensor
-from torch.nn import functional
 
-from compensators.filter_bank import DELAY, HOP, RATE
+from compensators.filter_bank import HOP, RATE
 from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import gain_to_pascals
-from hlsim.checks import check_waveform
 from hlsim.dsp.overlap import Block, split_into_blocks
-from hlsim.dsp.resample import resample
-from hlsim.torchtools import flatten_items
 
 _BLOCK_SECONDS = 10.0
 """Duration of the output of a block."""
@@ -59,36 +53,20 @@ def process_blocks(
     unit = math.lcm(HOP, RATE // math.gcd(rate, RATE)) * rate // RATE
     margin = math.ceil(_MARGIN_SECONDS * rate / unit) * unit
     blocks = split_into_blocks(samples, round(_BLOCK_SECONDS * rate), 2 * margin, 2 * margin, unit)
-    gain = gain_to_pascals(aid.full_scale_spl)
     state: State | None = None
     # Where a block is cut, resampling lacks context. The aid starts one margin later, with the
     # state that the block before had reached there.
     starts = [0, *(block.input_start + margin for block in blocks[1:])]
     for block, waveform, start, next_start in zip(
-        blocks, read(blocks), starts, [*starts[1:], samples], strict=True
+        blocks, read(blocks), starts, [*starts[1:], None], strict=True
     ):
-        check_waveform(waveform, full_scale_spl=aid.full_scale_spl)
-        batch, fitted = aid.prepare(waveform, audiogram)
-        values = aid.stack_sliders(sliders, batch, fitted)
-        if state is None:
-            state = aid.initial_state(values)
-        signals = flatten_items(waveform, batch, fitted.dtype) * gain
-        low = resample(signals, rate, RATE)[:, (start - block.input_start) * RATE // rate :]
-        if block.input_stop == samples:
-            low_time = low.shape[-1]
-            padded = functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
-        else:
-            padded = low[:, : -(margin * RATE // rate)]
-            low_time = padded.shape[-1] - DELAY
-        signals = signals[:, start - block.input_start :][:, : math.ceil(low_time * rate / RATE)]
-
-        before_next = (next_start - start) * RATE // (rate * HOP) * HOP
-        head, tail = padded.tensor_split([before_next], -1)
-        head_output, head_gains, state = aid.process_portions(head, fitted, values, state)
-        tail_output, tail_gains, _ = aid.process_portions(tail, fitted, values, state)
-        delayed = torch.cat((head_output, tail_output), -1)
-        gains = torch.cat((head_gains, tail_gains[:, 1:]), -1)
-        aligned = delayed[:, DELAY : DELAY + low_time]
-        output = aid.combine(signals, low[:, :low_time], aligned, gains) / gain
-        part = output[:, block.output_start - start : block.output_stop - start]
-        yield part.reshape(*batch, -1).to(waveform.dtype)
+        output, state = aid.process_block(
+            waveform,
+            audiogram,
+            sliders,
+            state,
+            lead=start - block.input_start,
+            lag=margin if next_start else 0,
+            state_time=(next_start - start) * RATE // (rate * HOP) * HOP if next_start else None,
+        )
+        yield output[..., block.output_start - start : block.output_stop - start]

@@ -14,6 +14,7 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
@@ -111,31 +112,9 @@ class Wearable(Aid):
         super().__init__(audiogram, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
         self.linked = linked
 
-    def forward(
-        self, waveform: Tensor, audiogram: AudiogramLike | None = None, **sliders: Slider
-    ) -> Tensor:
-        """Return the output for whole signals, see ``Aid.forward``.
-
-        Args:
-            waveform: Input of the aid.
-            audiogram: Ears of the signals, by default those of the constructor.
-            sliders: Value from 0 to 1 under each slider's name, such as ``noise_reduction``, one
-                number or one value per item; by default those of ``SLIDERS``.
-        """
-        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
-        with torch.autocast(waveform.device.type, enabled=False):
-            batch, fitted = self.prepare(waveform, audiogram)
-            settings = self.stack_sliders(sliders, batch, fitted)
-            gain = gain_to_pascals(self.full_scale_spl)
-            signals = flatten_items(waveform, batch, fitted.dtype) * gain
-            low = resample(signals, self.sample_rate, RATE)
-            low_time = low.shape[-1]
-            padded = nn.functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
-            state = self.initial_state(settings)
-            delayed, gains, _ = self.process_portions(padded, fitted, settings, state)
-            aligned = delayed[:, DELAY : DELAY + low_time]
-            output = self.combine(signals, low, aligned, gains)
-            return (output / gain).reshape(*batch, -1).to(waveform.dtype)
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+        """Return the output for whole signals, see ``Aid.forward``."""
+        return self.process_block(waveform, audiogram, {})[0]
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Slider) -> Stream:
         """Return a function that processes a signal in chunks of any size, as it arrives.
@@ -254,24 +233,65 @@ class Wearable(Aid):
             gains.append(block_gains)
         return torch.cat(outputs, -1), torch.cat(gains, -1), state
 
-    def combine(self, signals: Tensor, low: Tensor, aligned: Tensor, gains: Tensor) -> Tensor:
-        """Return the output at the aid's rate, with the band above 8 kHz, and limited.
+    def process_block(
+        self,
+        waveform: Tensor,
+        audiogram: AudiogramLike | None,
+        sliders: Mapping[str, Slider],
+        state: State | None = None,
+        *,
+        lead: int = 0,
+        lag: int = 0,
+        state_time: int | None = None,
+    ) -> tuple[Tensor, State]:
+        """Return the output for a whole signal or a block of one, time-aligned with the input.
 
         Args:
-            signals: Input in pascals.
-            low: Input at 16 kHz.
-            aligned: Output at 16 kHz, time-aligned with the input.
-            gains: Gains of the highest band from ``process_portions``.
+            waveform: Input of the aid.
+            audiogram: Ears of the signals, or None for those of the constructor.
+            sliders: Value under each slider's name; by default those of ``SLIDERS``.
+            state: State of the aid after the lead; None at the beginning of a signal.
+            lead: Samples of the block before the output, which resampling needs.
+            lag: Samples of the block after the output, which resampling needs; 0 at the end of a
+                signal.
+            state_time: Samples at 16 kHz, in whole hops after the lead, after which the state is
+                returned; by default after all.
 
-        Shape: (items, time), (items, low_time) twice, (items, hops + 1) -> (items, time).
+        Returns:
+            The output after the lead, (..., time), and the state.
         """
-        time = signals.shape[-1]
-        result = resample(aligned, RATE, self.sample_rate)
-        if self.sample_rate != RATE:
-            above_8_khz = signals - resample(low, RATE, self.sample_rate)[:, :time]
-            gain = gain_at_rate(gains, self.sample_rate, time)
-            result = result[:, :time] + (1.0 + gain) * above_8_khz
-        return soft_limit(result, self.limit_spl)
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
+        rate = self.sample_rate
+        with torch.autocast(waveform.device.type, enabled=False):
+            batch, fitted = self.prepare(waveform, audiogram)
+            settings = self.stack_sliders(sliders, batch, fitted)
+            gain = gain_to_pascals(self.full_scale_spl)
+            signals = flatten_items(waveform, batch, fitted.dtype) * gain
+            low = resample(signals, rate, RATE)[:, lead * RATE // rate :]
+            if lag:
+                samples = low[:, : -(lag * RATE // rate)]
+                low = samples[:, :-DELAY]
+            else:
+                padding = DELAY + -(low.shape[-1] + DELAY) % HOP
+                samples = nn.functional.pad(low, (0, padding))
+            low_time = low.shape[-1]
+            signals = signals[:, lead:][:, : math.ceil(low_time * rate / RATE)]
+
+            parts = [samples] if state_time is None else samples.tensor_split([state_time], -1)
+            start = state or self.initial_state(settings)
+            delayed, gains, state = self.process_portions(parts[0], fitted, settings, start)
+            for part in parts[1:]:
+                rest, rest_gains, _ = self.process_portions(part, fitted, settings, state)
+                delayed = torch.cat((delayed, rest), -1)
+                gains = torch.cat((gains, rest_gains[:, 1:]), -1)
+            output = resample(delayed[:, DELAY : DELAY + low_time], RATE, rate)
+            if rate != RATE:
+                time = signals.shape[-1]
+                above_8_khz = signals - resample(low, RATE, rate)[:, :time]
+                gain_above = gain_at_rate(gains, rate, time)
+                output = output[:, :time] + (1.0 + gain_above) * above_8_khz
+            output = soft_limit(output, self.limit_spl) / gain
+            return output.reshape(*batch, -1).to(waveform.dtype), state
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None
