@@ -21,7 +21,7 @@ from hlsim.audiogram.thresholds import (
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import check_number, check_rate
+from hlsim.checks import check_device, check_number, check_rate
 from hlsim.dsp.fft import power
 from hlsim.torchtools import constant
 
@@ -118,6 +118,7 @@ class Aid(nn.Module):
         tensor([ 1.,  8., 18., 20., 21., 22., 23., 24.])
         """
         check_number("level", level, 0.0, 120.0)
+        check_device(self)
         thresholds = self.find_thresholds(audiogram)
         thresholds = thresholds.to(next(self.parameters(), thresholds))
         ears = thresholds.reshape(-1, len(FREQUENCIES))

@@ -40,7 +40,7 @@ from hlsim.audiogram.thresholds import (
     check_two_channels,
 )
 from hlsim.calibration import gain_to_pascals
-from hlsim.checks import check_names, check_number, check_waveform
+from hlsim.checks import check_device, check_names, check_number, check_waveform
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
 from hlsim.torchtools import Audio, as_samples, as_type_of, broadcast_shape, flatten_items
@@ -309,6 +309,7 @@ class Wearable(Aid):
         Raises:
             ValueError: An ear is not valid, or shapes do not fit.
         """
+        check_device(self, waveform.device)
         thresholds = self.resolve_thresholds(waveform, audiogram)
         if self.linked:
             check_two_channels(waveform)

@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators accept."""
@@ -187,7 +187,6 @@ def check_waveform(
     waveform: Tensor,
     name: str = "waveform",
     *,
-    highest: float = HIGHEST_SAMPLE,
     full_scale_spl: float | None = None,
 ) -> Tensor:
     """Validate that a tensor is a waveform, and return it.
@@ -198,13 +197,12 @@ def check_waveform(
     Args:
         waveform: Tensor of shape (..., time).
         name: Name of the argument, for messages.
-        highest: Largest accepted magnitude of a finite sample.
         full_scale_spl: Level in dB SPL of RMS 1.0. If it is passed, the first waveform of a process
             whose level is above 120 dB SPL causes a warning.
 
     Raises:
         ValueError: It is not a floating-point tensor with time last, has no samples, or has a
-            sample above ``highest``.
+            sample above 1e9.
 
     >>> check_waveform(torch.zeros(2, 16000)).shape
     torch.Size([2, 16000])
@@ -218,14 +216,39 @@ def check_waveform(
     if waveform.device.type == "cpu" and not torch.compiler.is_compiling():
         low, high = torch.aminmax(waveform.detach())
         peak = max(-float(low), float(high))
-        if highest < peak < math.inf:
+        if HIGHEST_SAMPLE < peak < math.inf:
             raise ValueError(
-                f"expected samples of {name} up to {highest:g}, got a peak of {peak:.3g}; scale "
+                f"expected samples of {name} up to {HIGHEST_SAMPLE:g}, got a peak of {peak:.3g}; scale "
                 f"{name} to pascals, for example with hlsim.load_audio"
             )
         if full_scale_spl is not None:
             _warn_if_loud(waveform, name, peak, full_scale_spl)
     return waveform
+
+
+def check_device(module: nn.Module, device: torch.device | None = None) -> None:
+    """Raise ValueError if a module lacks its weights, or has them on another device than its input.
+
+    Args:
+        module: Module with or without weights.
+        device: Device of the input; None accepts any.
+
+    >>> check_device(nn.Linear(2, 2), torch.device("cpu"))
+    """
+    weight = next(module.parameters(), None)
+    if weight is None:
+        return
+    name = type(module).__name__
+    if weight.is_meta:
+        raise ValueError(
+            f"{name} was built on the meta device and has no weights; build it on the CPU, or load "
+            "a state dict with assign=True"
+        )
+    if device is not None and weight.device != device:
+        raise ValueError(
+            f"expected the waveform on {weight.device}, the device of {name}, got {device}; move "
+            "either with .to()"
+        )
 
 
 @contextmanager

@@ -98,12 +98,16 @@ def test_models_with_values_are_not_built_on_the_meta_device(name: str, clean: T
     assert torch.equal(call(name, model, clean), call(name, build(name), clean))
 
 
-@pytest.mark.parametrize("kind", [MappingCompensator, NeuroMSBG])
+@pytest.mark.parametrize("kind", [HearingAid, MappingCompensator, NeuroMSBG])
 def test_network_without_weights_says_so(kind: type[nn.Module], clean: Tensor) -> None:
     with torch.device("meta"):
         network = kind()
-    with pytest.raises(ValueError, match="has no weights; build it on the CPU"):
-        network(clean, EAR)
+    calls = [lambda: network(clean, EAR)]
+    if isinstance(network, Aid):
+        calls.append(lambda: network.gains(EAR))
+    for call in calls:
+        with pytest.raises(ValueError, match="has no weights; build it on the CPU"):
+            call()
 
 
 @pytest.mark.parametrize("name", LOSSES)

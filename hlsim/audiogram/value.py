@@ -210,24 +210,23 @@ class Audiogram:
         return {f"hl_{_shortest(hz)}": _shortest(level) for hz, level in points}
 
     @classmethod
-    def from_row(cls, row: Mapping[str, str], highest: float = HIGHEST_LEVEL) -> Audiogram:
+    def from_row(cls, row: Mapping[str, str]) -> Audiogram:
         """Convert a row of a table with the thresholds of one ear into an audiogram.
 
         Args:
             row: Texts by column. Columns of thresholds have the names that ``threshold_columns``
                 describes; other columns are ignored. A text that is empty, ``NA``, ``null``,
                 ``None`` or ``nan`` was not measured.
-            highest: Highest level allowed, in dB HL.
 
         Raises:
             ValueError: The row has no measured threshold, those of both ears, two of one frequency,
-                one that is not a number from -10 to ``highest``, or a column whose name looks like
+                one that is not a number from -10 to 120, or a column whose name looks like
                 thresholds but is not understood.
 
         >>> Audiogram.from_row({"hl_500": "20", "1k": "30"})
         Audiogram({500: 20, 1000: 30})
         """
-        ears = ears_in_row(row, highest)
+        ears = ears_in_row(row)
         if len(ears) > 1:
             raise ValueError(
                 "expected the thresholds of one ear, got those of both; read the table with "

@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import NEURO_RATE, check_full_scale, gain_to_pascals
-from hlsim.checks import check_rate, check_waveform
+from hlsim.checks import check_device, check_rate, check_waveform
 from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NetworkConfig
@@ -79,16 +79,7 @@ class EarNetwork(nn.Module):
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         weight = next(self.parameters())
-        if weight.is_meta:
-            raise ValueError(
-                f"{type(self).__name__} was built on the meta device and has no weights; build it "
-                "on the CPU, or load a state dict with assign=True"
-            )
-        if weight.device != waveform.device:
-            raise ValueError(
-                f"expected the waveform on {weight.device}, the device of {type(self).__name__}, "
-                f"got {waveform.device}; move either with .to()"
-            )
+        check_device(self, waveform.device)
         thresholds = resolve_thresholds(None, audiogram, waveform)
         with torch.autocast(waveform.device.type, enabled=False):
             batch, signals, ears = pair_items(waveform, thresholds, weight.dtype)
