@@ -151,12 +151,19 @@ def _read_ears(table: Path) -> list[tuple[float, ...]]:
 
 
 class _RandomBatches(Dataset[Batch]):
-    """Batches of random speech, noise and ears, which depend on the seed and the index alone."""
+    """Batches of random speech, noise and ears, which depend on the seed and the index alone.
 
-    recipe: TrainingRecipe
+    Args:
+        recipe: Settings of the training.
+        data: Speech, noise and ears.
+        ear: Ear of all items; None draws random ears.
+    """
 
-    def __init__(self, recipe: TrainingRecipe, data: TrainingData) -> None:
+    recipe: Any
+
+    def __init__(self, recipe: TrainingRecipe, data: TrainingData, ear: Audiogram | None) -> None:
         self.recipe = recipe
+        self.ear = None if ear is None else torch.tensor(ear.thresholds)
         settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **settings)
         self.noise = Clips(data.noise, repeat=True, **settings) if data.noise else None
@@ -182,7 +189,9 @@ class _RandomBatches(Dataset[Batch]):
         raise NotImplementedError
 
     def draw_ears(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw random and measured ears in dB HL. Shape: -> (count, 8)."""
+        """Draw random and measured ears in dB HL, or repeat the one ear. Shape: -> (count, 8)."""
+        if self.ear is not None:
+            return self.ear.expand(count, -1)
         ears = draw_thresholds(count, generator)
         if self.measured_ears is None:
             return ears
@@ -198,8 +207,6 @@ class _RandomBatches(Dataset[Batch]):
 class _SimulatorBatches(_RandomBatches):
     """Batches for a simulator: speech, noise, tones and clicks, like the outputs of aids."""
 
-    recipe: SimulatorRecipe
-
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         ears = self.draw_ears(count, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
@@ -210,21 +217,7 @@ class _SimulatorBatches(_RandomBatches):
 
 
 class _CompensatorBatches(_RandomBatches):
-    """Batches for a compensator: clean or noisy speech, tones and clicks.
-
-    Args:
-        recipe: Settings of the training.
-        data: Speech, noise and ears.
-        ear: Ear of all items; None draws random ears.
-    """
-
-    recipe: CompensatorRecipe
-
-    def __init__(
-        self, recipe: CompensatorRecipe, data: TrainingData, ear: Audiogram | None
-    ) -> None:
-        super().__init__(recipe, data)
-        self.ear = None if ear is None else torch.tensor(ear.thresholds)
+    """Batches for a compensator: clean or noisy speech, tones and clicks."""
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         recipe = self.recipe
@@ -241,10 +234,7 @@ class _CompensatorBatches(_RandomBatches):
             noisy = replace_share(clean, noisy, recipe.noisy, generator)
             is_speech = (clips == voices).all(-1, keepdim=True)
             signal = torch.where(is_speech, noisy, clean)
-        if self.ear is not None:
-            ears = self.ear.expand(count, -1)
-        else:
-            ears = self.draw_ears(count, generator)
+        ears = self.draw_ears(count, generator)
         batch = {"clean": clean, "signal": signal, "thresholds": ears}
         if recipe.kind == "hearing-aid":
             is_reduced = torch.rand(count, generator=generator) >= recipe.unreduced
@@ -306,76 +296,43 @@ class BatchData(L.LightningDataModule):
         return DataLoader(self.validation, batch_size=None)  # type: ignore[arg-type]
 
 
-def simulator_data(data: TrainingData, recipe: SimulatorRecipe) -> BatchData:
-    """Make the Lightning data module with the batches for the training of a Neuro-MSBG.
-
-    Clips for validation are not equalised, amplified or compressed.
-
-    Args:
-        data: Speech, noise and ears.
-        recipe: Settings of the training.
-
-    Returns:
-        Batches for training and validation.
-
-    Raises:
-        ValueError: Files are missing or invalid, or used for both training and validation.
-
-    >>> from hlsim.data.bundled import SPEECH
-    >>> batches = simulator_data(TrainingData(SPEECH), SimulatorRecipe())
-    >>> list(batches.training[0])
-    ['signal', 'thresholds']
-    """
-    levels = (50.0, 80.0) if recipe.treated else recipe.levels
-    plain = replace(recipe, seconds=_VALIDATION_SECONDS, levels=levels, treated=False)
-    validation = _SimulatorBatches(plain, data.validation())
-    return _make_data(data, _SimulatorBatches(recipe, data), validation)
-
-
-def compensator_data(
-    data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
+def make_data(
+    data: TrainingData, recipe: TrainingRecipe, ear: Audiogram | None = None
 ) -> BatchData:
-    """Make the Lightning data module with the batches for the training of a compensator.
+    """Make the Lightning data module with the batches for a training.
 
-    Clips for validation are not equalised.
+    The speech of the batches for validation is not used for training. Clips for validation are not
+    equalised, amplified or compressed.
 
     Args:
         data: Speech, noise and ears.
-        recipe: Settings of the training.
-        ear: Ear of a personal compensator; None for a general one.
-
-    Returns:
-        Batches for training and validation.
+        recipe: Settings of the training of a simulator or of a compensator.
+        ear: Ear of a personal compensator; None for random and measured ears.
 
     Raises:
         ValueError: Files are missing or invalid, or used for both training and validation, or the
             recipe requires noise and there is none.
 
     >>> from hlsim.data.bundled import SPEECH
-    >>> batches = compensator_data(TrainingData(SPEECH), CompensatorRecipe(), ear=None)
+    >>> batches = make_data(TrainingData(SPEECH), CompensatorRecipe())
     >>> len(batches.validation)  # of 4 items each
     2
     """
-    if (recipe.trains_noise_reduction() or recipe.babble) and not data.noise:
-        raise ValueError(
-            "denoising, intelligibility and babble in the recipe require noise, but the data has "
-            "none; add a folder of noise (--noise)"
-        )
-    plain = replace(recipe, seconds=_VALIDATION_SECONDS, equalised=0.0)
-    validation = _CompensatorBatches(plain, data.validation(), ear)
-    return _make_data(data, _CompensatorBatches(recipe, data, ear), validation)
-
-
-def _make_data(
-    data: TrainingData, training: _RandomBatches, validation: _RandomBatches
-) -> BatchData:
-    """Draw the batches for validation, whose speech must not be used for training.
-
-    Args:
-        data: Speech, noise and ears.
-        training: Batches for training.
-        validation: Batches from which those for validation are drawn once.
-    """
+    batches: type[_RandomBatches] = _CompensatorBatches
+    plain: dict[str, Any] = {"seconds": _VALIDATION_SECONDS}
+    if isinstance(recipe, SimulatorRecipe):
+        batches = _SimulatorBatches
+        levels = (50.0, 80.0) if recipe.treated else recipe.levels
+        plain |= {"levels": levels, "treated": False}
+    elif isinstance(recipe, CompensatorRecipe):
+        plain["equalised"] = 0.0
+        if (recipe.trains_noise_reduction() or recipe.babble) and not data.noise:
+            raise ValueError(
+                "denoising, intelligibility and babble in the recipe require noise, but the data "
+                "has none; add a folder of noise (--noise)"
+            )
+    training = batches(recipe, data, ear)
+    validation = batches(replace(recipe, **plain), data.validation(), ear)
     valid_files = {path.resolve() for path in validation.speech.files}
     shared = {path.resolve() for path in training.speech.files} & valid_files
     if data.valid_speech and shared:
@@ -383,10 +340,9 @@ def _make_data(
             f"{len(shared)} files are used for both training and validation, such as "
             f"{min(shared)}; use other files for validation, or leave --valid-speech out"
         )
-    recipe = training.recipe
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
-    batches = [
+    validation_batches = [
         validation.draw(_VALIDATION_BATCH, generator)
         for _ in range(0, recipe.validation_items, _VALIDATION_BATCH)
     ]
-    return BatchData(training, batches, workers=data.workers)
+    return BatchData(training, validation_batches, workers=data.workers)

@@ -13,7 +13,7 @@ from compensators.hearing_aid import HearingAid
 from compensators.loading import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
 from hlsim.losses.hearing_loss import HearingLossLoss
-from hlsim.training.batches import Batch, TrainingData, compensator_data
+from hlsim.training.batches import Batch, TrainingData, make_data
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
 from hlsim.training.module import TrainingModule, describe_simulator, initial_network
 from hlsim.training.recipes import CompensatorRecipe
@@ -126,7 +126,7 @@ def train_compensator(
     }
     return train_network(
         CompensatorTraining(recipe, simulator=simulator),
-        compensator_data(data, recipe, audiogram),
+        make_data(data, recipe, audiogram),
         recipe.kind,
         out=out,
         about=about,

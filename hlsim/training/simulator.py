@@ -16,7 +16,7 @@ from hlsim.losses.paper import paper_parts
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
 from hlsim.simulators import load_simulator
-from hlsim.training.batches import Batch, TrainingData, simulator_data
+from hlsim.training.batches import Batch, TrainingData, make_data
 from hlsim.training.module import TrainingModule, describe_simulator, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.trainer import train_network
@@ -124,7 +124,7 @@ def train_simulator(
     """
     return train_network(
         SimulatorTraining(recipe, load_simulator(teacher)),
-        simulator_data(data, recipe),
+        make_data(data, recipe),
         SIMULATOR,
         out=out,
         about={"data": data.identity(), **describe_simulator("teacher", teacher)},

@@ -15,7 +15,7 @@ pytest.importorskip("lightning")
 
 from hlsim.calibration import level_spl
 from hlsim.data.manifest import Utterance, write_manifest
-from hlsim.training.batches import BatchData, TrainingData, compensator_data, simulator_data
+from hlsim.training.batches import BatchData, TrainingData, make_data
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 SMALL = SimulatorRecipe(batch=2, seconds=0.25, validation_items=8)
@@ -23,7 +23,7 @@ HUM_HZ = 1000.0
 
 
 def load(data: TrainingData, recipe: SimulatorRecipe = SMALL) -> BatchData:
-    return simulator_data(data, recipe)
+    return make_data(data, recipe)
 
 
 def hum(samples: int) -> Tensor:
@@ -55,7 +55,7 @@ def share_of_hum(signals: Tensor) -> Tensor:
 def test_the_noise_of_a_manifest_is_noisy_minus_clean(manifest: Path) -> None:
     data = TrainingData.from_manifest(manifest)
     recipe = CompensatorRecipe(batch=40, noisy=0.5, snr=(-10.0, -10.0), sounds=0.0, equalised=0.0)
-    signals = compensator_data(data, recipe, None).training[0]["signal"]
+    signals = make_data(data, recipe, None).training[0]["signal"]
     noisy = share_of_hum(signals) > 0.5
     assert 8 < int(noisy.sum()) < 32 and float(share_of_hum(signals[~noisy]).max()) < 0.1
 

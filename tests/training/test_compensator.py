@@ -14,7 +14,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.simulators import BUILT_IN
-from hlsim.training.batches import Batch, TrainingData, compensator_data
+from hlsim.training.batches import Batch, TrainingData, make_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
 from hlsim.training.module import describe_simulator
 from hlsim.training.recipes import CompensatorRecipe
@@ -41,7 +41,7 @@ def train(data: TrainingData, recipe: CompensatorRecipe, out: Path, **options: A
 
 
 def draw(recipe: CompensatorRecipe, data: TrainingData, count: int) -> Batch:
-    return compensator_data(data, replace(recipe, batch=count), None).training[0]
+    return make_data(data, replace(recipe, batch=count), None).training[0]
 
 
 @pytest.fixture
@@ -177,4 +177,4 @@ def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: Training
 @pytest.mark.parametrize("settings", [{"weights": {"denoising": 1.0}}, {"babble": 0.3}])
 def test_noise_is_not_learned_without_noise(data: TrainingData, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="noise"):
-        compensator_data(data, replace(SMALL_AID, **settings), None)
+        make_data(data, replace(SMALL_AID, **settings), None)

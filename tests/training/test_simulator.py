@@ -13,7 +13,7 @@ from hlsim import MSBG
 from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
 from hlsim.simulators import Attenuation
-from hlsim.training.batches import Batch, TrainingData, simulator_data
+from hlsim.training.batches import Batch, TrainingData, make_data
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
 from tests.helpers import write_ears
@@ -33,7 +33,7 @@ ALL_CRITERIA |= {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
 
 
 def training_batch(data: TrainingData, recipe: SimulatorRecipe) -> Batch:
-    return simulator_data(data, recipe).training[0]
+    return make_data(data, recipe).training[0]
 
 
 def test_a_training_leaves_the_best_average_with_its_record(
@@ -47,7 +47,7 @@ def test_a_training_leaves_the_best_average_with_its_record(
     for name in ("start_validation", "validation"):
         module.on_validation_epoch_start()
         with torch.no_grad():
-            for batch in simulator_data(data, recipe).validation:
+            for batch in make_data(data, recipe).validation:
                 module.validation_step(batch, 0)
         summary = module.summarise(torch.cat(module.measured_values))
         assert about[name] == pytest.approx(summary, abs=1e-3)
