@@ -43,6 +43,7 @@ def process_blocks(
         ValueError: The audiogram or a slider is not valid.
 
     >>> from compensators import WDRC
+    >>> import torch
     >>> speech = torch.randn(2, 400000)  # 25 s
     >>> read = lambda blocks: (block.cut_input(speech) for block in blocks)
     >>> [part.shape for part in process_blocks(WDRC(), read, 400000, "N3")]

@@ -47,7 +47,8 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
     unknown = sorted({str(name) for name in names} - set(known))
     if unknown:
         raise ValueError(
-            f"unknown {description}: {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}"
+            f"unknown {description}: {', '.join(unknown)}; expected some of "
+            f"{', '.join(known) or 'none'}"
         )
 
 
@@ -218,8 +219,8 @@ def check_waveform(
         peak = max(-float(low), float(high))
         if HIGHEST_SAMPLE < peak < math.inf:
             raise ValueError(
-                f"expected samples of {name} up to {HIGHEST_SAMPLE:g}, got a peak of {peak:.3g}; scale "
-                f"{name} to pascals, for example with hlsim.load_audio"
+                f"expected samples of {name} up to {HIGHEST_SAMPLE:g}, got a peak of {peak:.3g}; "
+                f"scale {name} to pascals, for example with hlsim.load_audio"
             )
         if full_scale_spl is not None:
             _warn_if_loud(waveform, name, peak, full_scale_spl)

@@ -36,7 +36,8 @@ class TrainingModule(L.LightningModule):
         recipe: Learning rate, number of steps, and settings of the subclass.
 
     Attributes:
-        measured_values: Values of the items of a validation, (items,) per batch, or their mean, (1,).
+        measured_values: Values of the items of a validation, (items,) per batch, or their mean,
+            (1,).
         validation: Results of the last validation by name. The best network has the highest
             ``score``.
 
