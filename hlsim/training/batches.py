@@ -159,7 +159,7 @@ class _RandomBatches(Dataset[Batch]):
         ear: Ear of all items; None draws random ears.
     """
 
-    recipe: Any
+    recipe: TrainingRecipe
 
     def __init__(self, recipe: TrainingRecipe, data: TrainingData, ear: Audiogram | None) -> None:
         self.recipe = recipe
@@ -207,6 +207,8 @@ class _RandomBatches(Dataset[Batch]):
 class _SimulatorBatches(_RandomBatches):
     """Batches for a simulator: speech, noise, tones and clicks, like the outputs of aids."""
 
+    recipe: SimulatorRecipe
+
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         ears = self.draw_ears(count, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
@@ -218,6 +220,8 @@ class _SimulatorBatches(_RandomBatches):
 
 class _CompensatorBatches(_RandomBatches):
     """Batches for a compensator: clean or noisy speech, tones and clicks."""
+
+    recipe: CompensatorRecipe
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         recipe = self.recipe
