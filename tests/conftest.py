@@ -1,4 +1,10 @@
-"""Common set-up of all tests: seeded random numbers, one thread, and the bundled speech."""
+"""Common set-up of all tests: seeded random numbers, one thread, and the bundled speech.
+
+The process that distributes the tests imports this file, too. It needs no torch, whose import takes
+seconds of one core, so functions import it and what depends on it.
+"""
+
+from __future__ import annotations
 
 import os
 import random
@@ -6,16 +12,17 @@ import shutil
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
-from hlsim.audio import read_audio
-from tests.pyclarity import PyclarityOutputs, write_outputs
 from tests.sign_of_life import SignOfLife
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from tests.pyclarity import PyclarityOutputs
 
 SPEECH_DIR = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
 
@@ -36,17 +43,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Processes that tests start use one as well: several workers would wait for each other's threads.
     """
-    torch.set_num_threads(1)
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     config.stash[NEW_OUTPUTS] = {}
     distributes_tests = bool(config.getoption("numprocesses", None))
     if distributes_tests and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SignOfLife(config))
+        return
+    import torch
+
+    torch.set_num_threads(1)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Store pyclarity's outputs if ``--write-pyclarity`` was set."""
     if session.config.stash[NEW_OUTPUTS]:
+        from tests.pyclarity import write_outputs
+
         write_outputs(session.config.stash[NEW_OUTPUTS])
 
 
@@ -63,6 +75,8 @@ def pytest_report_header(config: pytest.Config) -> str | None:
 @pytest.fixture(params=["stored", pytest.param("computed", marks=pytest.mark.slow)])
 def pyclarity(request: pytest.FixtureRequest) -> PyclarityOutputs:
     """Outputs of pyclarity by key: the stored ones, and in a second, slow test, computed ones."""
+    from tests.pyclarity import PyclarityOutputs
+
     writes = request.config.option.write_pyclarity
     new_outputs = request.config.stash[NEW_OUTPUTS] if writes else None
     return PyclarityOutputs(request.param == "computed", new_outputs)
@@ -71,6 +85,8 @@ def pyclarity(request: pytest.FixtureRequest) -> PyclarityOutputs:
 @pytest.fixture(autouse=True)
 def seeded() -> None:
     """Seed every generator before each test; pyclarity's HASPI uses numpy's global one."""
+    import torch
+
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)
@@ -79,6 +95,8 @@ def seeded() -> None:
 @pytest.fixture
 def two_threads() -> Iterator[None]:
     """Use two threads, for code that computes differently with more than one."""
+    import torch
+
     torch.set_num_threads(2)
     yield
     torch.set_num_threads(1)
@@ -120,6 +138,8 @@ def speech_dir() -> Path:
 @cache
 def read_speech(name: str) -> tuple[Tensor, int]:
     """Read a bundled utterance and its rate in Hz, once for all tests. Shape: (1, time)."""
+    from hlsim.audio import read_audio
+
     return read_audio(SPEECH_DIR / f"{name}.flac")
 
 

@@ -28,6 +28,13 @@ MODULES = [
 WITH_EXAMPLES = [name for name in MODULES if not WITHOUT_EXAMPLES.fullmatch(name)]
 
 
+@pytest.fixture
+def one_position(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure the look-ahead of aids at one position; all of them take most of the time."""
+    monkeypatch.setattr("hlsim.evaluation.aid_properties.CHANGE_POSITIONS", [24001])
+
+
+@pytest.mark.usefixtures("one_position")
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_print_what_they_say(name: str) -> None:
     results = doctest.testmod(importlib.import_module(name))
