@@ -139,6 +139,7 @@ def test_a_manifest_names_ears_levels_and_conditions(corpus: Path) -> None:
     assert "gone.wav" in reasons["L2 right clean/p2/c 0 dB"]
 
 
+@pytest.mark.usefixtures("quick_scores")
 def test_the_better_ear_counts(corpus: Path) -> None:
     rows = ["listener,ear,condition,clean,processed,audiogram"]
     for condition, left, right in (("unaided", "after", "before"), ("aided", "before", "after")):

@@ -26,8 +26,8 @@ def test_value_is_1_minus_the_scores_and_the_cost_of_the_level(clean: Tensor) ->
     torch.testing.assert_close(parts["haspi"], 1.0 - haspi(aided, clean, "N3"))
     torch.testing.assert_close(parts["hasqi"], 1.0 - hasqi(aided, clean, "N3"))
     level = sum(loss.weights[name] * parts[name] for name in ("levels", "louder", "peaks"))
-    value = loss(aided, clean)
-    torch.testing.assert_close(value, parts["haspi"] + 0.5 * parts["hasqi"] + level)
+    value = parts["haspi"] + 0.5 * parts["hasqi"] + level
+    torch.testing.assert_close(loss(aided[1], clean[1]), value[1])
     assert set(HASPILoss("N3", level=0.0).weights) == {"haspi"}
     torch.testing.assert_close(HASPILoss("N3", quality=0.5)(aided, clean), value.mean())
 
