@@ -192,7 +192,8 @@ def clarity(parser: Parser) -> None:
         "path/to/file.py:name, a callable (waveform, listener, sample_rate) -> waveform or its "
         "class, for (2, time) at the files' scale"
     )
-    option("names", str, text, nargs="*")
+    names = parser.add_argument("names", help=text, nargs="+", default=[])
+    names.required = False  # with nargs="*", argparse would not find names behind other options
     text = (
         "existing outputs of an aid as LABEL=FOLDER, in files SCENE_LISTENER_HA-output.wav with "
         "two channels; repeat the option for several aids"

@@ -84,3 +84,11 @@ def test_lists_that_begin_with_a_minus_are_values() -> None:
     parsed = make_parser("evaluate-compensator").parse_args(words)
     assert parsed.audiogram == [-10.0, 0.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0]
     assert parsed.levels == [-5.0, -10.0] and parsed.names == ["msbg"]
+
+
+def test_aids_of_clarity_may_follow_options_or_be_left_out(tmp_path: Path) -> None:
+    options = [str(tmp_path), "--listeners", str(tmp_path), "--out", "judged"]
+    parser = make_parser("clarity")
+    assert parser.parse_args([*options, "nalr", "wdrc"]).names == ["nalr", "wdrc"]
+    assert parser.parse_args([options[0], "nalr", *options[1:]]).names == ["nalr"]
+    assert parser.parse_args(options).names == []
