@@ -135,8 +135,8 @@ class Player:
 
     >>> sounds = [Sound("unaided", 10.2, b"fLaC", -30.0, b"\\x89PNG")]
     >>> player = Player({"": sounds}, seconds=4.0, full_scale=94.0)
-    >>> [sound.label for sound in player.sounds]
-    ['unaided']
+    >>> player.sounds[0].label
+    'unaided'
     """
 
     groups: Mapping[str, Sequence[Sound]]
