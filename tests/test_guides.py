@@ -133,6 +133,9 @@ def _write_listeners(folder: Path, clean: torch.Tensor) -> None:
     write_audio(folder / "scene.wav", scene, 16000)
     for kind in ("mix", "target", "target_anechoic"):
         write_audio(clarity / "dev" / "scenes" / f"S06001_{kind}_CH1.wav", scene, 16000)
+    outputs = folder / "exp" / "amplified_signals"
+    outputs.mkdir(parents=True)
+    write_audio(outputs / "S06001_L0001_HA-output.wav", scene, 16000)
 
     header = ["listener", "ear", *(f"hl_{hz}" for hz in entry["audiogram_cfs"])]
     with open(folder / "listeners.csv", "w", newline="") as file:
