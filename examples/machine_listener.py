@@ -66,6 +66,7 @@ from hlsim.data.clips import Clips
 from hlsim.data.mixing import mix
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.conditions import AtLevelOf, EqualiserLike, Unaided
+from hlsim.evaluation.digits.material import INTERNAL_NOISE_DB, INTERNAL_NOISE_HZ
 from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
@@ -86,21 +87,6 @@ SPEECH_LEVEL = 65.0
 
 STANDARD_EARS = ("N2", "N3", "N4", "S2")
 MEASURED_EARS = 4
-
-NOISE_FREQUENCIES = (
-    *(50, 100, 160, 200, 250, 315, 400, 500, 630, 800, 1000, 1250),
-    *(1600, 2000, 2500, 3150, 4000, 5000, 6300, 8000),
-)
-"""Frequencies in Hz of ``NOISE_LEVELS``: third octaves, and 50 and 100 Hz."""
-
-NOISE_LEVELS = (
-    *(4.0, 2.0, 0.6, -1.7, -3.9, -6.1, -8.2, -9.7, -10.8, -11.9, -12.5, -13.5),
-    *(-15.4, -17.7, -21.2, -24.2, -25.9, -23.6, -15.8, -7.1),
-)
-"""Spectrum level in dB SPL per Hz of the internal noise of a normal ear.
-
-Source: ANSI S3.5-1997, table 3, from 160 Hz; below, an extension.
-"""
 
 PEAK = 0.5
 """Largest sample of the recogniser's input, which hears no level."""
@@ -139,8 +125,8 @@ def internal_noise(samples: int, seed: int) -> NDArray[np.float32]:
     """
     generator = np.random.default_rng(seed)
     spectrum = np.fft.rfft(generator.standard_normal(samples))
-    hertz = np.fft.rfftfreq(samples, 1.0 / RATE).clip(NOISE_FREQUENCIES[0])
-    levels = np.interp(np.log(hertz), np.log(NOISE_FREQUENCIES), NOISE_LEVELS)
+    hertz = np.fft.rfftfreq(samples, 1.0 / RATE).clip(INTERNAL_NOISE_HZ[0])
+    levels = np.interp(np.log(hertz), np.log(INTERNAL_NOISE_HZ), INTERNAL_NOISE_DB)
     # White noise of variance 1 has a power of 2 / RATE per Hz.
     gains = 10.0 ** ((levels - PASCAL_SPL) / 20.0) * math.sqrt(RATE / 2.0)
     noise: NDArray[np.float32] = np.fft.irfft(spectrum * gains, samples).astype(np.float32)

@@ -57,7 +57,7 @@ def test_words_are_aligned(example: ModuleType, spoken: str, recognised: str, co
 def test_internal_noise_has_the_levels_of_the_standard(example: ModuleType) -> None:
     noise = example.internal_noise(60 * 16000, seed=1)
     frequencies, density = welch(noise, fs=16000, nperseg=4096)
-    for frequency, level in zip(example.NOISE_FREQUENCIES, example.NOISE_LEVELS, strict=True):
+    for frequency, level in zip(example.INTERNAL_NOISE_HZ, example.INTERNAL_NOISE_DB, strict=True):
         if 100 <= frequency < 8000:
             near = np.abs(frequencies / frequency - 1.0) < 0.06
             measured = 94.0 + 10.0 * np.log10(density[near].mean())

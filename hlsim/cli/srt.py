@@ -73,11 +73,13 @@ def _srt(options: argparse.Namespace) -> None:
         "people with this mean loss": result.people,
     }
     for number, name in enumerate(ears):
-        texts = [f"{test} {_in_words(value, number)}" for test, value in tests.items() if value]
+        texts = [
+            f"{test} {_format_estimate(value, number)}" for test, value in tests.items() if value
+        ]
         print(f"{name}, {result.pta[number]:.0f} dB HL: {', '.join(texts)}")
 
 
-def _in_words(estimate: Any, number: int) -> str:
+def _format_estimate(estimate: Any, number: int) -> str:
     """Return an estimate of one of several ears with its 95 % interval."""
     value, low, high = (values[number] for values in estimate)
     return f"{value:.1f} dB [{low:.1f}, {high:.1f}]"

@@ -28,18 +28,20 @@ TRIPLET_SAMPLES = LEAD_SAMPLES + DIGITS_PER_TRIPLET * SLOT_SAMPLES + TAIL_SAMPLE
 _SPECTRUM_SAMPLES = 4096
 """Length of the frames from which the spectrum of the digits is computed."""
 
-# ANSI S3.5-1997, Table 3, reference internal noise spectrum level in dB SPL per hertz. The table
-# begins at 160 Hz; the first two values extrapolate it.
-_INTERNAL_NOISE_HZ = np.array(
-    "50 100 160 200 250 315 400 500 630 800 1000 1250 1600 2000 2500 3150 4000 5000 6300 8000"
-    "".split(),
-    dtype=float,
+INTERNAL_NOISE_HZ = (
+    *(50, 100, 160, 200, 250, 315, 400, 500, 630, 800, 1000, 1250),
+    *(1600, 2000, 2500, 3150, 4000, 5000, 6300, 8000),
 )
-_INTERNAL_NOISE_DB = np.array(
-    "4 2 .6 -1.7 -3.9 -6.1 -8.2 -9.7 -10.8 -11.9 -12.5 -13.5 -15.4 -17.7 -21.2 -24.2 -25.9 -23.6 "
-    "-15.8 -7.1".split(),
-    dtype=float,
+"""Frequencies in Hz of ``INTERNAL_NOISE_DB``: third octaves, and 50 and 100 Hz."""
+
+INTERNAL_NOISE_DB = (
+    *(4.0, 2.0, 0.6, -1.7, -3.9, -6.1, -8.2, -9.7, -10.8, -11.9, -12.5, -13.5),
+    *(-15.4, -17.7, -21.2, -24.2, -25.9, -23.6, -15.8, -7.1),
 )
+"""Spectrum level in dB SPL per Hz of the internal noise of a normal ear.
+
+Source: ANSI S3.5-1997, table 3, from 160 Hz; below, an extrapolation.
+"""
 
 
 class Triplets(NamedTuple):
@@ -159,8 +161,10 @@ def _speech_amplitudes() -> Tensor:
 @cache
 def _internal_amplitudes() -> Tensor:
     """Compute the factors by which white noise of RMS 1 becomes the internal noise in pascals."""
-    root_density = 10.0 ** ((_INTERNAL_NOISE_DB - PASCAL_SPL) / 20.0)
-    return _interpolate(root_density * np.sqrt(NEURO_RATE / 2.0), _INTERNAL_NOISE_HZ)
+    root_density = 10.0 ** ((np.array(INTERNAL_NOISE_DB) - PASCAL_SPL) / 20.0)
+    return _interpolate(
+        root_density * np.sqrt(NEURO_RATE / 2.0), np.array(INTERNAL_NOISE_HZ, float)
+    )
 
 
 def _interpolate(amplitudes: NDArray[Any], hertz: NDArray[np.float64]) -> Tensor:
