@@ -24,7 +24,7 @@ TUTORIALS = ROOT / "docs" / "tutorials"
 EXECUTED = ROOT / "build" / "tutorials"
 TIMEOUT_SECONDS = 1800
 
-SUFFIXES = {"audio/flac": "flac", "image/svg+xml": "svg", "image/png": "png"}
+SUFFIXES = {"audio/wav": "wav", "image/svg+xml": "svg", "image/png": "png"}
 PROMISES = {
     "hear-a-hearing-loss": """
 normal, mild, severe = (level_spl(hlsim.simulate(presented, name)) for name in ("NH", "N2", "N4"))
@@ -66,7 +66,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         notebook = executed or notebook
         page, media = render(notebook, path.name)
         kinds = {name.rpartition(".")[2] for name in media}
-        assert executed is None or kinds >= {"flac", "png"}, f"{path.name} has no sound or picture"
+        assert executed is None or kinds >= {"wav", "png"}, f"{path.name} has no sound or picture"
         source = f"tutorials/{path.stem}"
         files.append(File.generated(config, f"{source}.md", content=page))
         for name, data in media.items():

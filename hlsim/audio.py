@@ -265,8 +265,11 @@ def write_parts(
             file.write(values.mT.contiguous().numpy().astype("<f4", copy=False).tobytes())
 
 
-def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
-    """Encode a signal as the contents of a 16-bit FLAC file, for audio players on web pages.
+def encode_wav(waveform: Tensor, sample_rate: int) -> bytes:
+    """Encode a signal as the contents of a 16-bit WAV file, for audio players on web pages.
+
+    A FLAC file of libsndfile has half the size, but no seek table: Chromium cannot start to play it
+    at some positions, and stops.
 
     Args:
         waveform: Samples from -1 to 1, (time,) or (channels, time).
@@ -275,12 +278,12 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     Returns:
         The contents of the file.
 
-    >>> encode_flac(torch.zeros(160), 16000)[:4]
-    b'fLaC'
+    >>> encode_wav(torch.zeros(160), 16000)[:4]
+    b'RIFF'
     """
     data = io.BytesIO()
     samples = waveform.detach().cpu().float().resolve_neg().numpy()
-    soundfile.write(data, samples.T, sample_rate, format="FLAC", subtype="PCM_16")
+    soundfile.write(data, samples.T, sample_rate, format="WAV", subtype="PCM_16")
     return data.getvalue()
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import (
-    encode_flac,
+    encode_wav,
     find_audio,
     read_audio,
     read_parts,
@@ -137,10 +137,10 @@ def test_files_of_folders_are_sorted_and_hidden_ones_left_out(tmp_path: Path) ->
             find_audio(folder)
 
 
-def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
+def test_an_encoded_sound_is_the_signal_to_16_bits(tmp_path: Path) -> None:
     signal = torch.linspace(-1.0, 0.99, 16000)
-    (tmp_path / "x.flac").write_bytes(encode_flac(signal, 16000))
-    samples, rate = read_audio(tmp_path / "x.flac")
+    (tmp_path / "x.wav").write_bytes(encode_wav(signal, 16000))
+    samples, rate = read_audio(tmp_path / "x.wav")
     assert rate == 16000 and float((samples[0] - signal).abs().max()) <= 2**-15
 
 
@@ -238,7 +238,7 @@ def test_a_tensor_with_the_negative_bit_is_written(tmp_path: Path) -> None:
     assert signal.is_neg()
     write_audio(tmp_path / "a.wav", signal, 16000)
     assert torch.equal(read_audio(tmp_path / "a.wav")[0][0], signal)
-    assert encode_flac(signal, 16000) == encode_flac(signal.resolve_neg(), 16000)
+    assert encode_wav(signal, 16000) == encode_wav(signal.resolve_neg(), 16000)
 
 
 def test_the_first_invalid_sample_is_placed(tmp_path: Path) -> None:

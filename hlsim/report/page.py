@@ -108,7 +108,7 @@ class Sound:
         spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram.
         note: Text on the spectrogram, which says why it is black.
 
-    >>> Sound("unaided", 10.2, b"fLaC", -30.0, b"\\x89PNG").label
+    >>> Sound("unaided", 10.2, b"RIFF", -30.0, b"\\x89PNG").label
     'unaided'
     """
 
@@ -133,7 +133,7 @@ class Player:
         seconds: Length of the sounds in seconds.
         full_scale: Level in dB SPL for which full scale stands in the sounds of the first group.
 
-    >>> sounds = [Sound("unaided", 10.2, b"fLaC", -30.0, b"\\x89PNG")]
+    >>> sounds = [Sound("unaided", 10.2, b"RIFF", -30.0, b"\\x89PNG")]
     >>> player = Player({"": sounds}, seconds=4.0, full_scale=94.0)
     >>> player.sounds[0].label
     'unaided'
@@ -345,6 +345,6 @@ def _escape_markdown(text: str) -> str:
 
 def _data_uri(data: bytes) -> str:
     """Return the contents of a file as a URI, whose type is known from its first bytes."""
-    types = {b"\x89PNG": "image/png", b"fLaC": "audio/flac"}
+    types = {b"\x89PNG": "image/png", b"RIFF": "audio/wav"}
     media_type = types.get(data[:4], "image/svg+xml")
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"

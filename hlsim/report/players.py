@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from hlsim.audio import encode_flac
+from hlsim.audio import encode_wav
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.result import Evaluation, ItemSounds
@@ -122,7 +122,7 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
     return Sound(
         label,
         level,
-        encode_flac(signal * (_PEAK / peak), sample_rate),
+        encode_wav(signal * (_PEAK / peak), sample_rate),
         loudness=level - _full_scale(peak),
         spectrogram=_spectrogram_png(levels),
         note=_describe_black(levels),

@@ -88,6 +88,12 @@ def report(window: Any, report_file: Path) -> Any:
 
 
 @pytest.fixture
+def demo(window: Any, demo_file: Path) -> Any:
+    window.goto(demo_file.as_uri())
+    return window
+
+
+@pytest.fixture
 def players(window: Any, players_file: Path) -> Any:
     window.goto(players_file.as_uri())
     return window
@@ -148,32 +154,29 @@ def test_text_and_plots_follow_the_colour_scheme(report: Any) -> None:
     assert lightest > 200 if dark else darkest < 50
 
 
-def test_the_page_of_the_demo_shows_its_numbers_verdict_and_sounds(
-    window: Any, demo_file: Path
-) -> None:
-    window.goto(demo_file.as_uri())
-    check_images(window, 3 + 9)  # pictures, and spectrograms of all sounds
-    titles = window.locator(".card .name").all_inner_texts()
+def test_the_page_of_the_demo_shows_its_numbers_verdict_and_sounds(demo: Any) -> None:
+    check_images(demo, 3 + 9)  # pictures, and spectrograms of all sounds
+    titles = demo.locator(".card .name").all_inner_texts()
     assert titles == ["HASPI", "Words understood", "Loudness error"]
-    bars = window.locator(".card .bar").evaluate_all(
+    bars = demo.locator(".card .bar").evaluate_all(
         "cells => cells.map(cell => cell.getBoundingClientRect().width)"
     )
     assert len(bars) == 3 * 4 and min(bars) > 40
-    order = window.evaluate(
+    order = demo.evaluate(
         """['.cards', '.verdict', '.hlsim-player', '.pictures', 'details'].map(
             name => document.querySelector(name).getBoundingClientRect().top)"""
     )
     assert order == sorted(order)
-    labels = window.locator(".select span").all_inner_texts()
+    labels = demo.locator(".select span").all_inner_texts()
     aids = ["NAL-R", "NAL-R, same level", "trained aid"]
     assert labels == ["normal ear (the goal)", "unaided", *aids, "original speech", *aids]
-    window.keyboard.press("2")  # on the fresh page, before any click
-    (state,) = window.evaluate(STATE)
+    demo.keyboard.press("2")  # on the fresh page, before any click
+    (state,) = demo.evaluate(STATE)
     assert state["pressed"] == 1
-    window.locator(".play").click()
-    window.locator(".select").nth(3).click()
-    wait_until(window, "document.querySelectorAll('audio')[3].currentTime > 0.1")
-    (state,) = window.evaluate(STATE)
+    demo.locator(".play").click()
+    demo.locator(".select").nth(3).click()
+    wait_until(demo, "document.querySelectorAll('audio')[3].currentTime > 0.1")
+    (state,) = demo.evaluate(STATE)
     assert state["playing"] == [3]
 
 
@@ -193,6 +196,23 @@ def test_switching_keeps_the_position(players: Any) -> None:
     (state,) = players.evaluate(STATE)
     assert state["playing"] == []
     assert state["position"] == pytest.approx(state["times"][0], abs=0.05)
+
+
+def test_a_sound_plays_from_any_position(demo: Any) -> None:
+    errors = demo.evaluate(
+        """async () => {
+            const errors = [];
+            for (const audio of document.querySelectorAll('audio'))
+                for (let step = 0; step < 20; step++) {
+                    const answer = new Promise(found => { audio.onseeked = audio.onerror = found; });
+                    audio.currentTime = audio.duration * step / 20;
+                    await answer;
+                    if (audio.error) errors.push([step / 20, audio.error.message]);
+                }
+            return errors;
+        }"""
+    )
+    assert errors == []
 
 
 def test_a_spectrogram_and_the_slider_choose_the_position(players: Any) -> None:
