@@ -204,7 +204,9 @@ def test_a_sound_plays_from_any_position(demo: Any) -> None:
             const errors = [];
             for (const audio of document.querySelectorAll('audio'))
                 for (let step = 0; step < 20; step++) {
-                    const answer = new Promise(found => { audio.onseeked = audio.onerror = found; });
+                    const answer = new Promise(found => {
+                        audio.onseeked = audio.onerror = found;
+                    });
                     audio.currentTime = audio.duration * step / 20;
                     await answer;
                     if (audio.error) errors.push([step / 20, audio.error.message]);
