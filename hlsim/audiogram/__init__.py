@@ -12,8 +12,8 @@ from hlsim.audiogram.scale import (
     HIGHEST_SIMULATED,
     LOWEST_LEVEL,
     SEVERITIES,
-    STANDARD,
 )
+from hlsim.audiogram.standard import STANDARD
 from hlsim.audiogram.value import Audiogram, as_audiogram, severity_index
 
 __all__ = [

@@ -115,11 +115,15 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
 
 
 def _read_name(column: str, name: str) -> ThresholdColumn | None:
-    """Return the meaning of a column, or None if it holds no thresholds.
+    """Return the meaning of a column of thresholds or of a remark on one, or None for another one.
 
     Args:
         column: Name of the column, for messages.
         name: The name in lower case, with single blanks.
+
+    Raises:
+        ValueError: The name looks like that of thresholds, but its number is no frequency from 100
+            to 20000 Hz.
     """
     match = _NAME.match(name)
     if match is None:

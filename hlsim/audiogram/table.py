@@ -12,7 +12,8 @@ from typing import Any
 
 from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.listener import Listener
-from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD, EarName
+from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, EarName
+from hlsim.audiogram.standard import STANDARD
 from hlsim.audiogram.value import Audiogram, ears_in_row
 from hlsim.checks import reject_duplicates
 from hlsim.files import convert_at, read_table
@@ -133,7 +134,17 @@ def _group_rows(path: str | Path | Any) -> _Builders:
 
 
 def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
-    """Return the listener of one or two rows."""
+    """Return the listener of one row with both ears, or of a row per ear.
+
+    An ear without thresholds is missing from the listener.
+
+    Args:
+        listener: Name of the listener, for messages.
+        rows: The rows, each with its place in the table.
+
+    Raises:
+        ValueError: A row names no ear, an ear occurs twice, or an ear is not valid.
+    """
     ears: dict[EarName, Audiogram] = {}
     for place, row in rows:
         for name, ear in convert_at(place, _read_ears, row).items():

@@ -24,10 +24,10 @@ from hlsim.audiogram.scale import (
     LOWEST_LEVEL,
     SEVERITIES,
     SEVERITY_LIMITS,
-    STANDARD,
     WHO_GRADES,
     EarName,
 )
+from hlsim.audiogram.standard import STANDARD
 from hlsim.extras import require
 
 _UNMEASURED = ("", "na", "n/a", "null", "none", "nan")

@@ -268,10 +268,21 @@ def _checked_type(
 
 
 def ear(text: str) -> str | list[float] | dict[float, float]:
-    """Convert the text of ``--audiogram`` to a name, to levels, or to frequencies with levels.
+    """Convert the text of ``--audiogram`` to an ear.
+
+    Args:
+        text: A name, levels, or frequencies with levels.
+
+    Returns: The name, a list of levels in dB HL at the audiometric frequencies, or a dictionary
+    from frequencies in Hz to levels in dB HL.
+
+    Raises:
+        argparse.ArgumentTypeError: A frequency occurs twice.
 
     >>> ear("N3"), ear("500:30,4000:60")
     ('N3', {500.0: 30.0, 4000.0: 60.0})
+    >>> ear("20,30,40,50,60,60,70,70")
+    [20.0, 30.0, 40.0, 50.0, 60.0, 60.0, 70.0, 70.0]
     """
     if ":" in text:
         points = [point.split(":") for point in text.split(",")]

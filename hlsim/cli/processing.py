@@ -97,10 +97,15 @@ def _process(
 ) -> None:
     """Process the file or each file of the folder for each ear, and print a line per output.
 
+    A file of a folder that fails causes a warning, and the others are processed.
+
     Args:
         options: Options of the command.
         build_model: Function from the options and a sample rate in Hz to a simulator or
             compensator.
+
+    Raises:
+        ValueError: The single file failed or, once all are processed, a file of the folder did.
     """
     use_one_thread()
     from hlsim.checks import LOWEST_RATE

@@ -112,14 +112,17 @@ class Clips:
         return self._recordings[index].float() / 32767.0
 
     def cut_clip(self, index: int, position: float) -> Tensor:
-        """Cut a clip out of a recording.
+        """Cut a clip out of a recording whose peak is 1.0, so that its level is not calibrated.
+
+        A recording that is shorter than the clip is repeated if ``repeat`` is true. Otherwise
+        silence follows it.
 
         Args:
             index: Index of the file in ``files``.
             position: Position of the clip, from 0 at the start of the recording to 1 at its end.
 
         Returns:
-            Samples with shape (time,).
+            The clip, (samples,).
         """
         recording = self.read_recording(index)
         if self.repeat and len(recording) < self.samples:

@@ -178,11 +178,14 @@ def _make_conditions(
     equalisers: Mapping[str, nn.Module],
     enhancers: Mapping[str, WaveformPlugin],
 ) -> list[Condition]:
-    """Return all conditions, each of them after those with which it is compared.
+    """Return the conditions, each of which is compared with all earlier ones.
+
+    They are: unaided; each prescription, followed by its enhanced versions; and each trained aid,
+    after NAL-R and the equaliser at its level, followed by its enhanced versions.
 
     Args:
-        aids: Prescriptions and compensators, each under its name.
-        equalisers: Equaliser with the mean gain of each compensator.
+        aids: Prescriptions, NAL-R among them, and trained aids, each under its name.
+        equalisers: For each trained aid, under its name, an equaliser with its mean gain.
         enhancers: Enhancers, by the part of their names after the colon.
     """
     conditions = [Condition(UNAIDED, Unaided(), kind="unaided")]

@@ -49,19 +49,20 @@ def evaluate_trained_aid(
 ) -> Evaluation:
     """Compare an aid that was trained for one ear with no aid and NAL-R, on bundled speech.
 
-    The comparison with NAL-R at the aid's level by HASPI is planned. It is that of the means of the
-    voices, because utterances of one voice are not independent.
+    The only comparison is the planned one: HASPI of the aid against NAL-R at the aid's level, over
+    the means of the voices, because utterances of one voice are not independent.
 
     Args:
-        aid: The aid, which is called with a waveform and an ear.
+        aid: The aid, which is called with a waveform in pascals at 16 kHz, (time,), and an ear.
         audiogram: The ear.
         ear_name: Name of the ear, for the page.
         training_steps: Number of training steps, for the page.
         running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
     Returns:
-        The evaluation. Its ``details`` have the gains of the aids, and the levels per band that the
-        ear perceives and that speech has, its ``sounds`` the last utterance.
+        The evaluation. Its ``details`` have ``gain_curves`` of the aids, ``perceived_levels`` in
+        24 bands in dB SPL, and ``speech_levels_hl``, the levels of the input and of the aid's
+        output in dB HL. Its ``sounds`` are those of the last utterance.
     """
     nal_r = NALR()
     conditions = [

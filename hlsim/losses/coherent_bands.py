@@ -170,7 +170,14 @@ def _average_segments(frames: Tensor) -> Tensor:
 
 
 def _audibility(powers: Tensor, threshold: Tensor) -> Tensor:
-    """Compute weights from 0 to 1, which carry no gradient, from powers in Pa^2."""
+    """Compute how audible powers are: p / (p + threshold), which is 0.5 at the threshold.
+
+    The weights carry no gradient.
+
+    Args:
+        powers: Powers in Pa^2, (..., bands, frames).
+        threshold: Power in Pa^2 at which a band is half audible, broadcast over ``powers``.
+    """
     powers = powers.detach()
     return powers / (powers + threshold)
 

@@ -183,7 +183,7 @@ class FrozenSimulator:
 
 @compute_once
 def _normal_ear() -> Tensor:
-    """Return the thresholds of a normal ear on the CPU."""
+    """Return the thresholds of a normal ear, 0 dB HL at all ``FREQUENCIES``, (8,), on the CPU."""
     return torch.zeros(len(FREQUENCIES), device="cpu")
 
 

@@ -37,7 +37,7 @@ from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Equalisation, Noise, match_pair
-from hlsim.metrics.quality import QualityParts, QualityReference
+from hlsim.metrics.quality_reference import QualityParts, QualityReference
 from hlsim.torchtools import Audio, Samples, as_type_of, constant, not_compiled
 
 ENVELOPE_SEGMENT = 192

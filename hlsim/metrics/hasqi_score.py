@@ -16,7 +16,7 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.pair import Equalisation, Noise, match_pair
-from hlsim.metrics.quality import QualityParts, QualityReference
+from hlsim.metrics.quality_reference import QualityParts, QualityReference
 from hlsim.torchtools import Audio, Samples, as_type_of, not_compiled
 
 

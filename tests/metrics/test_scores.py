@@ -23,7 +23,7 @@ from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi,
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.haaqi_score import _split_by_rate
-from hlsim.metrics.quality import _scale_motion_to_level
+from hlsim.metrics.quality_reference import _scale_motion_to_level
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
