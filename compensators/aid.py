@@ -125,7 +125,7 @@ class Aid(nn.Module):
         noise = _speech_noise(like=ears) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
         # The first second, in which gains settle, is left out.
         output = self._amplify(noise.repeat(len(ears), 2), ears)[:, RATE:]
-        in_third = _thirds_of_octave(like=ears)
+        in_third = thirds_of_octave(like=ears)
         output_power, noise_power = (
             power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
         )
@@ -176,7 +176,11 @@ def _speech_noise() -> NDArray[np.float64]:
 
 
 @constant
-def _thirds_of_octave() -> NDArray[np.float64]:
-    """Return 1 for each whole frequency in Hz in each third of an octave, else 0, (8001, 8)."""
+def thirds_of_octave() -> NDArray[np.float64]:
+    """Return 1 for each whole frequency in Hz in each third of an octave, else 0, (8001, 8).
+
+    >>> print(thirds_of_octave().sum(0))
+    [  58.  116.  232.  463.  695.  926. 1389.  873.]
+    """
     ratio = np.arange(RATE // 2 + 1)[:, None] / np.array(FREQUENCIES)
     return ((ratio > 2.0 ** (-1.0 / 6.0)) & (ratio < 2.0 ** (1.0 / 6.0))).astype(float)

@@ -25,6 +25,7 @@ GROUPS = {
         ),
         "live": ("live", "run a hearing aid or a simulated hearing loss with a microphone"),
         "demo": ("demo", "train a compensator for one ear on bundled speech"),
+        "export-gains": ("fitting.export_gains", "write the gains of an aid for another program"),
     },
     "evaluate": {
         "haspi-report": ("evaluation", "compare recordings by HASPI, HASQI, HAAQI, STOI or PESQ"),

@@ -1,0 +1,50 @@
+"""The command ``export-gains``, which writes an aid's gains for another program."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from hlsim.cli.inputs import build_compensator, parse_ear, use_one_thread, warn_of_other_ears
+from hlsim.cli.options import SIMULATED_EARS, Parser, count, sound_level
+
+
+def export_gains(parser: Parser) -> None:
+    """Declare the options of the command ``export-gains``."""
+    parser.set_command(
+        _export_gains,
+        "--audiogram N3 --to csv",
+        "--audiogram N3 --to camilladsp --level 70 --sample-rate 48000 --out aid.yml",
+        "--audiogram N3 --to openmha --compensator wdrc --out gains.cfg",
+    )
+    option = parser.option
+    parser.audiogram(ears=SIMULATED_EARS, required=True)
+    programs = ("camilladsp", "equalizer-apo", "openmha", "csv")
+    option("--to", str, "program that reads the file", required=True, choices=programs)
+    text = "aid whose gains are exported: nalr, wdrc, or a checkpoint's name or folder"
+    option("--compensator", str, text, "hearing-aid")
+    text = (
+        "level of speech in dB SPL for which camilladsp and equalizer-apo amplify; the other "
+        "formats have gains at many levels"
+    )
+    option("--level", sound_level, text, 65.0)
+    option("--sample-rate", count, "sample rate in Hz of camilladsp or openmha", 48000)
+    option("--out", Path, "file to write; without it, the text is printed")
+    parser.set_defaults(full_scale_spl=94.0)  # for the aid, whose signals are in pascals
+
+
+def _export_gains(options: argparse.Namespace) -> None:
+    use_one_thread()
+    ear = parse_ear(options)
+    warn_of_other_ears({options.compensator: options.compensator}, ear)
+    from hlsim.calibration import NEURO_RATE
+    from hlsim.evaluation.fitting.gain_tables import export_gains as write_gains
+    from hlsim.files import write_atomically
+
+    aid = build_compensator(options, NEURO_RATE)
+    text = write_gains(aid, ear, options.to, options.level, options.sample_rate)
+    if options.out:
+        write_atomically(options.out, text)
+    else:
+        sys.stdout.write(text)

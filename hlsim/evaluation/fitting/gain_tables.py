@@ -1,0 +1,200 @@
+"""Export of an aid's fitted gains to other programs.
+
+Two formats hold gains at many levels: a CSV table, and the gain table of openMHA's compressor
+``dc``. CamillaDSP and Equalizer APO are linear: a file holds the gains for speech at one level.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from compensators.aid import Aid, thirds_of_octave
+from compensators.filter_bank import RATE, speech_density
+from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import NEURO_RATE
+from hlsim.checks import check_number
+
+Array = NDArray[np.float64]
+
+LEVELS = tuple(float(level) for level in range(20, 121, 5))
+"""Levels of speech in dB SPL at which the gains of tables are measured."""
+
+BAND_LEVELS = tuple(float(level) for level in range(0, 121, 3))
+"""Levels in dB SPL of a band of openMHA for which its table has gains."""
+
+TAPS = 1023
+"""Coefficients of the filter for CamillaDSP."""
+
+_HERTZ = np.arange(1, RATE // 2 + 1)
+"""Frequencies of ``speech_density``, and those at which filters are designed."""
+
+_FIT_STEPS = 10
+"""Steps of the fit of an equaliser, after which its gains are within .01 dB of the aid's."""
+
+
+class _Fitting(NamedTuple):
+    """An aid that is fitted to one ear, with the settings of the export.
+
+    Attributes:
+        aid: Aid with the method ``gains``.
+        ear: Audiogram of one ear.
+        level: Level of speech in dB SPL, for formats that hold the gains at one level.
+        sample_rate: Sample rate in Hz of the other program.
+    """
+
+    aid: Aid
+    ear: Any
+    level: float
+    sample_rate: int
+
+    def gains(self, level: float) -> Array:
+        """Measure the insertion gains in dB for speech at a level in dB SPL, (8,)."""
+        gains = self.aid.gains(self.ear, level).double().cpu().numpy()
+        if gains.ndim != 1:
+            raise ValueError(f"expected one ear to export, got {len(gains)}; export one at a time")
+        return gains
+
+    def gain_table(self) -> Array:
+        """Measure the insertion gains in dB at all ``LEVELS``, (21, 8)."""
+        return np.stack([self.gains(level) for level in LEVELS])
+
+
+def export_gains(
+    aid: Aid, ear: Any, program: str, level: float = 65.0, sample_rate: int = NEURO_RATE
+) -> str:
+    """Write the gains of an aid for an ear as a configuration of another program.
+
+    Args:
+        aid: Aid, such as ``NALR()`` or one from ``load_compensator``.
+        ear: Audiogram of one ear.
+        program: Name of the format: ``camilladsp``, ``equalizer-apo``, ``openmha`` or ``csv``.
+        level: Level of speech in dB SPL, 0 to 120, for ``camilladsp`` and ``equalizer-apo``.
+        sample_rate: Sample rate in Hz of CamillaDSP or openMHA, 16000 to 192000.
+
+    Returns:
+        Text of the configuration file.
+
+    Raises:
+        ValueError: There is no such format, or an ear or a number is not valid.
+
+    >>> from compensators import NALR
+    >>> print(export_gains(NALR(), "N3", "equalizer-apo").splitlines()[-1][:34])
+    GraphicEQ: 250 -0.48; 500 8.93; 10
+    """
+    if program not in PROGRAMS:
+        raise ValueError(f"no format {program!r}; expected one of {', '.join(PROGRAMS)}")
+    check_number("sample_rate", sample_rate, RATE, 192000)
+    return PROGRAMS[program](_Fitting(aid, ear, level, sample_rate))
+
+
+def _equaliser_points(gains: Array) -> Array:
+    """Return the gains of an equaliser that amplifies thirds of an octave as an aid does.
+
+    Between ``FREQUENCIES``, the equaliser's gain in dB is a straight line over log frequency. In a
+    third of an octave, it therefore amplifies the noise of ``Aid.gains`` otherwise than at the
+    centre, by up to 2 dB where gains are steep.
+
+    Shape: (8,) -> (8,) in dB.
+    """
+    in_third = thirds_of_octave()[1:]
+    density = speech_density(RATE)
+    points = gains.copy()
+    for _ in range(_FIT_STEPS):
+        response = 10.0 ** (_interpolate(points) / 10.0)
+        measured = (density * response) @ in_third / (density @ in_third)
+        points += gains - 10.0 * np.log10(measured)
+    return points
+
+
+def _interpolate(points: Array) -> Array:
+    """Return the equaliser's gains in dB at whole frequencies to 8 kHz. Shape: (8,) -> (8000,)."""
+    return np.interp(np.log(_HERTZ), np.log(FREQUENCIES), points)
+
+
+def _write_csv(fitting: _Fitting) -> str:
+    """Write a table with a row per frequency, and a column per level of speech in dB SPL."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["frequency_hz", *(f"gain_db_at_{level:g}" for level in LEVELS)])
+    for hertz, gains in zip(FREQUENCIES, fitting.gain_table().T, strict=True):
+        writer.writerow([f"{hertz:g}", *(f"{gain:.2f}" for gain in gains)])
+    return text.getvalue()
+
+
+def _write_equalizer_apo(fitting: _Fitting) -> str:
+    """Write the configuration of Equalizer APO: gains that follow lines over log frequency."""
+    points = _equaliser_points(fitting.gains(fitting.level))
+    pairs = [f"{hz:g} {gain:.2f}" for hz, gain in zip(FREQUENCIES, points, strict=True)]
+    return f"# Gains for speech at {fitting.level:g} dB SPL\nGraphicEQ: {'; '.join(pairs)}\n"
+
+
+def _write_camilladsp(fitting: _Fitting) -> str:
+    """Write the configuration of CamillaDSP 3: a minimum-phase filter, from stdin to stdout."""
+    points = _equaliser_points(fitting.gains(fitting.level))
+    hertz = np.array([0, *_HERTZ, *[fitting.sample_rate / 2][: fitting.sample_rate > RATE]])
+    response = 10.0 ** (np.interp(hertz, _HERTZ, _interpolate(points)) / 20.0)
+    linear_phase = scipy.signal.firwin2(TAPS, hertz, response, fs=fitting.sample_rate)
+    filter_ = scipy.signal.minimum_phase(linear_phase, half=False)
+    values = ", ".join(f"{value:.8g}" for value in filter_)
+    return f"""\
+# Gains for speech at {fitting.level:g} dB SPL. Replace capture and playback by your devices.
+devices:
+  samplerate: {fitting.sample_rate}
+  chunksize: 256
+  capture: {{type: Stdin, channels: 1, format: FLOAT32LE}}
+  playback: {{type: Stdout, channels: 1, format: FLOAT32LE}}
+filters:
+  aid:
+    type: Conv
+    parameters: {{type: Values, values: [{values}]}}
+pipeline:
+  - {{type: Filter, channels: [0], names: [aid]}}
+"""
+
+
+def _write_openmha(fitting: _Fitting) -> str:
+    """Write the part of openMHA's configuration for its filter bank and its compressor ``dc``.
+
+    The compressor looks up the gain of a band by the level of this band. The aid's gains are
+    measured with speech, whose level is that of all bands together.
+    """
+    edges = np.sqrt(np.multiply(FREQUENCIES[1:], FREQUENCIES[:-1]))
+    powers = np.bincount(np.searchsorted(edges, _HERTZ), speech_density(RATE))
+    bands_below_speech = 10.0 * np.log10(powers / powers.sum())
+    gains = [
+        np.interp(BAND_LEVELS, np.array(LEVELS) + below, column)
+        for below, column in zip(bands_below_speech, fitting.gain_table().T, strict=True)
+    ]
+    rows = ";".join(f"[{' '.join(f'{gain:.2f}' for gain in row)}]" for row in gains)
+    return f"""\
+# Plugin mhachain inside overlapadd, one channel at {fitting.sample_rate} Hz
+algos = [fftfilterbank dc combinechannels]
+fftfilterbank.unit = Hz
+fftfilterbank.f = [{" ".join(f"{hertz:g}" for hertz in FREQUENCIES)}]
+fftfilterbank.fscale = log
+fftfilterbank.ftype = center
+fftfilterbank.ovltype = rect
+dc.fb = fftfilterbank
+dc.chname = fftfilterbank_nchannels
+dc.log_interp = yes
+dc.gtmin = [{BAND_LEVELS[0]:g}]
+dc.gtstep = [{BAND_LEVELS[1] - BAND_LEVELS[0]:g}]
+dc.gtdata = [{rows}]
+combinechannels.outchannels = 1
+"""
+
+
+PROGRAMS: dict[str, Callable[[_Fitting], str]] = {
+    "camilladsp": _write_camilladsp,
+    "equalizer-apo": _write_equalizer_apo,
+    "openmha": _write_openmha,
+    "csv": _write_csv,
+}
+"""Function that writes the configuration of each program, by its name."""
