@@ -85,8 +85,8 @@ def export_gains(
         ValueError: There is no such format, or an ear or a number is not valid.
 
     >>> from compensators import NALR
-    >>> print(export_gains(NALR(), "N3", "equalizer-apo").splitlines()[-1][:34])
-    GraphicEQ: 250 -0.48; 500 8.93; 10
+    >>> print(export_gains(NALR(), "N3", "equalizer-apo").splitlines()[-1][:33])
+    GraphicEQ: 250 -0.29; 500 8.96; 1
     """
     if program not in PROGRAMS:
         raise ValueError(f"no format {program!r}; expected one of {', '.join(PROGRAMS)}")
