@@ -52,6 +52,24 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
         )
 
 
+def check_attributes(thing: Any, noun: str, **expected: Any) -> None:
+    """Raise ValueError unless those attributes of an object that exist have the expected values.
+
+    Args:
+        thing: Object to validate.
+        noun: Noun for the object, for the message.
+        expected: Expected value of each attribute.
+
+    >>> check_attributes("N3", "a module", sample_rate=16000)
+    """
+    for name, value in expected.items():
+        attribute = getattr(thing, name, value)
+        if attribute != value:
+            raise ValueError(
+                f"expected {noun} with {name}={value}, got {attribute}; build it with this value"
+            )
+
+
 def check_choice(name: str, value: Any, choice: Any) -> None:
     """Raise ValueError unless a setting has one of the values of a ``typing.Literal``.
 

@@ -25,7 +25,7 @@ from hlsim.calibration import (
     gain_to_pascals,
     set_level,
 )
-from hlsim.checks import check_rate, check_waveform
+from hlsim.checks import check_attributes, check_rate, check_waveform
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
@@ -226,10 +226,7 @@ def load_simulator(
     """
     if isinstance(simulator, nn.Module):
         settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
-        for attribute, value in settings.items():
-            setting = getattr(simulator, attribute, value)
-            if setting != value:
-                raise ValueError(f"expected a simulator with {attribute}={value}, got {setting}")
+        check_attributes(simulator, "a simulator", **settings)
         return simulator
     name = str(simulator)
     if name in BUILT_IN:

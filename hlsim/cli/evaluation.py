@@ -65,15 +65,13 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from compensators import load_compensator
     from hlsim.evaluation.simulators import evaluate_simulators
     from hlsim.report.simulators_page import simulators_page
-    from hlsim.simulators import load_simulator
 
-    names = _read_labels(options.names)
     compensator = load_compensator(options.compensator) if options.compensator else None
     _run_study(
         options,
         evaluate_simulators,
         simulators_page,
-        simulators={label: load_simulator(name) for label, name in names.items()},
+        simulators=_read_labels(options.names),
         compensator=compensator,
         store=options.out / STORE,
     )

@@ -295,7 +295,7 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
 
     Returns: Outputs, cut to the length of the signals. Shape: (signals, time).
     """
-    outputs = [cut_output(aid(signal, ear), signal, NEURO_RATE) for signal in signals]
+    outputs = [cut_output(aid(signal.clone(), ear), signal, NEURO_RATE) for signal in signals]
     return torch.stack(outputs)
 
 

@@ -13,7 +13,8 @@ from torch import nn
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import NEURO_RATE
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
+from hlsim.checks import check_attributes
 from hlsim.data.clips import Clips
 from hlsim.evaluation.aid_properties import (
     measure_aids,
@@ -117,6 +118,8 @@ def evaluate_compensators(
     """
     for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")
+    for name, aid in compensators.items():
+        check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
     ears = read_ears(audiograms)
     if audiogram is not None:
@@ -131,7 +134,7 @@ def evaluate_compensators(
     utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     enhancer_plugins = load_enhancers(enhancers)
     prescriptions = {NAL_R: NALR(sample_rate=NEURO_RATE), COMPRESSION: WDRC(sample_rate=NEURO_RATE)}
-    aids = {name: aid.eval() for name, aid in {**prescriptions, **compensators}.items()}
+    aids = {**prescriptions, **compensators}
     equalisers = {name: EqualiserLike(aids[name], utterances, levels) for name in compensators}
     conditions = _make_conditions(aids, equalisers, enhancer_plugins)
     kinds = ("aid", "prescription", "enhanced")

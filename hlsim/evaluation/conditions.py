@@ -87,7 +87,7 @@ class AtLevelOf(nn.Module):
         Samples after the end of the waveform do not count, because a study does not score them.
         """
         time = waveform.shape[-1]
-        level = level_spl(self.other(waveform, audiogram)[..., :time])
+        level = level_spl(self.other(waveform.clone(), audiogram)[..., :time])
         return set_level(self.aid(waveform, audiogram)[..., :time], level)
 
 

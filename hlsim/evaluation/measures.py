@@ -7,6 +7,7 @@ column of the study's table.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -111,7 +112,9 @@ class _PluginMeasure:
         return _PluginMeasure, (self.name,)
 
     def __call__(self, item: Item, output: Tensor) -> Values:
-        values = self.function(item, output)
+        # A function that changes its arguments in place must not change those of other measures.
+        copy = replace(item, clean=item.clean.clone(), signal=item.signal.clone())
+        values = self.function(copy, output)
         if not isinstance(values, Mapping):
             raise ValueError(
                 f"measure {self.name} returned {values!r}; expected a dict of numbers by the name "

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def evaluate_simulators(
-    simulators: Mapping[str, nn.Module],
+    simulators: Mapping[str, str | Path | nn.Module],
     *,
     speech: str | Path,
     audiograms: str | Path,
@@ -58,8 +58,8 @@ def evaluate_simulators(
     more simulator computes only its values.
 
     Args:
-        simulators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
-            waveform and an ear.
+        simulators: Simulators by their label in tables: names, folders, or modules at 16 kHz and 94
+            dB SPL full scale, see ``load_simulator``.
         speech: Folder of recordings of clean speech.
         audiograms: CSV file of ears, see ``draw_simulator_items``.
         store: File of scores, which is created if it does not exist; None stores nothing.
@@ -106,10 +106,11 @@ def evaluate_simulators(
         "seed": seed,
         "levels": list(levels),
     }
+    loaded = {label: load_simulator(simulator) for label, simulator in simulators.items()}
     drawn = draw_simulator_items(speech, noise, audiograms, **settings)
     evaluation = Evaluation.run(
         apply_treatments(drawn, inputs, compensator),
-        [Condition(name, module, "simulator") for name, module in simulators.items()],
+        [Condition(name, module, "simulator") for name, module in loaded.items()],
         [_fidelity_to(teacher), *map(load_measure, measures)],
         store=store,
         settings={"teacher": teacher, **settings, "inputs": inputs},

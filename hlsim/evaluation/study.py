@@ -16,7 +16,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
@@ -132,7 +132,7 @@ class Condition:
     Args:
         name: Name in tables.
         process: Function ``(signal, ear) -> output``, for a signal with shape (time,) and an
-            ``Audiogram``; None if the outputs were recorded.
+            ``Audiogram``; None if the outputs were recorded. A module is set to evaluation mode.
         kind: Role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
         of: Name of the condition to which this one belongs, such as the aid whose level it has.
 
@@ -145,6 +145,10 @@ class Condition:
     kind: str = "aid"
     of: str = ""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.process, nn.Module):
+            self.process.eval()
+
     @cached_property
     def fingerprint(self) -> str | None:
         """Fingerprint of the processing. If it is None, unknown, scores are not stored."""
@@ -155,7 +159,8 @@ class Condition:
         if self.process is None:
             assert item.recorded is not None
             return item.recorded(self.name)
-        return self.process(item.signal, item.ear)
+        # A function that changes its input in place must not change the item.
+        return self.process(item.signal.clone(), item.ear)
 
 
 @dataclass(frozen=True)
@@ -237,7 +242,8 @@ def run_study(
         measure has its values.
 
     Raises:
-        ValueError: No scheduler answers, or a measure returns a column that exists already.
+        ValueError: There are no items, conditions or measures; two conditions or measures have the
+            same name; a fact or a measure has the name of another column; or no scheduler answers.
         OSError: The store cannot be written.
         MissingExtraError: A package is not installed.
 
@@ -277,6 +283,11 @@ def run_measures(
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
     facts = {fact for source in items for fact in source.facts}
+    if not items:
+        raise ValueError("expected items, got none; add some")
+    _check_different("condition", [condition.name for condition in conditions])
+    _check_different("measure", [measure.name for measure in measures])
+    _check_different("column of the table", [*_RESERVED_COLUMNS, *facts])
     owners = dict.fromkeys([*_RESERVED_COLUMNS, *facts], "")
     results: _Results = {}
     tasks = []
@@ -318,6 +329,15 @@ def run_measures(
     return table, [
         replace(m, scores=columns[m.name] if m.scores is None else m.scores) for m in measures
     ]
+
+
+def _check_different(noun: str, names: Sequence[str]) -> None:
+    """Raise ValueError if there are no names, or if two of them are equal."""
+    if not names:
+        raise ValueError(f"expected the name of a {noun}, got none; add one")
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two of the {noun}s are called {name}; rename one of them")
 
 
 def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> None:
@@ -375,12 +395,18 @@ def _measure_item(task: _Task) -> list[Values | str]:
             if condition.name not in pairs:
                 pairs[condition.name] = _item_and_output(condition, item)
             with loud_outputs():
-                values = measure.compute(*pairs[condition.name])
+                item_of_output, output = pairs[condition.name]
+                # A measure that changes the output in place must not change that of the next one.
+                values = dict(measure.compute(item_of_output, output.clone()))
             for name, value in values.items():
-                if isinstance(value, float) and not math.isfinite(value):
+                if isinstance(value, str):
+                    continue
+                number = float(value)  # of a number of NumPy or torch, for example
+                if not math.isfinite(number):
                     raise ValueError(
                         f"expected a finite number for {name} from {measure.name}, got {value}"
                     )
+                values[name] = number
             results.append(values)
         except Exception as error:
             results.append(describe_error(error))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from compensators import MappingCompensator
+from compensators import NALR, MappingCompensator
 from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
@@ -153,6 +153,8 @@ def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
 def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
     for changes in (
         {"compensators": {"NAL-R": Unaided()}},
+        {"compensators": {"mine": NALR(sample_rate=44100)}},
+        {"compensators": {"mine": NALR(full_scale_spl=100.0)}},
         {"items": 0},
         {"seconds": 0.01},
         {"audiogram": Audiogram.standard("N7")},

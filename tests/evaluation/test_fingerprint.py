@@ -16,7 +16,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import list_pretrained
 from hlsim.evaluation.conditions import AtLevelOf
 from hlsim.evaluation.running.fingerprint import _hash_sources, fingerprint
-from hlsim.plugins import WaveformPlugin
+from hlsim.plugins import WaveformPlugin, load_plugin
 
 N3 = Audiogram.standard("N3")
 
@@ -75,8 +75,34 @@ def test_settings_of_any_describable_type_count() -> None:
     fingerprints = [fingerprint(Foreign(setting)) for setting in settings]
     assert None not in fingerprints and len(set(fingerprints)) == len(settings)
     assert fingerprints == [fingerprint(Foreign(setting)) for setting in settings]
-    moved = type("Foreign", (Foreign,), {"__module__": "elsewhere", "__qualname__": "Foreign"})
-    assert fingerprint(moved(1.0)) == fingerprint(Foreign(1.0)), "the place of a class is ignored"
+    unknown = type("Foreign", (Foreign,), {"__module__": "notebook"})
+    assert fingerprint(unknown(1.0)) is None, "a class without a source file"
+
+
+MODULE = """
+import torch
+from torch import nn
+class Aid(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Identity()
+        self.layer.weight = nn.Parameter(torch.ones(1))
+        self._gain = 1
+    def forward(self, waveform, rate):
+        return self._gain * waveform
+"""
+
+
+def test_the_source_and_private_attributes_of_a_module_of_a_user_count(tmp_path: Path) -> None:
+    sources = [MODULE, MODULE, MODULE.replace("return self", "return -self")]
+    fingerprints = []
+    for number, source in enumerate(sources):
+        (tmp_path / f"{number}.py").write_text(source)
+        aid = load_plugin(f"{tmp_path / str(number)}.py:Aid", "aid")
+        fingerprints.append(fingerprint(aid))
+        aid._gain = 2
+        assert fingerprint(aid) not in (None, fingerprints[-1])
+    assert fingerprints[0] == fingerprints[1] != fingerprints[2], "the place of a file is ignored"
 
 
 def test_functions_of_one_name_in_two_files_have_two_fingerprints(tmp_path: Path) -> None:

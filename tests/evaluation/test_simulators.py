@@ -39,6 +39,14 @@ def options(speech_dir: Path, ears_file: Path) -> dict[str, Any]:
     return {**folders, "audiograms": ears_file, "items": 8, "seconds": 1.0, "jobs": 1}
 
 
+@pytest.mark.parametrize("setting", [{"sample_rate": 44100}, {"full_scale_spl": 100.0}])
+def test_a_simulator_for_other_signals_is_rejected(
+    options: dict[str, Any], setting: dict[str, Any]
+) -> None:
+    with pytest.raises(ValueError, match="expected a simulator with"):
+        evaluate_simulators({"mine": MSBG(**setting)}, **options)
+
+
 def test_values_failures_and_page(options: dict[str, Any]) -> None:
     simulators = {"light": load_pretrained("neuro-msbg-light"), "none": Unimpaired(60.0)}
     study = evaluate_simulators(simulators, **options, inputs=("as-is", "louder"), listen=1)

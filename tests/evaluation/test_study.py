@@ -1,5 +1,6 @@
 """A study's table: its rows, its failures, stored values, and a run that is killed."""
 
+import math
 import os
 import signal
 from collections.abc import Callable
@@ -7,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -76,6 +78,58 @@ def test_there_is_one_row_per_item_and_condition(items: list[Item]) -> None:
     assert table.failure.fillna("").tolist() == ["", "", "negative", "negative", "", ""]
     assert CALLS.count("reference") == 3, "a reference is computed once per item"
     assert (progress[0], progress[-1]) == ((0, 12), (12, 12))
+
+
+def test_equal_names_and_empty_lists_are_rejected(items: list[Item]) -> None:
+    valid: dict[str, Any] = {"items": items, "conditions": gains(1), "measures": MEASURES}
+    for name, values, message in (
+        ("conditions", gains(1, 1), "two of the conditions are called times 1"),
+        ("measures", [MEASURES[0], replace(MEASURES[1], name="peak")], "measures are called peak"),
+        ("items", [replace(items[0], facts={"item": "s01"})], "columns? .* called item"),
+        ("items", [replace(items[0], facts={"failure": "none"})], "columns? .* called failure"),
+        *((name, [], f"expected .*{name[:-1]}") for name in valid),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run_study(**{**valid, name: values}, jobs=1)
+
+
+def test_changes_in_place_do_not_reach_other_conditions_and_measures(
+    items: list[Item], tmp_path: Path
+) -> None:
+    def double(signal: Tensor, ear: Audiogram) -> Tensor:
+        return signal.mul_(2.0)
+
+    def silence(item: Item, output: Tensor) -> dict[str, float]:
+        output.zero_()
+        return {"zero": 0.0}
+
+    file = tmp_path / "own.py"
+    file.write_text("def silence(item, output): item.clean.zero_(); return {'clean': 0.0}")
+    measures = [Measure("zero", silence), load_measure(f"{file}:silence"), MEASURES[0]]
+    table = run_study(items, [Condition("in place", double), *gains(1)], measures, jobs=1)
+    assert table["peak"].tolist() == pytest.approx([0.4, 0.2, 0.8, 0.4, 1.2, 0.6])
+    assert table["clean_peak"].tolist() == pytest.approx([0.1, 0.1, 0.2, 0.2, 0.3, 0.3])
+
+
+def test_a_module_is_in_evaluation_mode(items: list[Item]) -> None:
+    class Random(torch.nn.Dropout):
+        def forward(self, signal: Tensor, ear: Any = None) -> Tensor:
+            return super().forward(signal)
+
+    table = run_study(items, [Condition("aid", Random(1.0).train())], MEASURES[:1], jobs=1)
+    assert table["peak"].tolist() == pytest.approx([0.2, 0.4, 0.6])
+
+
+@pytest.mark.parametrize("kind", [float, np.float32, torch.tensor])
+def test_numbers_of_any_type_are_stored_and_must_be_finite(
+    items: list[Item], kind: Callable[[float], Any]
+) -> None:
+    store = ScoreStore()
+    values = iter([1.0, math.nan, 3.0])
+    measure = Measure("own", lambda item, output: {"own": kind(next(values))})
+    table = run_study(items, gains(1), [measure], store=store, jobs=1)
+    assert sorted(values["own"] for values in store.scores.values()) == [1.0, 3.0]
+    assert table["own"].isna().tolist() == table["failure"].notna().tolist() == [False, True, False]
 
 
 def resize(samples: int) -> Callable[[Tensor, Audiogram], Tensor]:

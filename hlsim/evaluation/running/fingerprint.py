@@ -1,15 +1,17 @@
 """Fingerprints: hashes that show whether a stored score is still valid.
 
 A fingerprint covers everything that decides the outputs of a module: class names, settings and
-tensors. The code of hlsim has a hash of its own, ``code_version``, which is part of the key of each
-stored score. Authors of modules outside hlsim add an attribute ``fingerprint``, such as a version,
-and change it when the outputs change.
+tensors and, for a class outside hlsim and torch, the file with its source code. The code of hlsim
+has a hash of its own, ``code_version``, which is part of the key of each stored score. Authors of
+modules outside hlsim may add an attribute ``fingerprint``, such as a version, which they change
+when the outputs change.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
 from functools import cache
 from pathlib import Path
@@ -19,6 +21,7 @@ import numpy as np
 from torch import Tensor, nn
 
 import compensators
+from hlsim.files import sha256
 from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
 
@@ -64,14 +67,14 @@ def fingerprint(processing: Any) -> str | None:
 
     Args:
         processing: Function or ``torch.nn.Module``. If it has an attribute ``fingerprint``, its
-            name and this attribute decide. Otherwise, the classes, the public attributes and the
-            tensors of a module and its submodules do.
+            name and this attribute decide. Otherwise, the classes, the attributes and the tensors
+            of a module and its submodules do, without private attributes of hlsim and torch.
 
     Returns:
         The SHA-256 in hexadecimal, or None if the outputs could change without notice: for a
         function without the attribute, for a module outside hlsim without tensors and ``config``,
-        for a module with a public attribute that cannot be described, such as a lambda, and for a
-        module of hlsim that contains one of these.
+        for a class without a source file, for a module with an attribute that cannot be described,
+        such as a lambda, and for a module of hlsim that contains one of these.
 
     >>> fingerprint(nn.Linear(2, 2)) == fingerprint(nn.Linear(2, 2))  # random weights
     False
@@ -93,12 +96,15 @@ def fingerprint(processing: Any) -> str | None:
     for place, module in processing.named_modules():
         parts[place] = [
             _name(module),
-            _public_attributes(module),
+            [_hash_source(kind) for kind in type(module).__mro__ if not _is_known(kind)],
+            _attributes(module),
             str(getattr(module, "fingerprint", None)),
         ]
         # A condition of hlsim, such as an aid at another's level, contains the aids of a user.
         contained = module.children() if _is_from_hlsim(module) else ()
-        if any(fingerprint(child) is None for child in contained if not _is_known(child)):
+        if any(fingerprint(child) is None for child in contained if not _is_known(type(child))):
+            return None
+        if None in parts[place][1]:
             return None
     try:
         return value_hash([parts, tensors])
@@ -128,17 +134,29 @@ def _is_from_hlsim(module: nn.Module) -> bool:
     return type(module).__module__.startswith(("hlsim.", "compensators."))
 
 
-def _is_known(module: nn.Module) -> bool:
-    """Return whether the class of a module belongs to hlsim or torch."""
-    return _is_from_hlsim(module) or type(module).__module__.startswith("torch.")
+def _is_known(kind: type) -> bool:
+    """Return whether a class belongs to hlsim, torch or Python."""
+    return kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "builtins")
 
 
-def _public_attributes(module: nn.Module) -> dict[str, Any]:
-    """Return the public attributes of a module without those that every module has."""
+@cache
+def _hash_source(kind: type) -> str | None:
+    """Compute the SHA-256 of the file with the source code of a class, or None if it is unknown."""
+    try:
+        return sha256(Path(inspect.getfile(kind)))
+    except (OSError, TypeError):  # of a class in a notebook, for example
+        return None
+
+
+def _attributes(module: nn.Module) -> dict[str, Any]:
+    """Return the attributes of a module without those that every module has.
+
+    Private attributes of hlsim and torch are values that calls have computed.
+    """
     return {
         name: value
         for name, value in vars(module).items()
-        if name not in _MODULE_ATTRIBUTES and not name.startswith("_")
+        if name not in _MODULE_ATTRIBUTES and not (name.startswith("_") and _is_known(type(module)))
     }
 
 
