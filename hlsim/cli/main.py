@@ -31,6 +31,10 @@ GROUPS = {
         "haspi-report": ("evaluation", "compare recordings by HASPI, HASQI, HAAQI, STOI or PESQ"),
         "evaluate-compensator": ("evaluation", "compare hearing aids with no aid, NAL-R and WDRC"),
         "evaluate-simulator": ("evaluation", "compare simulators with MSBG or another teacher"),
+        "verify": (
+            "fitting.verify",
+            "compare the gains of an aid in two recordings with their targets",
+        ),
         "srt": ("srt", "measure the speech reception threshold in noise of ears and aids"),
         "clarity": ("evaluation", "evaluate pairs of aids on scenes of the Clarity challenges"),
     },

@@ -207,10 +207,22 @@ def threshold_in_quiet() -> NDArray[np.float64]:
 
     Returns: Levels in dB SPL, (24,).
 
-    Source: Terhardt (1979), Equation 1.
-
     >>> print(threshold_in_quiet()[12].round(1))  # at 1423 Hz
     2.0
     """
-    khz = band_centres() / 1000.0
+    return normal_threshold(band_centres())
+
+
+def normal_threshold(hertz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the softest level in dB SPL that a normal ear hears in a free field.
+
+    Source: Terhardt (1979), Equation 1.
+
+    Args:
+        hertz: Frequencies in Hz.
+
+    >>> print(normal_threshold(np.array([250.0, 1000.0, 4000.0])).round(1))
+    [11.   3.4 -3.4]
+    """
+    khz = hertz / 1000.0
     return 3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4

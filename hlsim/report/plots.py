@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram.plot import frequency_axis
+from hlsim.evaluation.fitting.verification import PERCENTILES, Verification
 from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.statistics import MIN_ITEMS_FOR_INTERVAL, bootstrap_interval
@@ -144,6 +145,28 @@ def curves_picture(
 
     height = 2.9 + _LEGEND_INCHES * ((len(curves) + 1) // 2)
     return _draw_picture(draw, title, note=note, height=height)
+
+
+def verification_picture(result: Verification) -> Picture:
+    """Draw the percentiles of an aid's output between threshold and uncomfortable level.
+
+    >>> import hlsim
+    >>> from hlsim.evaluation.fitting.verification import verify
+    >>> speech = hlsim.example_speech()
+    >>> verification_picture(verify(speech, speech, "N3", 16000)).title
+    'Output of the aid in third octaves'
+    """
+    limit = {"color": UNAIDED_COLOUR, "linestyle": "--"}
+    curves: dict[str, Curve] = {"uncomfortable level": (result.hertz, result.uncomfortable, limit)}
+    for share, levels, style in zip(
+        PERCENTILES, result.output_levels, (":", "-", "--"), strict=True
+    ):
+        line = {"color": _COLOURS[0], "linestyle": style}
+        curves[f"output, {share} % of sections"] = (result.hertz, levels, line)
+    curves["threshold"] = (result.hertz, result.thresholds, {"color": UNAIDED_COLOUR})
+    target = {"color": _COLOURS[1]}
+    curves["target for 65 %"] = (result.hertz, result.input_levels[1] + result.targets, target)
+    return curves_picture(curves, "Output of the aid in third octaves", "level (dB SPL)")
 
 
 def gain_picture(

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.data.bundled import DIGIT_DBFS, DIGITS, SLOT_SAMPLES
+from hlsim.metrics.sii import INTERNAL_NOISE, SII_BANDS
 
 DIGITS_PER_TRIPLET = 3
 
@@ -28,16 +29,10 @@ TRIPLET_SAMPLES = LEAD_SAMPLES + DIGITS_PER_TRIPLET * SLOT_SAMPLES + TAIL_SAMPLE
 _SPECTRUM_SAMPLES = 4096
 """Length of the frames from which the spectrum of the digits is computed."""
 
-INTERNAL_NOISE_HZ = (
-    *(50, 100, 160, 200, 250, 315, 400, 500, 630, 800, 1000, 1250),
-    *(1600, 2000, 2500, 3150, 4000, 5000, 6300, 8000),
-)
+INTERNAL_NOISE_HZ = (50, 100, *SII_BANDS)
 """Frequencies in Hz of ``INTERNAL_NOISE_DB``: third octaves, and 50 and 100 Hz."""
 
-INTERNAL_NOISE_DB = (
-    *(4.0, 2.0, 0.6, -1.7, -3.9, -6.1, -8.2, -9.7, -10.8, -11.9, -12.5, -13.5),
-    *(-15.4, -17.7, -21.2, -24.2, -25.9, -23.6, -15.8, -7.1),
-)
+INTERNAL_NOISE_DB = (4.0, 2.0, *INTERNAL_NOISE)
 """Spectrum level in dB SPL per Hz of the internal noise of a normal ear.
 
 Source: ANSI S3.5-1997, table 3, from 160 Hz; below, an extrapolation.

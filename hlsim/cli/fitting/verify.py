@@ -1,0 +1,83 @@
+"""The command ``verify``, which measures an aid's gains from recordings of its input and output."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hlsim.cli.inputs import check_extras, parse_ear, use_one_thread
+from hlsim.cli.options import SIMULATED_EARS, Parser, input_path
+
+if TYPE_CHECKING:
+    from hlsim.evaluation.fitting.verification import Verification
+
+
+def verify(parser: Parser) -> None:
+    """Declare the options of the command ``verify``."""
+    parser.set_command(
+        _verify,
+        "input.wav output.wav --audiogram N3",
+        "input.wav output.wav --audiogram N3 --spl 65 --plot verify.svg --csv verify.csv",
+    )
+    option = parser.option
+    option("input", input_path, "input of the aid, a mono file of 16 to 48 kHz")
+    option("output", input_path, "output of the aid at the same scale and rate")
+    parser.audiogram(ears=SIMULATED_EARS, required=True)
+    text = "aid whose gains are the targets: nalr, wdrc, or a checkpoint's name or folder"
+    option("--target", str, text, "nalr")
+    parser.levels("the input; the output is scaled by the same factor")
+    option("--csv", Path, "file to write, with the printed table")
+    option("--plot", Path, "SVG file to write, with speech, threshold and uncomfortable level")
+
+
+def _verify(options: argparse.Namespace) -> None:
+    use_one_thread()
+    if options.plot:
+        check_extras("eval")
+    from hlsim.audio import read_audio
+    from hlsim.calibration import level_spl
+    from hlsim.evaluation.fitting.verification import verify as verify_aid
+    from hlsim.files import write_atomically
+
+    (input_, rate), (output, output_rate) = map(read_audio, (options.input, options.output))
+    if rate != output_rate:
+        raise ValueError(
+            f"expected one sample rate, got {rate} and {output_rate} Hz; resample one of the files"
+        )
+    full_scale_spl = options.full_scale_spl
+    if options.spl is not None:
+        full_scale_spl = options.spl - float(level_spl(input_.flatten(), 0.0))
+    result = verify_aid(
+        input_.squeeze(0),
+        output.squeeze(0),
+        parse_ear(options),
+        rate,
+        full_scale_spl=full_scale_spl,
+        prescription=options.target,
+    )
+    _print_result(result)
+    if options.csv:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [*result.rows()[0]], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(result.rows())
+        write_atomically(options.csv, text.getvalue())
+    if options.plot:
+        from hlsim.report.plots import verification_picture
+
+        write_atomically(options.plot, verification_picture(result).data)
+
+
+def _print_result(result: Verification) -> None:
+    """Print a row per third octave, in dB SPL and dB, and the audible shares of speech."""
+    rows = result.rows()
+    labels = [name.replace("put_", " ").replace("_", " ") for name in rows[0]]
+    print("  ".join(f"{label:>6}" for label in labels))
+    for row in rows:
+        cells = zip(labels, row.values(), strict=True)
+        print("  ".join(f"{value:>{max(6, len(label))}.0f}" for label, value in cells))
+    unaided, aided = result.unaided_sii, result.aided_sii
+    print(f"audible share of speech (SII): {unaided:.2f} unaided, {aided:.2f} aided")

@@ -1,0 +1,116 @@
+"""An aid is verified from two recordings: gains, targets and the audible share of speech."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import hlsim
+from compensators import NALR, WDRC
+from compensators.filter_bank import speech_density
+from hlsim.audio import write_audio
+from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import set_level
+from hlsim.cli.main import main
+from hlsim.evaluation.fitting.verification import section_powers, verify
+from hlsim.metrics.sii import INTERNAL_NOISE, SII_BANDS, sii
+
+RATE = 16000
+
+# Example C.2 of ANSI S3.5-1997; a report of the package phonometry states its SII.
+EXAMPLE_SPEECH = [54.0] * 18
+EXAMPLE_NOISE = [40.0, 30.0, 20.0] + [0.0] * 15
+
+
+@pytest.fixture(scope="module")
+def steady_noise() -> torch.Tensor:
+    """Noise with the spectrum of average speech, which repeats every 125 ms. Shape: (2000,)."""
+    spectrum = np.zeros(1001, dtype=complex)
+    phases = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, 1000)
+    spectrum[1:] = np.sqrt(speech_density(2000)) * np.exp(1j * phases)
+    return torch.from_numpy(np.fft.irfft(spectrum))
+
+
+def test_sii_is_that_of_a_published_example() -> None:
+    assert sii(EXAMPLE_SPEECH, EXAMPLE_NOISE) == pytest.approx(0.851, abs=0.001)
+
+
+def test_sii_loses_what_is_below_the_threshold() -> None:
+    noise = np.array(INTERNAL_NOISE)
+    # Speech 15 dB above the internal noise is wholly audible, 15 dB below it not at all.
+    assert sii(noise + 15.0) == pytest.approx(1.0, abs=0.02)
+    assert sii(noise + 15.0, thresholds=[15.0] * 18) == pytest.approx(0.5, abs=0.02)
+    assert sii(noise + 15.0, thresholds=[31.0] * 18) == 0.0
+    with pytest.raises(ValueError, match="expected 18 levels"):
+        sii([50.0] * 6)
+
+
+def test_the_power_of_white_noise_in_a_band_is_its_share_of_the_spectrum() -> None:
+    noise = torch.from_numpy(np.random.default_rng(0).standard_normal(20 * RATE))
+    shares = np.array(SII_BANDS) * (2 ** (1 / 6) - 2 ** (-1 / 6)) / (RATE / 2)
+    powers = section_powers(noise, RATE).mean(0)
+    # The power of 20 s of noise has a standard deviation of up to 0.16 dB.
+    assert np.abs(10.0 * np.log10(powers / shares)).max() < 0.5
+
+
+def test_gains_are_those_of_a_known_compressor_at_three_levels(steady_noise: torch.Tensor) -> None:
+    aid = WDRC("N3")
+    # 45 % of the time at 50, 35 % at 65 and 20 % at 80 dB SPL: the percentiles 30, 65 and 99.
+    levels = torch.tensor([50.0] * 9 + [65.0] * 7 + [80.0] * 4)
+    seconds = set_level(steady_noise.repeat(8).repeat(20, 1), levels)
+    speech = seconds.flatten()
+    result = verify(speech, aid(speech), "N3", RATE, prescription="wdrc")
+    at_audiogram = [SII_BANDS.index(hertz) for hertz in (250, 500, 1000, 2000, 3150, 4000, 6300)]
+    for gains, level in zip(result.gains, (50.0, 65.0, 80.0), strict=True):
+        expected = aid.gains(level=level).numpy()
+        expected = np.interp(np.log(SII_BANDS), np.log(FREQUENCIES), expected)
+        assert np.abs(gains - expected)[at_audiogram].max() < 1.0
+
+
+def test_targets_thresholds_and_scale() -> None:
+    speech = hlsim.example_speech()
+    result = verify(speech, NALR("N3")(speech), "N3", RATE)
+    upper = slice(SII_BANDS.index(1000), None)
+    assert np.abs(result.gains - result.targets)[:, upper].max() < 1.0
+    assert 0.0 < result.unaided_sii < result.aided_sii < 1.0
+    assert (result.thresholds < result.uncomfortable).all()
+    # 1 kHz: 40 dB HL is 40 dB above the 3.4 dB SPL that a normal ear hears.
+    assert result.thresholds[SII_BANDS.index(1000)] == pytest.approx(43.4, abs=0.1)
+    louder = verify(0.1 * speech, 0.1 * speech, "N3", RATE, full_scale_spl=114.0)
+    assert louder.input_levels == pytest.approx(result.input_levels, abs=0.01)
+    assert louder.aided_sii == pytest.approx(result.unaided_sii, abs=1e-4)
+
+
+def test_recordings_that_do_not_belong_together_are_refused() -> None:
+    speech = hlsim.example_speech()
+    with pytest.raises(ValueError, match="differ in length by more than 1 s"):
+        verify(speech, speech[:40000], "N3", RATE)
+    with pytest.raises(ValueError, match="at least 1 s"):
+        verify(speech[:8000], speech[:8000], "N3", RATE)
+    with pytest.raises(ValueError, match="save the channel of the ear as a mono file"):
+        verify(torch.stack([speech, speech]), speech, "N3", RATE)
+
+
+def test_command_prints_a_table_and_writes_it_with_a_plot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    speech = 0.1 * hlsim.example_speech()
+    write_audio(tmp_path / "in.wav", speech, RATE)
+    write_audio(tmp_path / "out.wav", 2.0 * speech, RATE)
+    files = [str(tmp_path / name) for name in ("in.wav", "out.wav")]
+    written = ["--csv", f"{tmp_path}/table.csv", "--plot", f"{tmp_path}/plot.svg"]
+    assert main(["verify", *files, *"--audiogram N3 --spl 65".split(), *written]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 20 and "in 30" in lines[0] and "SII" in lines[-1]
+    rows = (tmp_path / "table.csv").read_text().splitlines()
+    at_1_khz = dict(zip(rows[0].split(","), rows[9].split(","), strict=True))
+    expected = verify(set_level(speech, 65.0), speech, "N3", RATE)
+    assert float(at_1_khz["input_65"]) == pytest.approx(expected.input_levels[1, 8], abs=0.1)
+    assert at_1_khz["gain_65"] == "6.0"
+    assert "uncomfortable level" in (tmp_path / "plot.svg").read_text()
+
+    write_audio(tmp_path / "out.wav", torch.cat([speech] * 3)[:130000], 48000)
+    assert main(["verify", *files, "--audiogram", "N3"]) == 2
+    assert "expected one sample rate, got 16000 and 48000 Hz" in capsys.readouterr().err
