@@ -287,7 +287,7 @@ def encode_wav(waveform: Tensor, sample_rate: int) -> bytes:
     return data.getvalue()
 
 
-def find_audio(folder: str | Path) -> list[Path]:
+def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
     """Find all audio files in a folder and its subfolders, except hidden ones, sorted by path.
 
     Links to files and folders are followed. A file that is found several times, because links lead
@@ -297,6 +297,8 @@ def find_audio(folder: str | Path) -> list[Path]:
 
     Args:
         folder: Folder to search.
+        by_name: Whether to list a file under each of the names of links to it, because names
+            matter: those of two outputs may lead to one file of clean speech.
 
     Raises:
         ValueError: There is no such folder, a folder in it cannot be read, there is no audio in it,
@@ -308,17 +310,18 @@ def find_audio(folder: str | Path) -> list[Path]:
     """
     if not Path(folder).is_dir():
         raise ValueError(f"{folder}: there is no such folder; correct the path")
-    files: dict[str, Path] = {}  # by real path
+    files: dict[str, Path] = {}  # by path if names matter, and otherwise by real path
     broken_links, repeated_links, unreadable_files = [], [], []
     try:
         for path, real_path in _visible_files(folder):
             extension = path.suffix.lower()
+            key = str(path) if by_name else real_path
             if extension in ("", *EXTENSIONS) and not os.path.exists(real_path):
                 broken_links.append(path)
-            elif real_path in files or os.path.isdir(real_path):
+            elif key in files or os.path.isdir(real_path):
                 repeated_links.append(path)
             elif extension in EXTENSIONS and os.path.isfile(real_path):
-                files[real_path] = path
+                files[key] = path
             elif extension in _OTHER_EXTENSIONS:
                 unreadable_files.append(path)
     except OSError as error:

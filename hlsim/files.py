@@ -10,6 +10,7 @@ import io
 import os
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -220,6 +221,24 @@ def read_table(
     if not rows:
         raise ValueError(f"{source}: expected a table with rows, got no rows; add them")
     return rows
+
+
+def warn_of_unused(columns: Collection[str], contents: str, known_columns: Collection[str]) -> None:
+    """Warn of columns of a table that nothing reads, because their names may be misspelt.
+
+    Args:
+        columns: Names of the columns.
+        contents: Description of the table.
+        known_columns: Names of columns that are read.
+
+    >>> warn_of_unused([], "the manifest", ["path"])
+    """
+    if columns:
+        warnings.warn(
+            f"columns of {contents} that are not used: {', '.join(sorted(columns))}; rename them "
+            f"if they should be some of {', '.join(known_columns)}",
+            stacklevel=3,
+        )
 
 
 def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, list[str]]]]:

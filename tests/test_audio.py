@@ -213,6 +213,9 @@ def test_a_file_to_which_several_paths_lead_is_found_once(
         files = find_audio(corpus)
     assert corpus / "deep/1.wav" in files
     assert len({path.resolve() for path in files}) == len(files) == 2
+    names = find_audio(corpus, by_name=True)
+    linked_files = {corpus / name for name in links if name.endswith(".wav")}
+    assert {*files} | linked_files <= {*names} and len({*names}) == len(names)
 
 
 def test_links_between_many_folders_are_followed_once(tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ def haspi_report(parser: Parser) -> None:
     )
     option("--audiograms", input_path, text)
     text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
-    option("--measures", lambda names: names.split(","), text, ["haspi"])
+    option("--measures", lambda text: [name.strip() for name in text.split(",")], text, ["haspi"])
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     parser.flag("--better-ear", "use the better ear's scores; needs a manifest with both ears")
     parser.levels("every clean file")

@@ -212,7 +212,9 @@ def _plan_outputs(source: Path, target: Path, names: Sequence[str]) -> list[tupl
                 f"{target}: outputs would be inputs of the next run; choose a folder that neither "
                 f"is inside {source} nor contains it"
             )
-        files = {path: target / path.relative_to(source) for path in find_audio(source)}
+        files = {
+            path: target / path.relative_to(source) for path in find_audio(source, by_name=True)
+        }
         files = {path: output.with_suffix(".wav") for path, output in files.items()}
     elif target.is_dir():
         raise ValueError(f"{target} is a folder; name the file to write, as {target / 'out.wav'}")

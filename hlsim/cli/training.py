@@ -82,11 +82,6 @@ def _train_simulator(options: argparse.Namespace) -> None:
 
 
 def _train_compensator(options: argparse.Namespace) -> None:
-    if options.audiogram and (options.audiograms or options.valid_audiograms):
-        raise ValueError(
-            "--audiogram excludes --audiograms and --valid-audiograms, because it trains for one "
-            "ear; leave one or the other out"
-        )
     check_extras("train")
     recipe = make_recipe(CompensatorRecipe, options.recipe, options.settings)
     ear: Any = parse_ear(options)

@@ -40,8 +40,8 @@ _LEVELS = {
 
 _LAYOUTS = {
     "VoiceBank-DEMAND": (
-        r"(?P<condition>clean|noisy)_(?P<split>train|test)set(_28spk|_56spk)?_wav(_16k|_48k)?/"
-        r"(?P<speaker>p\d+)_\d+\.\w+"
+        r"(?P<condition>clean|noisy)_(?P<split>train|test)set(_28spk|_56spk)?_wav"
+        r"(?P<rate>_16k|_48k)?/(?P<speaker>p\d+)_\d+\.\w+"
     ),
     "LibriSpeech or LibriTTS": (
         r"(?P<split>train|dev|test)-(clean|other)(-\d+)?/(?P<speaker>\d+)/\d+/[^/]+"
@@ -257,10 +257,11 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
         condition = groups.get("condition", "clean").lower()
         folder = groups.get("split", "train").lower()
         split = _SPLIT_OF[folder]
+        folder += groups.get("rate", "").lower()  # copies of one corpus at two rates
         if folder_of.setdefault(split, folder) != folder:
             raise ValueError(
                 f"the folders {folder_of[split]} and {folder} are both for the split {split}; "
-                "rename one of them, for example to test"
+                "remove one of them, or rename it, for example to test"
             )
         if condition not in ("clean", "noisy"):
             continue

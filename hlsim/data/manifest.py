@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from hlsim.files import convert_at, path_below, read_table, write_atomically
+from hlsim.files import convert_at, path_below, read_table, warn_of_unused, write_atomically
 
 SPLITS = ("train", "valid", "test")
 """Names of the splits."""
@@ -63,8 +63,10 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     [Utterance(path='1.wav', noisy='', speaker='ann', split='train')]
     """
     folder = Path(path).parent if root is None else Path(root)
+    rows = read_table(path, "the manifest", COLUMNS)
+    warn_of_unused({*rows[0][1]} - {*COLUMNS}, str(path), COLUMNS)
     utterances = []
-    for place, row in read_table(path, "the manifest", COLUMNS):
+    for place, row in rows:
         values = {name: text for name, text in row.items() if name in COLUMNS}
         if not values.get("path") or values.get("split", "train") not in SPLITS:
             raise ValueError(
@@ -125,8 +127,9 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         utterances: Rows of the manifest.
 
     Raises:
-        ValueError: There are no rows, a file is both clean and noisy, noise is listed as speech, or
-            a file or a speaker is in two splits.
+        ValueError: There are no rows, a file is both clean and noisy, a noisy file or a clean file
+            without a noisy one is listed twice, noise is listed as speech, or a file or a speaker
+            is in two splits.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):
@@ -136,7 +139,12 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         raise ValueError("there are no utterances, expected one per row")
     clean = {utterance.path for utterance in utterances}
     splits: dict[tuple[str, str], str] = {}
+    listed = set()
     for utterance in utterances:
+        file = utterance.noisy or utterance.path
+        if file in listed:
+            raise ValueError(f"{file} is listed twice; remove one of the rows")
+        listed.add(file)
         if utterance.noisy in clean:
             raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
         for folder in utterance.path.split("/")[:-1]:

@@ -306,7 +306,7 @@ def _describe_unused_outputs(
     Raises:
         ValueError: No pair has an output.
     """
-    names = {path.relative_to(folder).as_posix() for path in find_audio(folder)}
+    names = {path.relative_to(folder).as_posix() for path in find_audio(folder, by_name=True)}
     if not names & {pair.output_name for pair in pairs}:
         raise ValueError(
             f"{folder}: no file is an output of {label} for a scene and a listener; expected names "

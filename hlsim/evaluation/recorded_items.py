@@ -16,6 +16,7 @@ on, as in tables of ears, in a column ``audiogram`` by its standard name, or in 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -34,7 +35,7 @@ from hlsim.audiogram.value import ears_in_row
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.running.fingerprint import value_hash
 from hlsim.evaluation.study import Item
-from hlsim.files import convert_at, path_below, read_table, sha256
+from hlsim.files import convert_at, path_below, read_table, sha256, warn_of_unused
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -286,7 +287,7 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
 def _files_by_name(folder: str | Path) -> dict[str, Path]:
     """Return the audio files of a folder by their path below it, without extension."""
     files: dict[str, Path] = {}
-    for path in find_audio(folder):
+    for path in find_audio(folder, by_name=True):
         name = path.relative_to(folder).with_suffix("").as_posix()
         if name in files:
             raise ValueError(f"{files[name]} and {path} differ in their extension; keep one")
@@ -337,6 +338,7 @@ def read_recordings(
             raise ValueError(
                 f"{rows[0][0]}: there is no column {column}, only {', '.join(columns)}; add it"
             )
+    warn_of_unused({*columns} - {*_COLUMNS, *threshold_columns(columns)}, "the manifest", _COLUMNS)
     listeners: dict[str, Listener] = {}
     if audiograms is not None:
         listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})
@@ -410,9 +412,11 @@ def _read_row(
             "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
             "ear"
         )
+    clean = path_below(root, row["clean"])
+    clean_name = clean.relative_to(os.path.abspath(root)).with_suffix("").as_posix()
     return RecordedItem(
-        utterance=row.get("item") or str(Path(row["clean"]).with_suffix("")),
-        clean=path_below(root, row["clean"]),
+        utterance=row.get("item") or clean_name,
+        clean=clean,
         outputs={row["condition"]: path_below(root, row["processed"])},
         audiogram=audiogram,
         listener=listener,

@@ -112,13 +112,20 @@ def train_compensator(
         The folder that ``load_compensator`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: The data, the recipe or the simulator is invalid.
+        ValueError: The data, the recipe or the simulator is invalid, or there is an ``audiogram``
+            although the data have ears.
 
     >>> def train_and_load(speech: str, out: str) -> nn.Module:
     ...     data, recipe = TrainingData(Path(speech)), CompensatorRecipe(steps=1000)
     ...     ear = Audiogram.standard("N4")
     ...     return load_compensator(train_compensator(data, recipe, out=out, audiogram=ear))
     """
+    if audiogram and (data.audiograms or data.valid_audiograms):
+        raise ValueError(
+            "audiogram (--audiogram) excludes the data's audiograms and valid_audiograms "
+            "(--audiograms, --valid-audiograms), because it trains for one ear; leave one or the "
+            "other out"
+        )
     about = {
         "data": data.identity(),
         "audiogram": audiogram.to_dict() if audiogram else None,

@@ -49,6 +49,11 @@ def test_voicebank_demand_is_recognised(files: list[str]) -> None:
         assert row.noisy == row.path.replace("clean_", "noisy_")
 
 
+def test_a_corpus_at_two_rates_is_rejected() -> None:
+    with pytest.raises(ValueError, match="folders train and train_16k are both for the split"):
+        recognise([*voicebank(), *voicebank("_16k")])
+
+
 def test_librispeech_and_libritts_are_recognised() -> None:
     names = "train-clean-100/103/1240/a.flac train-other-500/20/205/b.flac dev-clean/84/1/c.wav"
     files = [*names.split(), "test-other/367/1/d.flac"]
@@ -185,7 +190,8 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="--root"):
         read_manifest(tmp_path / "a" / "m.csv")
     (tmp_path / "m.csv").write_text("seconds,Path,SPLIT\n2.5,a/1.wav,test\n")
-    assert read_manifest(tmp_path / "m.csv") == [Utterance("a/1.wav", split="test")]
+    with pytest.warns(UserWarning, match=r"columns of .*m\.csv that are not used: seconds;"):
+        assert read_manifest(tmp_path / "m.csv") == [Utterance("a/1.wav", split="test")]
     with pytest.raises(ValueError, match="no manifest; choose another name"):
         write_manifest(tmp_path / "m.csv", UTTERANCES)
 
@@ -205,6 +211,9 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         "path,noisy,split\n1.wav,2.wav,train\n1.wav,3.wav,test\n",
         "path,speaker,split\n1.wav,ann,train\n2.wav,ann,test\n",
         "path\nnoise/1.wav\n",
+        "path\n1.wav\n./1.wav\n",
+        "path,noisy\n1.wav,3.wav\n1.wav,3.wav\n",
+        "path,noisy\n1.wav,3.wav\n2.wav,3.wav\n",
     ],
 )
 def test_invalid_contradictory_and_noisy_manifests_are_rejected(tmp_path: Path, text: str) -> None:

@@ -247,6 +247,27 @@ def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
         haspi_report(**folders(corpus), audiogram=N4)
 
 
+def test_links_to_one_clean_file_are_items_of_their_own(corpus: Path) -> None:
+    clean = corpus / "clean" / "p2" / "c.flac"
+    (corpus / "clean" / "d.flac").symlink_to(clean)
+    for folder in ("before", "after"):
+        path = corpus / folder / "p2" / "c.wav"
+        (corpus / folder / "d.wav").write_bytes(path.read_bytes())
+    report = haspi_report(**folders(corpus), audiogram=N4, measures=["stoi"])
+    assert report.table["name"].unique().tolist() == ["a.b", "d", "p2/c"]
+    assert report.comparisons[0].overall.n == 3
+
+
+def test_a_clean_file_is_one_item_however_its_path_is_written(corpus: Path) -> None:
+    rows = ["condition,clean,processed,audiogram,listner"]
+    paths = "clean/a.b.flac", f"{corpus}/clean/a.b.flac", "./after/../clean//a.b.flac"
+    rows += [f"{number},{path},after/a.b.wav,N4,L1" for number, path in enumerate(paths)]
+    (corpus / "study.csv").write_text("\n".join(rows))
+    with pytest.warns(UserWarning, match="columns of the manifest that are not used: listner;"):
+        (recording,) = read_recordings(corpus / "study.csv")
+    assert (recording.name, [*recording.outputs]) == ("clean/a.b", ["0", "1", "2"])
+
+
 def write_ears(folder: Path, noises: dict[tuple[str, str, int], float], item: str = "") -> Path:
     """Write a manifest of one utterance per number, and its files.
 

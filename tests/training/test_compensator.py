@@ -64,6 +64,12 @@ def test_an_aid_learns_from_random_weights(
     load_compensator(tmp_path / "checkpoint")
 
 
+def test_one_ear_excludes_tables_of_ears(noisy: TrainingData, tmp_path: Path) -> None:
+    for name in ("audiograms", "valid_audiograms"):
+        with pytest.raises(ValueError, match=r"audiogram .* excludes the data's audiograms"):
+            train(replace(noisy, **{name: "standard"}), SMALL, tmp_path, audiogram=N3)
+
+
 def test_another_simulator_needs_another_folder(data: TrainingData, tmp_path: Path) -> None:
     config = NeuroConfig(channels=4, blocks=1)
     simulator = tmp_path / "simulator"
