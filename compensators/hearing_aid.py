@@ -17,6 +17,7 @@ from compensators.smoothing import follow_peaks
 from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
+from hlsim.checkpoint import HubModel
 from hlsim.torchtools import built_in_float32
 
 DEFAULT_NOISE_REDUCTION = 0.5
@@ -45,7 +46,7 @@ SOFTEST_SPL = 20.0
 """Level of a band in dB SPL below which the restoring gain does not rise."""
 
 
-class HearingAid(Wearable):
+class HearingAid(Wearable, HubModel):
     """A hearing aid with trained gains and trained noise reduction, and a delay of 4 ms.
 
     The gain of each frequency band changes every 4 ms. In dB, it is
@@ -82,6 +83,9 @@ class HearingAid(Wearable):
     >>> output.shape
     torch.Size([64320])
     """
+
+    kind = "hearing-aid"
+    config_class = HearingAidConfig
 
     SLIDERS: ClassVar = {"noise_reduction": DEFAULT_NOISE_REDUCTION, "amplification": 1.0}
 

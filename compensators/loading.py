@@ -12,14 +12,12 @@ from compensators.wdrc import WDRC
 from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
-from hlsim.checkpoint import read_checkpoint, read_record, save_checkpoint
-from hlsim.version import __version__
+from hlsim.checkpoint import read_checkpoint, read_record
 
 Trained = MappingCompensator | HearingAid
 
 CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
-    "mapping-compensator": MappingConfig,
-    "hearing-aid": HearingAidConfig,
+    kind.kind: kind.config_class for kind in (MappingCompensator, HearingAid)
 }
 """Class of the settings of each kind of checkpoint, by the kind's name in ``config.json``."""
 
@@ -116,10 +114,8 @@ def save_compensator(
         raise ValueError(
             f"expected a MappingCompensator or a HearingAid to save, got {type(model).__name__}"
         )
-    kind = next(kind for kind, config in CONFIGS.items() if isinstance(model.config, config))
     ear = None if audiogram is None else audiogram.to_dict()
-    about = {"hlsim": __version__, "audiogram": ear}
-    save_checkpoint(folder, kind, model, model.config.to_dict(), about)
+    model.save_pretrained(folder, about={"audiogram": ear})
 
 
 def trained_for(name: str | Path) -> Audiogram | None:

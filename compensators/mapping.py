@@ -15,6 +15,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, check_two_channels
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
+from hlsim.checkpoint import HubModel
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
 from hlsim.dsp.interpolation import interpolate, interpolation_weights
@@ -31,7 +32,7 @@ LOWEST_CENTRE = 100.0
 """Centre of the lowest band of the correction in Hz."""
 
 
-class MappingCompensator(Aid, EarNetwork):
+class MappingCompensator(Aid, EarNetwork, HubModel):
     """A trainable aid for whole signals: a network that amplifies each point of the spectrogram.
 
     In dB, the gain at a time and a frequency is that of the prescription NAL-R plus a correction by
@@ -65,6 +66,8 @@ class MappingCompensator(Aid, EarNetwork):
     """
 
     highest_frequency = NEURO_RATE / 2.0
+    kind = "mapping-compensator"
+    config_class = MappingConfig
 
     config: MappingConfig
 

@@ -10,17 +10,21 @@ loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 import safetensors
 import safetensors.torch
 import torch
 from torch import nn
 
+from hlsim.extras import require
 from hlsim.files import atomic_path, write_atomically
 from hlsim.suggestions import suggest
+from hlsim.version import __version__
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config")
@@ -205,6 +209,7 @@ def save_checkpoint(
     model: nn.Module,
     config: Settings,
     about: Settings,
+    card: Settings | None = None,
 ) -> None:
     """Save a model as a checkpoint, in place of an older one in the same folder.
 
@@ -218,6 +223,7 @@ def save_checkpoint(
         model: Model whose state dict is saved.
         config: Settings with which the model can be built again, as JSON values.
         about: Record of the training: data, seed, command, time, measures and version.
+        card: Metadata of the card beside those of every card, such as ``{"license": "mit"}``.
 
     Raises:
         ValueError: The folder cannot be written.
@@ -246,19 +252,159 @@ def save_checkpoint(
         if older_weights is not None:
             write_atomically(target / OLDER_WEIGHTS, older_weights)
     (target / OLDER_WEIGHTS).unlink(missing_ok=True)
-    _write_card(target, kind, about)
+    _write_card(target, kind, about, card or {})
 
 
-def _write_card(folder: Path, kind: str, about: Settings) -> None:
-    """Write a card with a table of ``about``, unless there is a card that somebody else wrote."""
+def _write_card(folder: Path, kind: str, about: Settings, metadata: Settings) -> None:
+    """Write a card with a table of ``about``, unless there is a card that somebody else wrote.
+
+    It begins with the metadata by which the Hugging Face Hub lists models.
+    """
     path, table_head = folder / CARD, "| record | value |\n|---|---|"
     if path.exists() and table_head not in path.read_text(encoding="utf-8"):
         return
+    task = "audio-classification" if kind == DIGIT_LISTENER else "audio-to-audio"
+    common: dict[str, Any] = {
+        "library_name": "hlsim",
+        "pipeline_tag": task,
+        "tags": ["hearing-loss", kind],
+    }
+    # A value in JSON is one in YAML, too.
+    lines = [f"{key}: {json.dumps(value)}" for key, value in {**common, **metadata}.items()]
+    head = "\n".join(lines)
     introduction = f"A {kind} for hlsim. Load this folder with `{_loader_name(kind)}`."
     rows = "\n".join(f"| {name} | {value} |" for name, value in about.items())
-    write_atomically(path, f"# {folder.name}\n\n{introduction}\n\n{table_head}\n{rows}\n")
+    text = f"---\n{head}\n---\n\n# {folder.name}\n\n{introduction}\n\n{table_head}\n{rows}\n"
+    write_atomically(path, text)
 
 
 def _digest(config: Any) -> str:
     """Compute the SHA-256 of a configuration, independent of the order of its settings."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+
+class HubModel:
+    """Methods with which a simulator or an aid is saved, loaded and shared, as on Hugging Face.
+
+    A repository of the Hub is a folder as ``save_checkpoint`` writes it. Only ``push_to_hub``, and
+    ``from_pretrained`` of a repository that is no local folder, use the network; they need the
+    extra ``hub``. The names are those of ``huggingface_hub.PyTorchModelHubMixin``, which is no base
+    class here because hlsim works without this package.
+
+    >>> import hlsim
+    >>> with TemporaryDirectory() as folder:
+    ...     hlsim.HearingAid().save_pretrained(folder, license="mit")
+    ...     aid = hlsim.HearingAid.from_pretrained(folder)
+    """
+
+    kind: ClassVar[str]
+    config_class: ClassVar[Any]
+    build_options: ClassVar[Settings] = {}
+    config: Any
+
+    def save_pretrained(
+        self,
+        folder: str | Path,
+        *,
+        license: str | None = None,
+        datasets: Sequence[str] = (),
+        about: Settings | None = None,
+    ) -> None:
+        """Save the model as a checkpoint, in place of an older one in the same folder.
+
+        Args:
+            folder: Folder to write.
+            license: Licence of the weights, such as ``"mit"``, for the card.
+            datasets: Names of the corpora on which the model was trained, for the card.
+            about: Record of the training for the card, such as ``{"seed": 0}``.
+
+        Raises:
+            ValueError: The folder cannot be written.
+        """
+        assert isinstance(self, nn.Module)
+        card: dict[str, Any] = {}
+        if license:
+            card["license"] = license
+        if datasets:
+            card["datasets"] = [*datasets]
+        record = {"hlsim": __version__, **(about or {})}
+        save_checkpoint(folder, self.kind, self, self.config.to_dict(), record, card)
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        name: str | Path,
+        *,
+        revision: str | None = None,
+        cache_dir: str | Path | None = None,
+        token: str | bool | None = None,
+        **settings: Any,
+    ) -> Self:
+        """Load a model in evaluation mode, with weights that are not trained further.
+
+        Args:
+            name: Folder of a checkpoint, name of one that ships with hlsim, or ``user/name`` of a
+                repository of the Hub, which is downloaded unless it is in the cache.
+            revision: Branch, tag or commit of the repository.
+            cache_dir: Folder of downloads instead of that of huggingface_hub.
+            token: Token of a private repository.
+            settings: Arguments of the class, such as ``sample_rate``.
+
+        Raises:
+            ValueError: There is no such checkpoint, it is damaged, or of another kind.
+            MissingExtraError: A repository is to be downloaded, and the extra ``hub`` is missing.
+        """
+        try:
+            folder = _find_folder(name)
+        except ValueError:
+            if not re.fullmatch(r"[\w.-]+/[\w.-]+", str(name)):
+                raise
+            hub = require("huggingface_hub", "hub")
+            files = [WEIGHTS, CONFIG, CARD]
+            folder = hub.snapshot_download(
+                str(name),
+                revision=revision,
+                cache_dir=cache_dir,
+                token=token,
+                allow_patterns=files,
+            )
+        options = {**cls.build_options, **settings}
+        kinds = {cls.kind: cls.config_class.from_dict}
+        build: Any = cls
+        model: Any = read_checkpoint(folder, kinds, lambda config: build(config=config, **options))
+        return cast(Self, model.eval().requires_grad_(False))
+
+    def push_to_hub(
+        self,
+        name: str,
+        *,
+        private: bool | None = None,
+        token: str | bool | None = None,
+        commit_message: str = "Upload a model of hlsim",
+        **card: Any,
+    ) -> str:
+        """Upload the model to a repository of the Hub, which is created if there is none.
+
+        Args:
+            name: ``user/name`` of the repository.
+            private: Whether a new repository is private; None is the default of the account.
+            token: Token with the right to write; by default that of ``hf auth login``.
+            commit_message: Title of the commit.
+            card: Arguments of ``save_pretrained`` other than the folder.
+
+        Returns:
+            Address of the commit.
+
+        Raises:
+            MissingExtraError: The extra ``hub`` is not installed.
+        """
+        api = require("huggingface_hub", "hub").HfApi(token=token)
+        repository = api.create_repo(name, private=private, exist_ok=True).repo_id
+        with TemporaryDirectory() as parent:
+            folder = Path(parent) / repository.split("/")[-1]
+            self.save_pretrained(folder, **card)
+            return str(
+                api.upload_folder(
+                    repo_id=repository, folder_path=folder, commit_message=commit_message
+                )
+            )

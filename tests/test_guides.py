@@ -34,7 +34,7 @@ NOT_RUN = {
     "listening_page.py": "needs npm",
     "http.server": "does not end",
     "HLSIM_GOLDEN": "takes minutes, and .ci/run does the same",
-    "huggingface_hub": "needs a network",
+    "push_to_hub": "needs a network",
     "LightningModule": "is part of a program",
     "mine.ckpt": "is part of a program",
     "read_sas": "needs a file of NHANES; tests/audiogram/test_table.py runs it",

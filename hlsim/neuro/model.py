@@ -2,14 +2,14 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
-from hlsim.checkpoint import SIMULATOR, read_checkpoint
+from hlsim.checkpoint import SIMULATOR, HubModel, read_checkpoint
 from hlsim.dsp.fft import power
 from hlsim.dsp.interpolation import interpolate
 from hlsim.msbg.recruitment import CATCH_UP_SPL
@@ -38,7 +38,7 @@ MAX_LOG_MASK = 4.0
 """Largest natural logarithm of the network's factor on a magnitude."""
 
 
-class NeuroMSBG(EarNetwork):
+class NeuroMSBG(EarNetwork, HubModel):
     """Simulator of an impaired ear: a neural network that emulates MSBG, but faster.
 
     MSBG is the simulation of hearing loss by Moore, Stone, Baer and Glasberg. The output is the
@@ -82,6 +82,9 @@ class NeuroMSBG(EarNetwork):
     emulates_msbg = True
     highest_frequency = NEURO_RATE / 2.0
     needs_exact_lengths = True
+    kind = SIMULATOR
+    config_class = NeuroConfig
+    build_options: ClassVar = {"compute_prior": False}
 
     config: NeuroConfig
 
