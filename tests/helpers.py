@@ -2,11 +2,13 @@
 
 import importlib.util
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from unittest.mock import patch
 
+import pytest
 import soundfile
 
 from hlsim import Audiogram
@@ -14,6 +16,11 @@ from hlsim import Audiogram
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 FIGURES = ROOT / "docs" / "figures"
+
+
+def mostly_slow(cases: Iterable[Any], fast: Container[Any]) -> list[Any]:
+    """Mark the cases of a sweep as slow, except those that every run of the tests shall cover."""
+    return [case if case in fast else pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 
 def touch_files(folder: Path, files: Iterable[str]) -> Path:

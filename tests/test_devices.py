@@ -16,6 +16,7 @@ from compensators import WDRC, MappingCompensator, load_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
 from hlsim.metrics import haaqi, haspi, hasqi, mbstoi
 from hlsim.metrics.ear import model as ear_model
+from tests.helpers import mostly_slow
 from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
 
@@ -126,7 +127,19 @@ def value_and_gradient(call: Call, module: nn.Module, *tensors: Tensor) -> tuple
     return value.detach(), wave.grad
 
 
-@pytest.mark.parametrize("name", CALLS)
+# each kind of module once; the others are slow
+FAST = [
+    "msbg",
+    "haspi",
+    "neuro-msbg",
+    "nalr",
+    "hearing-aid",
+    "loss coherent-bands",
+    "loss through msbg",
+]
+
+
+@pytest.mark.parametrize("name", mostly_slow(CALLS, FAST))
 def test_module_keeps_to_its_device_and_does_not_wait(name: str) -> None:
     call = CALLS[name]
     torch.manual_seed(0)
@@ -163,7 +176,11 @@ class Operations(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "name", ["loss through msbg, own ear", "loss through neuro-msbg, own ear", "hearing-aid"]
+    "name",
+    mostly_slow(
+        ["loss through msbg, own ear", "loss through neuro-msbg, own ear", "hearing-aid"],
+        ["loss through neuro-msbg, own ear"],
+    ),
 )
 def test_operations_and_shapes_do_not_depend_on_the_signal(name: str) -> None:
     """A CUDA graph replays the operations that it captured, in the memory that it captured."""

@@ -34,6 +34,7 @@ def test_own_network_trains(
     assert trained(noise[0], ear).shape == (8000,)
 
 
+@pytest.mark.slow
 def test_the_papers_last_table(
     tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -57,6 +58,7 @@ def test_the_papers_last_table(
     assert (out / "report" / "report.json").is_file()
 
 
+@pytest.mark.slow
 def test_sliders_trade_noise_for_level(
     speech_dir: Path,
     tmp_path: Path,
@@ -83,6 +85,7 @@ def test_sliders_trade_noise_for_level(
         assert levels["| 1", "1", "2", condition] < levels["| 1", "1", "0.1", condition]
 
 
+@pytest.mark.slow
 def test_delay_by_frequency(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +98,7 @@ def test_delay_by_frequency(
     assert len(capsys.readouterr().out.splitlines()) == 2 + len(example.TABLE_EARS)
 
 
+@pytest.mark.slow
 def test_pictures_of_perceived_speech(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     example = load_figure("heard.py")
@@ -107,6 +111,7 @@ def test_pictures_of_perceived_speech(tmp_path: Path, monkeypatch: pytest.Monkey
     assert {path.name for path in tmp_path.iterdir()} == {"heard.png", "family.png"}
 
 
+@pytest.mark.slow
 def test_parity(
     tmp_path: Path,
     speech_dir: Path,
@@ -131,6 +136,7 @@ def test_parity(
     assert all(float(line.split("worst ")[1].split()[0]) < 4e-2 for line in lines)
 
 
+@pytest.mark.slow
 def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     example = load_figure("other_sounds.py")
     ear, exact = Audiogram.standard("N3"), MSBG("N3", sample_rate=16000)
@@ -172,6 +178,7 @@ def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) 
     assert not example.compare({**scores, "upside down": worst}, "upside down")[2]
 
 
+@pytest.mark.slow
 def test_benchmark_prints_a_table_of_each_kind(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ from tests.compensators.aids import (
     build_wearable,
     varied_hearing_aid,
 )
+from tests.helpers import mostly_slow
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 EARS = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
@@ -79,7 +80,10 @@ def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: 
     assert_close(perceived, simulator(waveform, ears), 1e-4)
 
 
-@pytest.mark.parametrize(("name", "items", "hops"), [("wdrc", 2, 1), ("wdrc", 1, 5), ("aid", 2, 3)])
+@pytest.mark.parametrize(
+    ("name", "items", "hops"),
+    [("wdrc", 2, 1), pytest.param("wdrc", 1, 5, marks=pytest.mark.slow), ("aid", 2, 3)],
+)
 def test_a_program_of_hops_gives_the_outputs_of_the_stream(
     name: str, items: int, hops: int
 ) -> None:
@@ -149,7 +153,10 @@ def test_what_cannot_be_exported_is_a_value_error(call: Callable[[], object]) ->
         call()
 
 
-@pytest.mark.parametrize("name", ["neuro-msbg-light", "compensator-general", "hearing-aid"])
+@pytest.mark.parametrize(
+    "name",
+    mostly_slow(["neuro-msbg-light", "compensator-general", "hearing-aid"], ["hearing-aid"]),
+)
 def test_torch_exports_a_network_by_itself(name: str) -> None:
     """Levels that are out of range give NaN, because a program cannot raise an error."""
     model: Any = load_pretrained(name) if "msbg" in name else load_compensator(name)

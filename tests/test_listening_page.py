@@ -174,9 +174,12 @@ def test_a_dragged_point_moves_the_sounds_and_the_link(opened: Any) -> None:
     assert f"#ear={level},35,40,50,55,60,65,65&" in opened.url
     name = "Your own ear, closest to N3: moderate loss"
     assert opened.locator("#ear-name").inner_text() == name
-    opened.wait_for_timeout(200)
-    wait(opened)
-    assert float(result(opened, "ear").norm()) < 0.9 * float(before.norm())
+    for _ in range(600):  # the page waits a moment before it computes
+        opened.wait_for_timeout(100)
+        wait(opened)
+        if not torch.equal(after := result(opened, "ear"), before):
+            break
+    assert float(after.norm()) < 0.9 * float(before.norm())
 
 
 def test_loudness_is_that_relative_to_a_healthy_ear(opened: Any) -> None:
@@ -199,9 +202,10 @@ def test_presets_numbers_and_the_link_set_the_ear(opened: Any) -> None:
     opened.evaluate("location.hash = '#ear=20,20,25,35,40,45,50,50'")
     opened.wait_for_function("document.getElementById('ear-name').textContent.startsWith('N2')")
     opened.evaluate("location.hash = '#ear=20,20,nonsense'")
-    opened.wait_for_timeout(100)
+    opened.wait_for_function(
+        "document.getElementById('shared').textContent.startsWith('The link has no ear')"
+    )
     assert opened.locator(".point").nth(3).get_attribute("aria-valuetext") == "35 decibels"
-    assert opened.locator("#shared").inner_text().startswith("The link has no ear")
 
 
 def test_the_keyboard_alone_sets_an_ear_and_plays(opened: Any) -> None:
@@ -237,12 +241,21 @@ def test_the_keyboard_alone_sets_an_ear_and_plays(opened: Any) -> None:
 def test_another_sentence_plays_from_its_start(opened: Any) -> None:
     opened.locator("#version-ear .play").click()
     opened.wait_for_selector("#version-ear.playing")
-    opened.wait_for_timeout(1500)
+    opened.wait_for_timeout(500)
+    opened.evaluate(
+        """() => {
+            window.positions = [];
+            const start = AudioBufferSourceNode.prototype.start;
+            AudioBufferSourceNode.prototype.start = function (when, position) {
+                window.positions.push(position);
+                start.call(this, when, position);
+            };
+        }"""
+    )
     opened.locator("#speech").select_option(index=1)
-    opened.wait_for_selector(".version:not(.playing)#version-ear")
+    opened.wait_for_function("window.positions.length > 0")
     opened.wait_for_selector("#version-ear.playing")
-    line = opened.locator("#version-ear .head-line")
-    assert float(line.evaluate("line => parseFloat(line.style.left)")) < 20.0
+    assert opened.evaluate("window.positions[0]") == 0
 
 
 def test_the_link_has_the_ear_and_the_sentence(opened: Any, chromium: Any) -> None:

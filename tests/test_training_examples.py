@@ -15,6 +15,7 @@ def losses(out: str) -> list[float]:
     return [float(line.split(":")[1]) for line in out.splitlines()]
 
 
+@pytest.mark.slow
 def test_conv_tasnet_trains(
     tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -45,6 +46,7 @@ def test_networks_are_trained_and_compared_with_nalr(
     assert aided == unaided and follows == as_it_is == "1.00"  # they start as what changes nothing
 
 
+@pytest.mark.slow
 def test_saved_networks_are_judged_at_the_level_of_nalr(
     tmp_path: Path,
     speech_dir: Path,
@@ -128,6 +130,7 @@ def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
     assert float(similarity) > 0.9999
 
 
+@pytest.mark.slow
 def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("lightning")
     aid = load_example("training/lightning_bf16.py").main(2)
@@ -135,6 +138,7 @@ def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
     assert float(aid.trainer.callback_metrics["loss"]) > 0.0
 
 
+@pytest.mark.slow
 def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     example = load_example("training/filter_bank.py")
     ear = example.Audiogram.standard("N3")
@@ -155,6 +159,7 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
     assert unaided < louder  # Both texts begin with HASPI.
 
 
+@pytest.mark.slow
 def test_haspi_trains(
     speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

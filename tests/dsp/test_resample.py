@@ -75,6 +75,7 @@ def test_length_is_rounded_up_and_leading_dimensions_stay(source: int, target: i
         torch.testing.assert_close(resampled[1, 1], resample(waveform[1, 1], source, target))
 
 
+@pytest.mark.slow
 def test_resampling_compiles_to_one_graph() -> None:
     waveform = torch.randn(2, 500)
     options = {"backend": "aot_eager", "fullgraph": True}

@@ -118,6 +118,7 @@ def test_a_delayed_enhancer_is_rejected(tmp_path: Path) -> None:
         load_enhancers([f"{tmp_path}/plugin.py:late"])
 
 
+@pytest.mark.slow
 def test_an_item_counts_only_if_every_condition_has_its_values(
     ears_file: Path, options: dict[str, Any]
 ) -> None:
@@ -129,6 +130,7 @@ def test_an_item_counts_only_if_every_condition_has_its_values(
     assert "no such ear" in compensators_page(study).markdown()
 
 
+@pytest.mark.slow
 def test_only_a_further_compensator_is_evaluated(tmp_path: Path, options: dict[str, Any]) -> None:
     store = tmp_path / "scores.jsonl"
     values = 5  # of each output: HASPI, HASQI, levels, perception, the network's loss
@@ -142,6 +144,7 @@ def test_only_a_further_compensator_is_evaluated(tmp_path: Path, options: dict[s
         assert store.read_text().count("\n") == values * outputs
 
 
+@pytest.mark.slow
 def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
     options["noise"] = None
     study = evaluate_compensators({"mine": Gain(0.0)}, **options, audiogram=NORMAL, items=2)

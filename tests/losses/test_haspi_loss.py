@@ -59,6 +59,7 @@ def test_bad_weights_and_short_speech_raise_value_error(clean: Tensor) -> None:
         HASPILoss("N3")(clean[:, :8000], clean[:, :8000])
 
 
+@pytest.mark.slow
 def test_hard_inputs_have_finite_values_and_gradients(clean: Tensor) -> None:
     silence = torch.zeros(TIME)
     square = 30.0 * torch.sign(torch.sin(torch.arange(TIME) * 0.3 + 0.1))
@@ -72,6 +73,7 @@ def test_hard_inputs_have_finite_values_and_gradients(clean: Tensor) -> None:
     assert float(values[0].detach()) == 0.0 and not bool(slope[0].any())
 
 
+@pytest.mark.slow
 def test_ears_and_levels_count_alike(clean: Tensor) -> None:
     """The gradient of HASPI alone differs by a factor of 500 between ears."""
     cases = [*((f"N{i}", 65.0) for i in range(1, 6)), ("N3", 50.0), ("N3", 80.0)]

@@ -21,6 +21,7 @@ from hlsim.losses.paper import paper_parts
 from hlsim.metrics.band_levels import band_level_loss
 from hlsim.msbg.response import apply_bank_phase
 from hlsim.training.recipes import CompensatorRecipe
+from tests.helpers import mostly_slow
 from tests.losses.signals import add_noise, excerpt, gain_slope
 
 SIMULATORS = {"neuro-msbg": NeuroMSBG, "msbg": MSBG}
@@ -187,7 +188,7 @@ def test_a_full_graph_is_compiled_from_exported_networks_only(clean: Tensor) -> 
 
 
 @pytest.mark.parametrize("simulator", [*SIMULATORS, "neuro-msbg-light"])
-@pytest.mark.parametrize("seconds", [0.3, 1.2])
+@pytest.mark.parametrize("seconds", mostly_slow([0.3, 1.2], [0.3]))
 def test_checkpoint_stores_less_and_changes_no_bit(
     simulator: str, seconds: float, clean: Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,7 +243,9 @@ def test_padded_item_has_the_value_that_it_has_alone(
             assert float(batch[name][item]) == pytest.approx(float(part), rel=2e-3), (name, end)
 
 
-@pytest.mark.parametrize("criterion", [*WEIGHTS, "haspi", "hasqi"])
+@pytest.mark.parametrize(
+    "criterion", mostly_slow([*WEIGHTS, "haspi", "hasqi"], ["coherent-bands", "paper", "bands"])
+)
 def test_gradient_of_an_item_does_not_depend_on_the_padding(criterion: str, clean: Tensor) -> None:
     """The limit of the gradient is a percentile of the item's own samples."""
     loss = HearingLossLoss(N4, simulator="neuro-msbg-light", criterion=criterion)
@@ -414,7 +417,7 @@ def test_simulator_has_a_normal_ear(clean: Tensor) -> None:
 
 @each_simulator
 @each_reference
-@pytest.mark.parametrize("ear", ["NH", "N3", "S2"])
+@pytest.mark.parametrize("ear", mostly_slow(["NH", "N3", "S2"], ["N3"]))
 def test_speech_is_closer_than_inverted_speech_and_silence(
     simulator: str, reference: str, ear: str, clean: Tensor
 ) -> None:
@@ -428,7 +431,7 @@ def test_speech_is_closer_than_inverted_speech_and_silence(
 
 
 @each_simulator
-@pytest.mark.parametrize("ear", ["N2", "N4", "S2"])
+@pytest.mark.parametrize("ear", mostly_slow(["N2", "N4", "S2"], ["N4"]))
 def test_less_noise_costs_less(simulator: str, ear: str, clean: Tensor) -> None:
     """Without an aid, too, where noise fills the bands that are too soft."""
     loss = HearingLossLoss(ear, simulator=simulator)
@@ -464,7 +467,12 @@ HARD = [(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1e-9, 1.0), (1.0, 1.0), (63.0, 63.0
 
 
 @pytest.mark.parametrize(
-    ("rate", "dtype"), [(16000, torch.float32), (16000, torch.float64), (44100, torch.float32)]
+    ("rate", "dtype"),
+    [
+        (16000, torch.float32),
+        pytest.param(16000, torch.float64, marks=pytest.mark.slow),
+        pytest.param(44100, torch.float32, marks=pytest.mark.slow),
+    ],
 )
 def test_hard_inputs_have_finite_values_and_gradients(
     options: Options, rate: int, dtype: torch.dtype, clean: Tensor

@@ -25,6 +25,7 @@ from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.haaqi_score import _split_by_rate
 from hlsim.metrics.quality_reference import _scale_motion_to_level
 from tests import pyclarity as reference
+from tests.helpers import mostly_slow
 from tests.pyclarity import PyclarityOutputs
 
 SPEECH = bundled.SPEECH / "valid"
@@ -136,7 +137,9 @@ def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, key: str) 
     assert without_seed == pytest.approx(expected[0], abs=7e-3 if name == "haspi" else 2e-3)
 
 
-@pytest.mark.parametrize("key", ["haaqi, NAL-R", "haaqi, compressed", "hasqi, NAL-R"])
+@pytest.mark.parametrize(
+    "key", mostly_slow(["haaqi, NAL-R", "haaqi, compressed", "hasqi, NAL-R"], ["hasqi, NAL-R"])
+)
 def test_reference_that_is_amplified_already(pyclarity: PyclarityOutputs, key: str) -> None:
     """Cadenza's later challenges score so, with NAL-R of 221 taps or with a compressor."""
     name, rate = key.partition(",")[0], 44100
@@ -152,7 +155,7 @@ def test_reference_that_is_amplified_already(pyclarity: PyclarityOutputs, key: s
     assert score == pytest.approx(expected[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["hasqi", "haaqi"])
+@pytest.mark.parametrize("name", mostly_slow(["hasqi", "haaqi"], ["hasqi"]))
 def test_amplifying_the_reference_twice_changes_the_score(name: str) -> None:
     ear = N3 if name == "hasqi" else N4
     amplified = NALR()(example_music(16000)[:12000], ear)
@@ -290,7 +293,7 @@ def test_a_batch_equals_its_items(name: str, noise: str) -> None:
     torch.testing.assert_close(torch.autograd.grad(as_on_gpu.sum(), padded)[0], gradient)
 
 
-@pytest.mark.parametrize("name", SCORES)
+@pytest.mark.parametrize("name", mostly_slow(SCORES, ["haspi"]))
 def test_references_of_inference_mode_serve_training_and_autocast_has_no_effect(name: str) -> None:
     clean, noisy = (signal[0] for signal in pair())
     with torch.inference_mode():
@@ -306,7 +309,9 @@ def test_references_of_inference_mode_serve_training_and_autocast_has_no_effect(
 # -- noise -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("ear", "gain"), [(N2, 1.0), (N3, 3.0)])
+@pytest.mark.parametrize(
+    ("ear", "gain"), [(N2, 1.0), pytest.param(N3, 3.0, marks=pytest.mark.slow)]
+)
 def test_expected_noise_is_the_mean_over_seeds(ear: Audiogram, gain: float) -> None:
     clean, noisy = (signal[0] for signal in pair())
     prepared, output = HaspiReference(clean), gain * noisy
@@ -328,7 +333,7 @@ def amplify(signal: Tensor, gains_db: Tensor) -> Tensor:
     return torch.fft.irfft(spectrum * 10.0 ** (gains / 20.0), signal.shape[-1])
 
 
-@pytest.mark.parametrize("name", SCORES)
+@pytest.mark.parametrize("name", mostly_slow(SCORES, ["haspi", "hasqi"]))
 def test_gradient_equals_finite_differences(name: str) -> None:
     step = 1e-3
     clean, noisy = (signal[0, :11200].double() for signal in pair())
@@ -345,12 +350,12 @@ def test_gradient_equals_finite_differences(name: str) -> None:
 @pytest.mark.parametrize(  # HASQI and HAAQI share the steps that could divide by zero
     ("name", "ear", "noise"),
     [
-        ("haspi", N6, "expected"),
         ("haspi", N6, "none"),
-        ("hasqi", N6, "expected"),
         ("hasqi", NH, "none"),
-        ("haaqi", NH, "expected"),
-        ("haaqi", N6, "none"),
+        pytest.param("haspi", N6, "expected", marks=pytest.mark.slow),
+        pytest.param("hasqi", N6, "expected", marks=pytest.mark.slow),
+        pytest.param("haaqi", NH, "expected", marks=pytest.mark.slow),
+        pytest.param("haaqi", N6, "none", marks=pytest.mark.slow),
     ],
 )
 def test_gradient_is_finite(name: str, ear: Audiogram, noise: str) -> None:

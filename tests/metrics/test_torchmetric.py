@@ -17,6 +17,7 @@ pytest.importorskip("torchmetrics")
 
 import hlsim.metrics
 from hlsim.metrics import HAAQI, HASPI, HASQI, MBSTOI, mbstoi
+from tests.helpers import mostly_slow
 
 N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
 
@@ -72,7 +73,11 @@ def noisy(clean: Tensor) -> Tensor:
 
 @pytest.mark.parametrize(
     ("kind", "name", "full_scale"),
-    [(HASPI, "haspi", 94.0), (HASQI, "hasqi", 96.0), (HAAQI, "haaqi", 96.0)],
+    [
+        (HASPI, "haspi", 94.0),
+        pytest.param(HASQI, "hasqi", 96.0, marks=pytest.mark.slow),
+        pytest.param(HAAQI, "haaqi", 96.0, marks=pytest.mark.slow),
+    ],
 )
 def test_the_mean_of_the_functions_scores(
     clean: Tensor, kind: type[Any], name: str, full_scale: float
@@ -201,7 +206,7 @@ def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> Non
         assert float(metric.compute()) == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("kind", [HASPI, HASQI, HAAQI])
+@pytest.mark.parametrize("kind", mostly_slow([HASPI, HASQI, HAAQI], [HASPI]))
 def test_an_item_with_one_broken_ear_is_left_out(clean: Tensor, kind: type[Any]) -> None:
     """Otherwise the score of the other ear would hide an output that diverges."""
     output, reference = (clean[0].repeat(3, 2, 1) for _ in range(2))
@@ -283,6 +288,7 @@ def test_bad_arguments_raise_value_error() -> None:
             HASPI(**settings)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_scores")
 def test_in_a_lightning_validation_loop(clean: Tensor, tmp_path: Path) -> None:
     lightning = pytest.importorskip("lightning")
