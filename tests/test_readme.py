@@ -102,6 +102,17 @@ def test_notebooks_are_stored_without_outputs() -> None:
             assert not cell.get("outputs") and cell.get("execution_count") is None, path
 
 
+def test_cells_of_notebooks_that_train_or_score_show_their_progress() -> None:
+    shown = 0
+    for path in (ROOT / "docs" / "tutorials").glob("*.ipynb"):
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            source = "".join(cell["source"])
+            if "backward()" in source or "haspi(" in source:
+                assert "ProgressLine" in source and " progress(" in source, path
+                shown += 1
+    assert shown == 3
+
+
 def test_recipes_are_readable() -> None:
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("lightning")
