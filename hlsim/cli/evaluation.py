@@ -94,6 +94,7 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
     text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
     option("--gain-ears", str.upper, text, ["N3", "S2"], nargs="+")
+    _declare_precision(parser)
     _declare_study(parser)
 
 
@@ -151,6 +152,7 @@ def haspi_report(parser: Parser) -> None:
     option("--audiograms", input_path, text)
     text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
     option("--measures", lambda text: [name.strip() for name in text.split(",")], text, ["haspi"])
+    _declare_precision(parser)
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     parser.flag("--better-ear", "use the better ear's scores; needs a manifest with both ears")
     parser.levels("every clean file")
@@ -208,6 +210,7 @@ def clarity(parser: Parser) -> None:
     option("--microphones", count, text, [1], nargs="+")
     text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1, dest="stride")
+    _declare_precision(parser)
     parser.enhancers("waveforms with shape (2, time) in pascals")
     parser.linked("")
     text = "level in dB SPL of a file whose RMS is 1.0"
@@ -287,6 +290,15 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
     )
     option("--items", count, "number of items", items)
     option("--seconds", positive_number, "length of an item in seconds", 3.0)
+
+
+def _declare_precision(parser: Parser) -> None:
+    """Declare ``--precision`` of the scores for an ear."""
+    text = (
+        "bits of the numbers with which HASPI, HASQI and HAAQI are computed, 32 or 64; with 64 "
+        "they are those of pyclarity, in twice the time"
+    )
+    parser.option("--precision", int, text, 32, choices=[32, 64])
 
 
 def _declare_study(parser: Parser) -> None:

@@ -56,6 +56,7 @@ def evaluate_compensators(
     enhancers: Sequence[str] = (),
     simulator: str | Path = "neuro-msbg",
     measures: Sequence[str] = (),
+    precision: int = 32,
     items: int = 400,
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
@@ -88,6 +89,7 @@ def evaluate_compensators(
         simulator: Name or folder of the Neuro-MSBG whose training loss is compared with that of
             the exact MSBG, because an aid may exploit errors of the network.
         measures: Names of measures in addition to HASPI and HASQI.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         items: Number of items. With noise, 400 items are 200 of clean and 200 of noisy speech.
         seconds: Length of an item in seconds. HASPI is not reliable much below 3.
         levels: Levels of the clean speech in dB SPL, in turn.
@@ -152,7 +154,7 @@ def evaluate_compensators(
         "seed": seed,
         "levels": list(levels),
     }
-    scores = find_measures(["haspi", "hasqi", *measures])
+    scores = find_measures(["haspi", "hasqi", *measures], precision)
     evaluation = Evaluation.run(
         draw_aid_items(speech, noise, ears, **settings),
         conditions,
@@ -160,6 +162,7 @@ def evaluate_compensators(
         store=store,
         settings={
             **settings,
+            "precision": precision,
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),
         },

@@ -7,7 +7,7 @@ column of the study's table.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.checks import check_names, loud_outputs
-from hlsim.evaluation.running.fingerprint import fingerprint
+from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
 from hlsim.metrics import fidelity
@@ -29,11 +29,12 @@ from hlsim.metrics.band_levels import (
     band_level_loss,
     band_levels,
 )
-from hlsim.metrics.haaqi_score import haaqi
-from hlsim.metrics.haspi_score import haspi
-from hlsim.metrics.hasqi_score import hasqi
+from hlsim.metrics.haaqi_score import HaaqiReference
+from hlsim.metrics.haspi_score import HaspiReference
+from hlsim.metrics.hasqi_score import HasqiReference
 from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
+from hlsim.torchtools import compute_once
 
 _CORRELATION_FLOOR = 0.2
 """Correlation coefficient below which the lag of an output is unknown."""
@@ -42,14 +43,58 @@ NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
 
 
-def _score_for_ear(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
+PRECISIONS = {32: torch.float32, 64: torch.float64}
+"""Precisions of the scores for an ear by their number of bits.
+
+Double precision takes twice the time. It gives the digits of pyclarity.
+"""
+
+
+@dataclass(frozen=True)
+class _CleanSignal:
+    """Clean signal that equals another one with the same samples, so that it can be a key.
+
+    Attributes:
+        digest: Hash of the samples and of their precision.
+        samples: The samples. Shape: (time,).
+    """
+
+    digest: str
+    samples: Tensor = field(compare=False)
+
+
+@compute_once
+def _prepare_haspi(clean: _CleanSignal, sample_rate: int, full_scale_spl: float) -> HaspiReference:
+    settings: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+    return HaspiReference(clean.samples, **settings, whole_khz=True)
+
+
+@compute_once
+def _prepare_quality(
+    kind: type[HasqiReference] | type[HaaqiReference],
+    clean: _CleanSignal,
+    sample_rate: int,
+    full_scale_spl: float,
+    ear: Audiogram,
+) -> HasqiReference | HaaqiReference:
+    settings: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+    return kind(clean.samples, ear, **settings, whole_khz=True)
+
+
+def _score_for_ear(name: str, precision: torch.dtype, item: Item, output: Tensor) -> Values:
     """Compute a score with pyclarity's noise, and with its rounding of the rate to whole kHz.
 
-    Single precision takes half the time, but may align a channel differently by one sample.
+    The clean signal is prepared once for all conditions, and for HASPI, which needs it in a normal
+    ear, for all ears.
     """
-    options: dict[str, Any] = {"sample_rate": item.sample_rate, "seed": item.seed}
-    options |= {"full_scale_spl": item.full_scale_spl, "noise": "seeded", "whole_khz": True}
-    return {name: float(score(output.double(), item.clean.double(), item.ear, **options))}
+    samples, output = item.clean.to(precision), output.to(precision)
+    clean = _CleanSignal(value_hash(samples), samples)
+    level = item.sample_rate, item.full_scale_spl
+    draw: dict[str, Any] = {"noise": "seeded", "seed": item.seed}
+    if name == "haspi":
+        return {name: float(_prepare_haspi(clean, *level).score(output, item.ear, **draw))}
+    kind = HasqiReference if name == "hasqi" else HaaqiReference
+    return {name: float(_prepare_quality(kind, clean, *level, item.ear).score(output, **draw))}
 
 
 def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
@@ -57,45 +102,65 @@ def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tens
     return {name: score(output, item.clean, item.sample_rate)}
 
 
+def _ear_measure(name: str, bits: int = 32) -> Measure:
+    """Return the measure of HASPI, HASQI or HAAQI in a precision, which stored scores state."""
+    compute = partial(_score_for_ear, name, PRECISIONS[bits])
+    packages = ["numpy"]  # NumPy draws the ear's noise.
+    settings = f"{bits} bits"
+    return Measure(name, compute, packages, settings, uses_facts=False, scores=[name])
+
+
 MEASURES = {
-    name: Measure(
-        name,
-        partial(compute, name, score),
-        packages,
+    **{name: _ear_measure(name) for name in ("haspi", "hasqi", "haaqi")},
+    "stoi": Measure(
+        "stoi",
+        partial(_score_signal, "stoi", fidelity.stoi),
+        ["pystoi", "scipy"],
         uses_facts=False,
-        scores=[name],
-        may_crash=name == "pesq",
-    )
-    for name, compute, score, packages in (
-        ("haspi", _score_for_ear, haspi, ["numpy"]),  # NumPy draws the ear's noise.
-        ("hasqi", _score_for_ear, hasqi, ["numpy"]),
-        ("haaqi", _score_for_ear, haaqi, ["numpy"]),
-        ("stoi", _score_signal, fidelity.stoi, ["pystoi", "scipy"]),
-        ("pesq", _score_signal, fidelity.pesq_wb, ["pesq"]),
-    )
+        scores=["stoi"],
+    ),
+    "pesq": Measure(
+        "pesq",
+        partial(_score_signal, "pesq", fidelity.pesq_wb),
+        ["pesq"],
+        uses_facts=False,
+        scores=["pesq"],
+        may_crash=True,
+    ),
 }
-"""The scores of ``--measures``, each under its name. Higher is better for all of them."""
+"""The scores of ``--measures``, each under its name. Higher is better for all of them.
+
+Those for an ear are computed in single precision.
+"""
 
 
-def find_measures(names: Sequence[str]) -> list[Measure]:
+def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
     """Return the measures of some names, without duplicates.
 
     Args:
         names: Names in ``MEASURES``, or ``package.module:name`` of your own functions.
+        precision: Number of bits of the numbers with which HASPI, HASQI and HAAQI are computed, 32
+            or 64.
 
     Raises:
-        ValueError: There is no such measure.
+        ValueError: There is no such measure or precision.
         MissingExtraError: pesq is not installed.
 
     >>> [measure.name for measure in find_measures(["haspi", "hasqi"])]
     ['haspi', 'hasqi']
     """
     check_names([name for name in names if ":" not in name], MEASURES, "measures")
+    if precision not in PRECISIONS:
+        raise ValueError(f"expected precision 32 or 64 (bits), got {precision!r}; pass one of them")
     if "pesq" in names:
         require("pesq", "pesq")
-    return [
-        MEASURES[name] if name in MEASURES else load_measure(name) for name in dict.fromkeys(names)
-    ]
+    measures = []
+    for name in dict.fromkeys(names):
+        measure = MEASURES[name] if name in MEASURES else load_measure(name)
+        if precision != 32 and name in ("haspi", "hasqi", "haaqi"):
+            measure = _ear_measure(name, precision)
+        measures.append(measure)
+    return measures
 
 
 class _PluginMeasure:

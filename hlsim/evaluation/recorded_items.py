@@ -94,6 +94,11 @@ class RecordedItem:
         return join_name(self.listener, self.utterance, self.snr)
 
     @property
+    def clean_name(self) -> str:
+        """File and ear of the clean speech, which several listeners may share."""
+        return f"{self.clean} {self.ear}"
+
+    @property
     def utterance_key(self) -> tuple[str, str, float | None]:
         """Listener, utterance and SNR, which both ears share, as a key that equals itself."""
         snr = None if math.isnan(self.snr) else self.snr

@@ -49,6 +49,7 @@ def haspi_report(
     manifest: str | Path | DataFrame | None = None,
     root: str | Path | None = None,
     measures: Sequence[str] = ("haspi",),
+    precision: int = 32,
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,
@@ -79,6 +80,7 @@ def haspi_report(
             the current folder for a DataFrame.
         measures: Names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
             ``stoi``, ``pesq`` or ``package.module:name``.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         baseline: Condition with which all other conditions are compared. By default, all
             conditions are compared with each other.
         better_ear: Whether to use the better ear's score of each utterance. An utterance that
@@ -140,6 +142,7 @@ def haspi_report(
         recordings,
         [Condition(name, kind="recorded") for name in names],
         measures,
+        precision=precision,
         baseline=baseline,
         better_ear=better_ear,
         store=store,
@@ -168,6 +171,7 @@ def score_recordings(
     conditions: Sequence[Condition],
     measures: Sequence[str],
     *,
+    precision: int = 32,
     baseline: str | None = None,
     better_ear: bool = False,
     planned: Sequence[PlannedComparison] = (),
@@ -181,6 +185,7 @@ def score_recordings(
         recordings: One recording per utterance and ear.
         conditions: Conditions under which outputs were recorded.
         measures: Names of measures, the most important first.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         baseline: Condition with which all others are compared; by default, all pairs are compared.
         better_ear: Whether to use the better ear's score of each utterance.
         planned: Planned comparisons; by default that of the first with the last condition by the
@@ -207,8 +212,13 @@ def score_recordings(
     ['unaided']
     """
     utterances = _pair_ears(recordings) if better_ear else []
-    settings = {"seed": recordings[0].seed, "baseline": baseline, "better_ear": better_ear}
-    columns = [*find_measures(measures), LEVELS, ALIGNMENT]
+    settings = {
+        "seed": recordings[0].seed,
+        "precision": precision,
+        "baseline": baseline,
+        "better_ear": better_ear,
+    }
+    columns = [*find_measures(measures, precision), LEVELS, ALIGNMENT]
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
     table, scores, names = evaluation.table, evaluation.scores, evaluation.names
     notes = _describe_lags(table)

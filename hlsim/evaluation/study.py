@@ -64,6 +64,13 @@ class ItemSource(Protocol):
     @property
     def facts(self) -> Mapping[str, Any]: ...
 
+    @property
+    def clean_name(self) -> str:
+        """Name of the clean signal; items with the same name are measured after each other.
+
+        Measures prepare a clean signal once for such items.
+        """
+
     def digest(self, condition: str) -> str:
         """Return a hash of all data of the item on which its scores under a condition depend.
 
@@ -103,6 +110,11 @@ class Item:
     facts: Mapping[str, Any] = field(default_factory=dict)
     recorded: Callable[[str], Tensor] | None = None
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def clean_name(self) -> str:
+        """Empty, so that items are measured in their order."""
+        return ""
 
     def load(self) -> Item:
         """Return a copy without the values that ``once`` has computed, which need memory."""
@@ -302,12 +314,15 @@ def run_measures(
                     task.missing.append((condition, measure, key))
         if task.missing:
             tasks.append(task)
+    tasks.sort(key=lambda task: task.source.clean_name)
     total = len(items) * len(conditions) * len(measures)
     report_progress(len(results), total)
     running["in_processes"] = any(measure.may_crash for measure in measures)
     while tasks:
         tasks_of_crashes = []
         for task, measured in run_parallel(_measure_item, tasks, **running):
+            if isinstance(measured, Crash):
+                running["in_processes"] = True  # The next crash would end this process.
             if isinstance(measured, Crash) and len(task.missing) > 1:
                 # Only one of the scores is to blame: each is computed again in a task of its own.
                 tasks_of_crashes += [task._replace(missing=[score]) for score in task.missing]

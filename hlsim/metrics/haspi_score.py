@@ -21,10 +21,10 @@ Communication 131, 35-46, doi 10.1016/j.specom.2020.05.001.
 from __future__ import annotations
 
 import json
-from functools import reduce
+from functools import lru_cache, reduce
 from operator import add
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -281,14 +281,29 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
         Cepstrum of the noise for clean speech, then for the output. Shape: (2, items, 5, audible).
     """
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
+    random = np.random.RandomState()
     for item, (samples, frames) in enumerate(zip(extent.ends, audible.ends, strict=True)):
-        random = np.random.RandomState(seed)
-        for _ in range(2 * CHANNELS):  # the noise of other scores, which pyclarity draws before
-            random.standard_normal(samples)
+        random.set_state(_state_after_motion_noise(seed, samples))
         for signal in (0, 1):
             levels = torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like.dtype)
             noise[signal, item, :, :frames] = envelopes.NOISE_DB * envelopes.cepstrum(levels.mT)
     return noise.to(like.device)
+
+
+@lru_cache(maxsize=256)
+def _state_after_motion_noise(seed: int, samples: int) -> Any:
+    """Return the state of NumPy's generator after the noise that pyclarity draws for HASQI.
+
+    These are most of the random numbers. A study draws the same ones for all conditions and ears.
+
+    Args:
+        seed: Seed of the generator.
+        samples: Number of samples of a channel.
+    """
+    random = np.random.RandomState(seed)
+    for _ in range(2 * CHANNELS):
+        random.standard_normal(samples)
+    return random.get_state()
 
 
 # -- networks --------------------------------------------------------------------------------------

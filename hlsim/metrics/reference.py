@@ -120,6 +120,11 @@ class Reference(ABC):
         if keep:
             self._batches = map_on_cores(self._prepare, self._groups, self._clean)
 
+    @property
+    def nbytes(self) -> int:
+        """Size of the stored features in bytes."""
+        return _count_bytes(self._batches)
+
     def _thresholds(self, audiogram: AudiogramLike) -> Tensor:
         """Return the thresholds in dB HL of the ear of each item. Shape: -> (items, 8).
 
@@ -220,6 +225,15 @@ class Reference(ABC):
         with torch.autocast(rows.device.type, enabled=False):
             numbers = map_on_cores(compare, range(len(self._groups)), rows)
         return torch.cat(numbers).reshape(*outputs.shape[:-1], -1)
+
+
+def _count_bytes(value: Any) -> int:
+    """Return the size of all tensors in lists, tuples and objects, in bytes."""
+    if isinstance(value, Tensor):
+        return value.nbytes
+    if not isinstance(value, list | tuple):
+        value = vars(value).values() if hasattr(value, "__dict__") else ()
+    return sum(map(_count_bytes, value))
 
 
 def map_on_cores(

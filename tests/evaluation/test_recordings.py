@@ -61,7 +61,8 @@ def test_a_score_is_that_of_the_metric_and_is_read_again(corpus: Path) -> None:
         output = first_channel(corpus / row.condition / f"{row.name}.wav")
         options: dict[str, Any] = {"sample_rate": read_audio(clean)[1], "full_scale_spl": 90.0}
         options |= {"noise": "seeded", "seed": seed, "whole_khz": True}
-        assert row.haspi == float(haspi(output, first_channel(clean), N4, **options))
+        expected = float(haspi(output, first_channel(clean), N4, **options))
+        assert row.haspi == pytest.approx(expected, abs=5e-6)
         level = 90.0 + 10.0 * math.log10(float(output.square().mean()))
         assert row.level == pytest.approx(level, abs=1e-9)
     comparison = report.headline
@@ -72,6 +73,26 @@ def test_a_score_is_that_of_the_metric_and_is_read_again(corpus: Path) -> None:
     assert store.read_bytes() == lines
     haspi_report(**settings, audiogram=Audiogram.standard("N2"))
     assert store.read_bytes().count(b"\n") == 2 * lines.count(b"\n")
+
+
+def test_a_stored_score_has_the_precision_that_is_asked_for(corpus: Path) -> None:
+    paths = {"clean": corpus / "clean", "after": corpus / "after"}
+    settings = {**paths, "audiogram": N4, "store": corpus / "scores.jsonl", "jobs": 1}
+    single = haspi_report(**settings).table.haspi
+    double = haspi_report(**settings, precision=64)
+    exact = []
+    for row in double.table.itertuples():
+        clean = corpus / "clean" / f"{row.name}.flac"
+        output = first_channel(corpus / "after" / f"{row.name}.wav")
+        options: dict[str, Any] = {"sample_rate": read_audio(clean)[1], "noise": "seeded"}
+        options |= {"seed": int(sha256(clean)[:8], 16), "whole_khz": True}
+        exact.append(float(haspi(output, first_channel(clean), N4, **options)))
+    assert list(double.table.haspi) == exact
+    assert list(single) != exact
+    assert list(haspi_report(**settings).table.haspi) == list(single)
+    assert double.settings["precision"] == 64
+    with pytest.raises(ValueError, match="expected precision 32 or 64"):
+        haspi_report(**settings, precision=16)
 
 
 def test_a_single_condition_is_scored_without_a_comparison(corpus: Path) -> None:

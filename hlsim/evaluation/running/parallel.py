@@ -82,8 +82,8 @@ def run_parallel(
         function: Function of a task, which can be pickled. An exception that it raises ends the
             run.
         tasks: Arguments of the function.
-        jobs: Number of processes; all cores by default. With 1, tasks run in this process, which a
-            crash ends.
+        jobs: Number of processes; all cores by default. With 1, and for a single task, tasks run in
+            this process, which a crash ends.
         dask: Address of a Dask scheduler, whose workers replace the processes. The workers must be
             able to import hlsim and to read the same files.
         in_processes: Whether tasks run in another process even if ``jobs`` is 1.
@@ -97,6 +97,8 @@ def run_parallel(
     [(-1, 1), (2, 2)]
     """
     joblib = require("joblib", "eval")
+    if len(tasks) == 1:
+        jobs = 1  # A process takes seconds to start.
     with ExitStack() as stack:
         settings: dict[str, Any] = {"backend": "loky", "inner_max_num_threads": 1}
         if dask is not None:
