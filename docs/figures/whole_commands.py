@@ -152,6 +152,8 @@ def commands(root: Path) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
     recipe = [f"path.root={root}", f"path.exp_folder={root}"]
     report = [*hlsim, "haspi-report", "--full-scale-spl", "100", "--jobs", "1"]
     listeners = ["--audiograms", f"{root}/clarity_data/metadata/listeners.json"]
+    both_scores = ["--measures", "haspi,hasqi", "--out", "icassp"]
+    folders = ["--clean", "pair/clean", "--after", "pair/output"]
     return {
         "CEC2 evaluation, 16 HASPI": (
             [*python, "-m", "recipes.cec2.baseline.evaluate", *recipe],
@@ -159,8 +161,7 @@ def commands(root: Path) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
         ),
         "ICASSP 2023, 8 HASPI and 8 HASQI": (
             [*python, "-m", "recipes.icassp_2023.baseline.evaluate", *recipe],
-            [*report, "--manifest", "one_condition.csv", *listeners, "--out", "icassp"]
-            + ["--measures", "haspi,hasqi"],
+            [*report, "--manifest", "one_condition.csv", *listeners, *both_scores],
         ),
         "HAAQI of 3 s, stereo": (
             [*python, "-c", MUSIC.format(**levels)],
@@ -168,12 +169,11 @@ def commands(root: Path) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
         ),
         "HASPI of 3 s": (
             [*python, "-c", PAIR.format(**levels)],
-            [*report, "--clean", "pair/clean", "--after", "pair/output", "--audiogram", "N3"]
-            + ["--out", "haspi"],
+            [*report, *folders, "--audiogram", "N3", "--out", "haspi"],
         ),
         "MSBG of 3 s": (
             [*python, "-c", SIMULATE.format(**levels)],
-            [*hlsim, "simulate", "pair/clean/a.wav", "--audiogram", "N3", "--out", "perceived"],
+            [*hlsim, "simulate", "pair/clean/a.wav", "perceived.wav", "--audiogram", "N3"],
         ),
     }
 
@@ -181,7 +181,7 @@ def commands(root: Path) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
 def run(command: Sequence[str], root: Path) -> float:
     """Return the processor time in seconds of a command and of the processes that it starts."""
     results = [root / "si.csv", root / "si_unproc.csv", root / "scores.csv"]
-    folders = [root / name for name in ("cec2", "icassp", "haaqi", "haspi", "perceived")]
+    folders = [root / name for name in ("cec2", "icassp", "haaqi", "haspi")]
     for path in [*results, *(folder / "scores.jsonl" for folder in folders)]:
         path.unlink(missing_ok=True)  # stored scores are not computed again
     settings = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}

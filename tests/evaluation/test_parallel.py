@@ -29,6 +29,10 @@ def test_tasks_come_back_with_their_results_and_an_exception_ends_the_run() -> N
         list(run_parallel(abs, [1, "three"], jobs=1))
 
 
+def test_a_single_task_needs_no_other_process() -> None:
+    assert list(run_parallel(process_of, [7])) == [(7, (7, os.getpid()))]
+
+
 @pytest.mark.slow  # Processes take seconds to start, because they import hlsim.
 @pytest.mark.parametrize("settings", [{"jobs": 2}, {"jobs": 1, "in_processes": True}])
 def test_a_process_that_ends_costs_only_its_task(settings: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.evaluation import haspi_report
 from hlsim.evaluation.recorded_items import RecordedItem, read_recordings
 from hlsim.files import sha256
-from hlsim.metrics import haspi
+from hlsim.metrics import HaspiReference, haspi
 from hlsim.shortcuts import example_speech
 
 pytest.importorskip("pandas")
@@ -73,6 +73,24 @@ def test_a_score_is_that_of_the_metric_and_is_read_again(corpus: Path) -> None:
     assert store.read_bytes() == lines
     haspi_report(**settings, audiogram=Audiogram.standard("N2"))
     assert store.read_bytes().count(b"\n") == 2 * lines.count(b"\n")
+
+
+def test_clean_speech_is_prepared_once_for_all_conditions_and_listeners(
+    corpus: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = []
+
+    class CountedReference(HaspiReference):
+        def __init__(self, *arguments: Any, **settings: Any) -> None:
+            prepared.append(arguments)
+            super().__init__(*arguments, **settings)
+
+    monkeypatch.setattr("hlsim.evaluation.measures.HaspiReference", CountedReference)
+    ears = corpus / "ears.csv"
+    ears.write_text("listener,audiogram\nL1,N2\nL2,N4\n")
+    table = haspi_report(**folders(corpus), audiograms=ears, seed=9).table
+    assert len(table) == 8 and table.haspi.nunique() == 8
+    assert len(prepared) == 2  # files
 
 
 def test_a_stored_score_has_the_precision_that_is_asked_for(corpus: Path) -> None:

@@ -120,6 +120,29 @@ def test_a_module_is_in_evaluation_mode(items: list[Item]) -> None:
     assert table["peak"].tolist() == pytest.approx([0.2, 0.4, 0.6])
 
 
+class ItemOfFile(Item):
+    """Item whose clean signal has the name of its listener."""
+
+    @property
+    def clean_name(self) -> str:
+        return str(self.facts["listener"])
+
+
+def test_items_with_the_same_clean_signal_are_measured_after_each_other(items: list[Item]) -> None:
+    order = []
+
+    def note(item: Item, output: Tensor) -> dict[str, float]:
+        order.append(item.name)
+        return {"note": 1.0}
+
+    sources = [
+        ItemOfFile(item.name, item.clean, item.signal, N3, facts=item.facts) for item in items
+    ]
+    table = run_study(sources, gains(1), [Measure("note", note)], jobs=1)
+    assert order == ["item 0", "item 2", "item 1"]
+    assert list(table.name) == ["item 0", "item 1", "item 2"]
+
+
 @pytest.mark.parametrize("kind", [float, np.float32, torch.tensor])
 def test_numbers_of_any_type_are_stored_and_must_be_finite(
     items: list[Item], kind: Callable[[float], Any]
