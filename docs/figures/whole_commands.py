@@ -83,8 +83,8 @@ def make_scene(number: int) -> tuple[Signals, Signals]:
         waveform, rate = read_audio(path)
         voice = resample(waveform[0].double(), rate, RATE).repeat(4)[: SECONDS * RATE]
         voices.append(set_level(voice, SPEECH_SPL, full_scale_spl=FULL_SCALE_SPL))
-    speech, *others = voices
-    babble = set_level(torch.stack(others).sum(0), SPEECH_SPL - SNR, full_scale_spl=FULL_SCALE_SPL)
+    speech, *maskers = voices
+    babble = set_level(torch.stack(maskers).sum(0), SPEECH_SPL - SNR, full_scale_spl=FULL_SCALE_SPL)
     clean = torch.stack((speech, 0.8 * speech), -1)
     mixture = clean + torch.stack((babble, babble.roll(20)), -1)
     return clean.numpy(), mixture.numpy()

@@ -87,7 +87,7 @@ def test_clean_speech_is_prepared_once_for_all_conditions_and_listeners(
 
     monkeypatch.setattr("hlsim.evaluation.measures.HaspiReference", CountedReference)
     ears = corpus / "ears.csv"
-    ears.write_text("listener,audiogram\nL1,N2\nL2,N4\n")
+    ears.write_text("listener,hl_500,hl_4000\nL1,20,40\nL2,50,60\n")
     table = haspi_report(**folders(corpus), audiograms=ears, seed=9).table
     assert len(table) == 8 and table.haspi.nunique() == 8
     assert len(prepared) == 2  # files
