@@ -7,8 +7,14 @@ Each cell is the unaided minus the aided threshold in dB, with its interval of 9
 """
 
 import argparse
+from functools import partial
 
-from hlsim import reception_threshold
+import torch
+
+from compensators import load_compensator
+from hlsim import Audiogram
+from hlsim.evaluation.digits import DigitTest
+from hlsim.evaluation.digits.psychometric import subtract
 
 AIDS = {
     "NAL-R": ("nalr", {}),
@@ -27,16 +33,19 @@ def main() -> None:
     parser.add_argument("--listener", default="digit-listener")
     parser.add_argument("--triplets", type=int, default=120)
     options = parser.parse_args()
-    settings = {name: getattr(options, name) for name in ("simulator", "listener", "triplets")}
+    torch.set_num_threads(1)
+    test = DigitTest.draw(options.triplets, simulator=options.simulator, listener=options.listener)
+    ears = [torch.tensor(Audiogram.standard(name).thresholds) for name in options.ears]
+    unaided = [test.measure(ear) for ear in ears]
     print(f"| aid | {' | '.join(options.ears)} |\n|---|{'---|' * len(options.ears)}")
+    print(f"| unaided threshold | {' | '.join(f'{x.value:.1f}' for x in unaided)} |", flush=True)
     for label, (name, sliders) in AIDS.items():
-        result = reception_threshold(options.ears, name, **settings, **sliders)
-        if label == "NAL-R":
-            print(f"| unaided threshold | {' | '.join(f'{x:.1f}' for x in result.unaided.value)} |")
-        cells = [
-            f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
-            for value, low, high in zip(*result.benefit, strict=True)
+        aid = partial(load_compensator(name), **sliders)
+        benefits = [
+            subtract(without, test.measure(ear, aid))
+            for ear, without in zip(ears, unaided, strict=True)
         ]
+        cells = [f"{value:+.1f} [{low:+.1f}, {high:+.1f}]" for value, low, high in benefits]
         print(f"| {label} | {' | '.join(cells)} |", flush=True)
 
 

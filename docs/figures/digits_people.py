@@ -43,6 +43,9 @@ HERTZ = (125, 250, 500, 750, 1000, 1500, 2000, 4000)
 GROUPS = {"below 20": (-99, 20), "20 to 35": (20, 35), "35 to 50": (35, 50), "from 50": (50, 999)}
 """Limits of the PTA in dB HL of groups of people."""
 
+LOW_LOSS = 30.0
+"""PTA in dB HL below which people's thresholds rise slowly: the bend of all 279."""
+
 AT_ONCE = 8
 """Number of people per call of ``reception_threshold``."""
 
@@ -53,7 +56,11 @@ DRAWS = 300
 """Bootstrap samples of people."""
 
 
-def read_people(path: Path) -> list[tuple[str, float, Audiogram]]:
+Person = tuple[str, float, Audiogram]
+"""Name, threshold in noise in dB, and better ear."""
+
+
+def read_people(path: Path) -> list[Person]:
     """Read name, threshold in noise and better ear of each person, in the order of PTA."""
     people = []
     with path.open(encoding="utf-8") as file:
@@ -69,23 +76,29 @@ def read_people(path: Path) -> list[tuple[str, float, Audiogram]]:
     return sorted(people, key=lambda person: person[2].pta)
 
 
-def run_tests(people: list[tuple[str, float, Audiogram]], triplets: int, path: Path) -> None:
-    """Test each person behind each simulator, and append a line per test to a file."""
-    tests = {(name, simulator) for name, _, _ in people for simulator in SIMULATORS}
-    finished = tests & {(row["person"], row["simulator"]) for row in read_tests(path)}
+def run_tests(
+    people: list[Person], simulators: list[str], triplets: int, seed: int, path: Path
+) -> None:
+    """Test each person behind each simulator, and append a line per test to a file.
+
+    Each call tests people of all losses, so that a run which is stopped leaves an even share.
+    """
+    tests = {(name, simulator, seed) for name, _, _ in people for simulator in simulators}
+    finished = tests & {(row["person"], row["simulator"], row["seed"]) for row in read_tests(path)}
     total, done = len(tests), len(finished)
+    calls = -(-len(people) // AT_ONCE)
     with ProgressLine("tests") as progress, path.open("a", encoding="utf-8") as file:
-        for start in range(0, len(people), AT_ONCE):
-            for name in SIMULATORS:
-                part = people[start : start + AT_ONCE]
-                part = [person for person in part if (person[0], name) not in finished]
+        for start in range(calls):
+            for name in simulators:
+                part = people[start::calls]
+                part = [person for person in part if (person[0], name, seed) not in finished]
                 if not part:
                     continue
                 ears = [ear for _, _, ear in part]
-                result = reception_threshold(ears, simulator=name, triplets=triplets)
+                result = reception_threshold(ears, simulator=name, triplets=triplets, seed=seed)
                 for (person, srt, ear), value in zip(part, result.unaided.value, strict=True):
-                    row = {"person": person, "simulator": name, "people": srt, "pta": ear.pta}
-                    row["hlsim"] = float(value)
+                    row = {"person": person, "simulator": name, "seed": seed, "people": srt}
+                    row |= {"pta": ear.pta, "hlsim": float(value)}
                     file.write(json.dumps(row) + "\n")
                 file.flush()
                 done += len(part)
@@ -139,7 +152,8 @@ def print_table(head: str, rows: list[list[str]]) -> None:
 def report(tests: dict[str, list[dict]]) -> None:
     """Print all tables."""
     agreement, slopes, groups = [], [], []
-    for name, label in SIMULATORS.items():
+    labels = {name: label for name, label in SIMULATORS.items() if tests[name]}
+    for name, label in labels.items():
         pta, people, hlsim = (
             np.array([row[key] for row in tests[name]]) for key in ("pta", "people", "hlsim")
         )
@@ -154,7 +168,8 @@ def report(tests: dict[str, list[dict]]) -> None:
             columns = intervals(lambda i, x=(pta, srt): fit_two_lines(*(v[i] for v in x)), count)
             slopes.append([source, *columns])
         for group, (low, high) in GROUPS.items():
-            inside = error[(pta >= low) & (pta < high)]
+            members = (pta >= low) & (pta < high)
+            inside = error[members]
             groups.append(
                 [
                     label,
@@ -163,15 +178,63 @@ def report(tests: dict[str, list[dict]]) -> None:
                     f"{inside.mean():+.1f}",
                     f"{np.median(np.abs(inside)):.1f}",
                     f"{np.sqrt(np.square(inside).mean()):.1f}",
+                    f"{spearmanr(hlsim[members], people[members])[0]:.2f}",
+                    f"{spearmanr(pta[members], people[members])[0]:.2f}",
+                    f"{hlsim[members].std(ddof=1):.2f}",
+                    f"{people[members].std(ddof=1):.2f}",
                 ]
             )
-    print(f"{len(tests['msbg'])} people")
+    print(f"{', '.join(f'{label}: {len(tests[name])} people' for name, label in labels.items())}")
     print_table("ear | rank r | r | median absolute error | RMSE | offset", agreement)
     print_table("source | slope below the bend | above | bend (dB HL)", slopes)
-    print_table("ear | PTA (dB HL) | people | bias | median absolute error | RMSE", groups)
+    head = "ear | PTA (dB HL) | people | bias | median absolute error | RMSE"
+    print_table(f"{head} | rank r | rank r of PTA | SD of the ear | SD of people", groups)
+    print_limits(labels, tests)
 
 
-def draw(tests: dict[str, list[dict]], everybody: list[tuple[str, float, Audiogram]]) -> None:
+def print_limits(labels: dict[str, str], tests: dict[str, list[dict]]) -> None:
+    """Print what the rank correlation would be if something else were as it is not.
+
+    Below ``LOW_LOSS``, the order of the ears is replaced by that of the PTA, once among the values
+    that these ears have, and once below all others. *PTA* is the rank correlation without an ear.
+    """
+    rows = []
+    for name, label in labels.items():
+        pta, people, hlsim = (
+            np.array([row[key] for row in tests[name]]) for key in ("pta", "people", "hlsim")
+        )
+        low = pta < LOW_LOSS
+        ordered, below = hlsim.copy(), hlsim.copy()
+        ordered[low] = np.sort(hlsim[low])[pta[low].argsort().argsort()]
+        below[low] = pta[low] - 1000.0
+        predictors = (hlsim, ordered, below, pta)
+        rows.append([label, *(f"{spearmanr(x, people)[0]:.2f}" for x in predictors)])
+    low_loss = f"{LOW_LOSS:.0f} dB HL"
+    print_table(
+        f"ear | rank r | below {low_loss} in the order of PTA | and below all others | PTA", rows
+    )
+
+
+def report_retest(first: list[dict], second: list[dict]) -> None:
+    """Print how well two tests with other triplets agree, for the people who have both."""
+    rows = []
+    for name, label in SIMULATORS.items():
+        values = [
+            {row["person"]: row["hlsim"] for row in tests if row["simulator"] == name}
+            for tests in (first, second)
+        ]
+        both = [
+            (values[0][person], values[1][person]) for person in values[1] if person in values[0]
+        ]
+        if both:
+            once, again = np.array(both).T
+            deviation = np.std(once - again, ddof=1) / np.sqrt(2.0)
+            rank, r = spearmanr(once, again)[0], np.corrcoef(once, again)[0, 1]
+            rows.append([label, str(len(both)), f"{rank:.2f}", f"{r:.2f}", f"{deviation:.2f}"])
+    print_table("ear | people | rank r of two tests | r | SD of one test (dB)", rows)
+
+
+def draw(tests: dict[str, list[dict]], everybody: list[Person]) -> None:
     """Draw people as dots and each ear as a line, the mean over five neighbours."""
     figure, axes = pyplot.subplots(figsize=(8.0, 4.0), layout="constrained")
     pta = [ear.pta for _, _, ear in everybody]
@@ -179,6 +242,8 @@ def draw(tests: dict[str, list[dict]], everybody: list[tuple[str, float, Audiogr
     axes.plot(pta, srt, ".", color="0.65", label=f"people ({len(pta)})")
     for name, label in SIMULATORS.items():
         rows = tests[name]
+        if not rows:
+            continue
         offset = np.mean([row["people"] - row["hlsim"] for row in rows])
         window = np.ones(5) / 5.0
         smooth = [
@@ -197,20 +262,22 @@ def main() -> None:
     parser.add_argument("table", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="path without the ending .jsonl")
     parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--triplets", type=int, default=100)
+    parser.add_argument("--triplets", type=int, default=80)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--simulators", nargs="+", default=list(SIMULATORS))
     options = parser.parse_args()
     torch.set_num_threads(1)
     everybody = read_people(options.table)
     people = everybody[:: options.every]
     path = options.out.with_suffix(".jsonl")
-    run_tests(people, options.triplets, path)
+    run_tests(people, options.simulators, options.triplets, options.seed, path)
     names = {person for person, _, _ in people}
-    rows = sorted(read_tests(path), key=lambda row: row["pta"])
-    tests = {
-        name: [row for row in rows if row["simulator"] == name and row["person"] in names]
-        for name in SIMULATORS
-    }
+    everything = sorted(read_tests(path), key=lambda row: row["pta"])
+    rows = [row for row in everything if row["seed"] == options.seed and row["person"] in names]
+    tests = {name: [row for row in rows if row["simulator"] == name] for name in SIMULATORS}
     report(tests)
+    for seed in sorted({row["seed"] for row in everything} - {options.seed}):
+        report_retest(rows, [row for row in everything if row["seed"] == seed])
     draw(tests, everybody)
 
 

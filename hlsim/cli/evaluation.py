@@ -95,6 +95,8 @@ def evaluate_compensator(parser: Parser) -> None:
     text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
     option("--gain-ears", str.upper, text, ["N3", "S2"], nargs="+")
     _declare_precision(parser)
+    text = "measure thresholds for digits in noise as well, for the ears of the gain curves"
+    parser.flag("--srt", text)
     _declare_study(parser)
 
 

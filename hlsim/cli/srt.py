@@ -9,7 +9,6 @@ from hlsim.cli.inputs import (
     build_compensator,
     parse_ears,
     read_sliders,
-    use_one_thread,
     warn_of_other_ears,
 )
 from hlsim.cli.options import Parser, count, seed, sound_level
@@ -37,7 +36,6 @@ def srt(parser: Parser) -> None:
 
 
 def _srt(options: argparse.Namespace) -> None:
-    use_one_thread()
     named_ears = parse_ears(options)
     from hlsim.audiogram import Audiogram
     from hlsim.calibration import NEURO_RATE

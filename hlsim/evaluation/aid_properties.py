@@ -16,6 +16,8 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
+from hlsim.evaluation.digits.psychometric import Estimate, subtract
+from hlsim.evaluation.digits.threshold import DigitTest
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.running.parallel import describe_error, one_thread
 from hlsim.evaluation.study import cut_output
@@ -282,6 +284,36 @@ def measure_look_ahead(
         if differs.any():
             largest = max(largest, position - int(differs.int().argmax()))
     return largest
+
+
+def measure_reception_thresholds(aids: Aids, ears: Ears, reference: str, seed: int) -> Results:
+    """Measure how much noise ears tolerate with hearing aids, by a test with digits in noise.
+
+    Args:
+        aids: Hearing aids, each under its name.
+        ears: Audiograms, each under its name.
+        reference: Name of the aid, such as none, to which benefits are relative.
+        seed: Seed of digits and noises, which are the same for all ears and aids.
+
+    Returns:
+        One dictionary per ear and aid, as ``measure_aids`` returns it, with ``threshold_db``, the
+        signal-to-noise ratio at which half of the triplets are understood, and ``benefit_db``, the
+        threshold with the reference minus that with the aid, both with their 95 % intervals.
+    """
+    test = DigitTest.draw(seed=seed)
+    results = measure_aids(aids, ears, _measure_reception_threshold, test)
+    unaided = {row["ear"]: row["threshold_db"] for row in results if row["aid"] == reference}
+    for row in results:
+        row["benefit_db"] = subtract(unaided[row["ear"]], row["threshold_db"])
+    return results
+
+
+def _measure_reception_threshold(aid: Aid, ear: Audiogram, test: DigitTest) -> dict[str, Estimate]:
+    """Measure the threshold of one ear with an aid."""
+    thresholds = torch.tensor(ear.thresholds)
+    return {
+        "threshold_db": test.measure(thresholds, lambda inputs, _: _aid_outputs(aid, inputs, ear))
+    }
 
 
 @torch.no_grad()

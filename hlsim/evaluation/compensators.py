@@ -19,6 +19,7 @@ from hlsim.data.clips import Clips
 from hlsim.evaluation.aid_properties import (
     measure_aids,
     measure_gain_curve,
+    measure_reception_thresholds,
     measure_steady_tones,
     measure_wearability,
 )
@@ -61,6 +62,7 @@ def evaluate_compensators(
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
     gain_ears: Sequence[str] = ("N3", "S2"),
+    srt: bool = False,
     seed: int = 0,
     listen: int = 0,
     **running: Any,
@@ -93,7 +95,10 @@ def evaluate_compensators(
         items: Number of items. With noise, 400 items are 200 of clean and 200 of noisy speech.
         seconds: Length of an item in seconds. HASPI is not reliable much below 3.
         levels: Levels of the clean speech in dB SPL, in turn.
-        gain_ears: Names of the standard ears for gain curves and steady tones.
+        gain_ears: Names of the standard ears for gain curves, steady tones and ``srt``.
+        srt: Whether to measure speech reception thresholds in noise by the digit test, too. Such a
+            threshold belongs to an ear and an aid, not to an item. It takes about five seconds for
+            each of them, without the time of the aid.
         seed: Seed of all random draws.
         listen: Number of items with sounds for the players of a page, as the ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
@@ -104,7 +109,8 @@ def evaluate_compensators(
         The evaluation with the groups ``clean`` and ``noisy`` (speech in noise)
         if they have items. Its ``details`` are ``gain_curves``, ``steady_tones`` and ``wearing``:
         results of ``measure_aids`` with ``measure_gain_curve``, ``measure_steady_tones`` and
-        ``measure_wearability``.
+        ``measure_wearability``; with ``srt``, also ``reception_thresholds``, that of
+        ``measure_reception_thresholds``.
 
     Raises:
         ValueError: Data or settings are not valid, or no item has all its scores.
@@ -148,6 +154,10 @@ def evaluate_compensators(
         "steady_tones": measure_aids(with_unaided, ears_of_aids, measure_steady_tones, levels),
         "wearing": measure_aids(wearable, ears_of_aids, measure_wearability, utterances[0]),
     }
+    if srt:
+        details["reception_thresholds"] = measure_reception_thresholds(
+            with_unaided, ears_of_aids, UNAIDED, seed
+        )
     settings: dict[str, Any] = {
         "items": items,
         "seconds": seconds,

@@ -42,6 +42,15 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH_INCHES = 4.2
 _LEGEND_INCHES = 0.2  # for each row of a legend
 
+_LEGEND: dict[str, Any] = {
+    "ncols": 2,
+    "frameon": False,
+    "fontsize": 9,
+    "handlelength": 1.5,
+    "columnspacing": 1.0,
+}
+"""Properties of the legend below curves."""
+
 _INKED = "text.color axes.edgecolor axes.labelcolor xtick.color ytick.color"
 
 _STYLE: dict[str, Any] = {
@@ -140,8 +149,7 @@ def curves_picture(
             axes.plot(x, y, label=f" {fill(name, 26)}", **style)
         axes.set(ylabel=axis, ylim=axis_range)
         frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
-        style = {"frameon": False, "fontsize": 9, "handlelength": 1.5, "columnspacing": 1.0}
-        axes.figure.legend(loc="outside lower left", ncols=2, **style)
+        axes.figure.legend(loc="outside lower left", **_LEGEND)
 
     height = 2.9 + _LEGEND_INCHES * ((len(curves) + 1) // 2)
     return _draw_picture(draw, title, note=note, height=height)
@@ -195,6 +203,45 @@ def gain_picture(
         for name, line, style in zip(names, gains.tolist(), _LINE_STYLES, strict=False):
             curves[name] = (row["frequencies"], line, {"color": colours[aid], "linestyle": style})
     return curves_picture(curves, title, "insertion gain (dB)")
+
+
+def ears_picture(
+    title: str,
+    axis: str,
+    values: Sequence[tuple[str, str, Sequence[float]]],
+    colours: Mapping[str, Any],
+) -> Picture:
+    """Draw a value with its interval for each ear and aid, the aids of an ear side by side.
+
+    Args:
+        title: Heading above the picture.
+        axis: Title of the vertical axis.
+        values: Names of an ear and an aid, and the value with the limits of its interval.
+        colours: Colour of matplotlib for each aid.
+
+    >>> values = [("N3", "mine", (-5.0, -6.0, -4.0)), ("N4", "mine", (2.0, 1.0, 3.0))]
+    >>> ears_picture("Thresholds", "threshold (dB)", values, {"mine": "#2f7ed8"}).title
+    'Thresholds'
+    """
+    ears = [*dict.fromkeys(ear for ear, _, _ in values)]
+    aids = [*dict.fromkeys(aid for _, aid, _ in values)]
+
+    def draw(axes: Any) -> None:
+        for number, aid in enumerate(aids):
+            shift = 0.6 * (number + 0.5) / len(aids) - 0.3
+            own = [(ears.index(ear) + shift, value) for ear, name, value in values if name == aid]
+            places = [place for place, _ in own]
+            points, low, high = np.array([value for _, value in own]).T
+            # A label that begins with an underscore would be hidden.
+            axes.plot(places, points, "o", color=colours[aid], label=f" {fill(aid, 26)}")
+            axes.vlines(places, low, high, colors=[colours[aid]])
+        axes.set(ylabel=axis, xlim=(-0.5, len(ears) - 0.5))
+        axes.set_xticks(range(len(ears)), ears)
+        axes.grid(axis="y", alpha=0.4)
+        axes.figure.legend(loc="outside lower left", **_LEGEND)
+
+    height = 2.9 + _LEGEND_INCHES * ((len(aids) + 1) // 2)
+    return _draw_picture(draw, title, height=height)
 
 
 def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:

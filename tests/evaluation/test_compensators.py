@@ -16,6 +16,7 @@ from hlsim.cli.main import main
 from hlsim.evaluation import Item, aid_properties
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.conditions import Unaided, load_enhancers
+from hlsim.evaluation.digits import DigitTest, reception_threshold
 from hlsim.evaluation.measures import NORMAL, PERCEPTION, _band_error_db, network_loss
 from hlsim.report.compensators_page import compensators_page
 
@@ -110,6 +111,33 @@ def test_conditions_groups_and_page(
     (example,) = page.sections[1].sections
     assert len(example.player.sounds) == 4, "normal ear, unaided, NAL-R at the same level, mine"
     assert "my_enhancer:half" in page.markdown() and page.html().count("<audio") == 4
+
+
+def test_thresholds_in_noise_are_measured_for_each_ear_and_aid(
+    options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = DigitTest.draw(30, simulator="attenuation")
+    expected = reception_threshold(["N2", "N4"], Gain(), simulator="attenuation", triplets=30)
+    monkeypatch.setattr(DigitTest, "draw", lambda seed: quick)
+    options["gain_ears"] = ("N2", "N4")
+    study = evaluate_compensators({"mine": Gain()}, **options, items=1, srt=True)
+    rows = study.details["reception_thresholds"]
+    names = ["unaided", "NAL-R", "WDRC", "mine"]
+    assert [(row["ear"], row["aid"]) for row in rows] == [
+        (ear, name) for ear in ("N2", "N4") for name in names
+    ]
+    thresholds = [row["threshold_db"].value for row in rows]
+    assert thresholds[::4] == expected.unaided.value.tolist()
+    assert expected.aided is not None and thresholds[3::4] == expected.aided.value.tolist()
+    assert [row["benefit_db"].value for row in rows[:4]] == [
+        thresholds[0] - x for x in thresholds[:4]
+    ]
+    page = compensators_page(study)
+    (section,) = (section for section in page.sections if section.title == "Digits in noise")
+    value, low, high = rows[3]["threshold_db"]
+    assert f"{value:.1f} [{low:.1f}, {high:.1f}]" in page.markdown()
+    assert len(section.tables) == len(section.pictures) == 1
+    assert b"<svg" in section.pictures[0].data
 
 
 def test_a_delayed_enhancer_is_rejected(tmp_path: Path) -> None:

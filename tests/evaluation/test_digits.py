@@ -1,5 +1,6 @@
 """Digits, noises, listener and thresholds of the digits-in-noise test."""
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from hlsim.evaluation.digits.material import (
 )
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
-from hlsim.simulators import load_simulator
+from hlsim.simulators import Attenuation, load_simulator
 
 QUICK: dict[str, Any] = {"simulator": "attenuation", "triplets": 30}
 """Settings of a test of a second."""
@@ -146,6 +147,27 @@ def test_the_same_call_has_the_same_bits_and_ears_are_independent() -> None:
     listener = reception_threshold(Listener("N2", "N4"), **QUICK)
     assert listener.unaided.value.tolist() == first.unaided.value.tolist()
     assert reception_threshold("N4", seed=1, **QUICK).unaided.value != alone.unaided.value
+
+
+def test_threads_share_the_triplets_and_do_not_change_the_threshold() -> None:
+    calls: set[tuple[bool, int]] = set()
+
+    class Recorder(Attenuation):
+        def forward(self, waveform: torch.Tensor, audiogram: Any = None) -> torch.Tensor:
+            is_main_thread = threading.current_thread() is threading.main_thread()
+            calls.add((is_main_thread, len(waveform)))
+            return super().forward(waveform, audiogram)
+
+    simulator, threads = Recorder(), torch.get_num_threads()
+    results = []
+    try:
+        for number in (1, 2):
+            torch.set_num_threads(number)
+            results.append(reception_threshold("N4", simulator=simulator, triplets=60).unaided)
+    finally:
+        torch.set_num_threads(threads)
+    assert results[0] == results[1]
+    assert calls == {(True, 8), (True, 4), (False, 8), (False, 4)}
 
 
 def test_people_have_the_two_lines_that_were_fitted() -> None:

@@ -2,10 +2,11 @@
 
 from hlsim.evaluation.digits.listener import DigitListener, load_listener
 from hlsim.evaluation.digits.psychometric import Estimate
-from hlsim.evaluation.digits.threshold import ReceptionThreshold, reception_threshold
+from hlsim.evaluation.digits.threshold import DigitTest, ReceptionThreshold, reception_threshold
 
 __all__ = [
     "DigitListener",
+    "DigitTest",
     "Estimate",
     "ReceptionThreshold",
     "load_listener",

@@ -11,6 +11,7 @@ triplets over the whole range, then twice two fifths around the threshold so far
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,6 +38,8 @@ from hlsim.evaluation.digits.psychometric import (
     estimate_threshold,
     subtract,
 )
+from hlsim.evaluation.running.parallel import one_thread
+from hlsim.metrics.reference import map_on_cores
 from hlsim.simulators import EXACT, load_simulator
 
 NOISE_SPL = 65.0
@@ -53,6 +56,9 @@ _ROUND_ENDS = (0.2, 0.6)
 
 _AROUND_DB = 4.0
 """Largest distance in dB from the threshold so far, in all rounds but the first."""
+
+_TRIPLETS_AT_ONCE = 8
+"""Number of triplets that a core simulates and recognises at once."""
 
 AidFunction = Callable[..., Tensor]
 """Function of signals in pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL."""
@@ -85,14 +91,18 @@ class ReceptionThreshold:
 
 
 @dataclass(frozen=True)
-class _Test:
-    """Digit test behind a simulated ear.
+class DigitTest:
+    """Digit test behind a simulated ear, with the same triplets for all ears and aids.
 
     Attributes:
         material: Triplets of the test.
         simulator: Simulator of the hearing loss.
         listener: Recogniser of the digits.
         noise_spl: Level of the noise in dB SPL.
+
+    >>> test = DigitTest.draw(30, simulator="attenuation")
+    >>> bool(test.measure(torch.zeros(8)).value < test.measure(torch.full((8,), 60.0)).value)
+    True
     """
 
     material: Triplets
@@ -100,8 +110,36 @@ class _Test:
     listener: DigitListener
     noise_spl: float
 
-    def measure(self, ear: Tensor, aid: AidFunction | None) -> Estimate:
-        """Measure the threshold of one ear, (8,) in dB HL, with an aid or None."""
+    @classmethod
+    def draw(
+        cls,
+        triplets: int = TRIPLETS,
+        *,
+        simulator: str | Path | nn.Module = EXACT,
+        listener: str | Path = DIGIT_LISTENER,
+        noise_spl: float = NOISE_SPL,
+        seed: int = 0,
+    ) -> DigitTest:
+        """Draw the triplets of a test, as ``reception_threshold`` does with these arguments."""
+        return cls(
+            draw_triplets(triplets, torch.Generator().manual_seed(seed)),
+            load_simulator(simulator),
+            load_listener(listener),
+            noise_spl,
+        )
+
+    @torch.inference_mode()
+    @loud_outputs()
+    def measure(
+        self, ear: Tensor, aid: AidFunction | None = None, *, aid_in_threads: bool = False
+    ) -> Estimate:
+        """Measure the threshold of one ear.
+
+        Args:
+            ear: Thresholds at the eight frequencies in dB HL, (8,).
+            aid: Function of signals and the ear; None for no aid.
+            aid_in_threads: Whether several threads may call the aid at once.
+        """
         count = len(self.material.digits)
         snr, right = np.zeros(count), np.zeros(count)
         centre = np.nan  # after the first round, the threshold so far
@@ -112,29 +150,51 @@ class _Test:
             else:
                 levels = centre + np.linspace(-_AROUND_DB, _AROUND_DB, len(part))
             snr[part] = levels.clip(LOWEST_SNR, HIGHEST_SNR)
-            right[part] = self._count_right(part, snr[part], ear, aid)
+            right[part] = self._count_right(part, snr[part], ear, aid, aid_in_threads)
             finished = part[-1] + 1
             estimate = estimate_threshold(snr[:finished], right[:finished])
             centre = min(estimate.value, HIGHEST_SNR)
         return estimate
 
     def _count_right(
-        self, part: NDArray[np.int64], snr: Array, ear: Tensor, aid: AidFunction | None
+        self,
+        part: NDArray[np.int64],
+        snr: Array,
+        ear: Tensor,
+        aid: AidFunction | None,
+        aid_in_threads: bool,
     ) -> Array:
         """Present some of the triplets, and count the right digits of each."""
         triplets = Triplets(*(values[part] for values in self.material))
         signals = present(triplets, torch.from_numpy(snr).float(), self.noise_spl)
+
+        def recognise(portion: slice) -> Tensor:
+            perceived = perceive(signals[portion], ear, self.simulator, triplets.internal[portion])
+            return self.listener(perceived).argmax(-1)
+
+        # The portions do not depend on the number of cores, so that results do not, either.
+        starts = range(0, len(part), _TRIPLETS_AT_ONCE)
+        portions = [slice(start, start + _TRIPLETS_AT_ONCE) for start in starts]
         if aid is not None:
-            output = aid(signals, ear)
-            if output.shape != signals.shape or not bool(output.isfinite().all()):
-                raise ValueError(
-                    f"expected the aid to return finite samples of shape {tuple(signals.shape)}, "
-                    f"got shape {tuple(output.shape)}; return as many samples as the input has, "
-                    "without NaN or infinity"
-                )
-            signals = output
-        scores = self.listener(perceive(signals, ear, self.simulator, triplets.internal))
-        return (scores.argmax(-1) == triplets.digits).sum(-1).double().numpy()
+            call = partial(_call_aid, aid, signals, ear)
+            with one_thread() if not aid_in_threads else nullcontext():
+                outputs = map_on_cores(call, portions, signals)
+            signals = torch.cat(outputs)
+        answers = torch.cat(map_on_cores(recognise, portions, signals))
+        return (answers == triplets.digits).sum(-1).double().numpy()
+
+
+def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) -> Tensor:
+    """Compute the outputs of an aid for a portion of signals, and check them."""
+    inputs = signals[portion]
+    outputs = aid(inputs, ear)
+    if outputs.shape != inputs.shape or not bool(outputs.isfinite().all()):
+        raise ValueError(
+            f"expected the aid to return finite samples of shape {tuple(inputs.shape)}, "
+            f"got shape {tuple(outputs.shape)}; return as many samples as the input has, "
+            "without NaN or infinity"
+        )
+    return outputs
 
 
 def reception_threshold(
@@ -194,19 +254,16 @@ def reception_threshold(
     if aid is not None:
         function = load_compensator(aid) if isinstance(aid, str | Path) else aid
         aids.append(partial(function, **sliders))
-    test = _Test(
-        draw_triplets(triplets, torch.Generator().manual_seed(seed)),
-        load_simulator(simulator),
-        load_listener(listener),
-        noise_spl,
+    test = DigitTest.draw(
+        triplets, simulator=simulator, listener=listener, noise_spl=noise_spl, seed=seed
     )
     total = len(aids) * len(ears)
     estimates: list[Estimate] = []
-    with torch.inference_mode(), loud_outputs():
-        for tested_aid in aids:
-            for ear in ears:
-                show(len(estimates), total)
-                estimates.append(test.measure(ear, tested_aid))
+    shipped = isinstance(aid, str | Path)
+    for tested_aid in aids:
+        for ear in ears:
+            show(len(estimates), total)
+            estimates.append(test.measure(ear, tested_aid, aid_in_threads=shipped))
     show(total, total)
 
     def in_shape_of_ears(values: Any) -> Any:
