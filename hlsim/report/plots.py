@@ -229,9 +229,11 @@ def ears_picture(
     def draw(axes: Any) -> None:
         for number, aid in enumerate(aids):
             shift = 0.6 * (number + 0.5) / len(aids) - 0.3
-            own = [(ears.index(ear) + shift, value) for ear, name, value in values if name == aid]
-            places = [place for place, _ in own]
-            points, low, high = np.array([value for _, value in own]).T
+            points_of_aid = [
+                (ears.index(ear) + shift, value) for ear, name, value in values if name == aid
+            ]
+            places = [place for place, _ in points_of_aid]
+            points, low, high = np.array([value for _, value in points_of_aid]).T
             # A label that begins with an underscore would be hidden.
             axes.plot(places, points, "o", color=colours[aid], label=f" {fill(aid, 26)}")
             axes.vlines(places, low, high, colors=[colours[aid]])

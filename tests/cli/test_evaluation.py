@@ -40,7 +40,8 @@ CALLS = {
 EXPECTED: dict[str, Any] = {
     "speech": "a", "noise": "b", "items": 5, "seconds": 1.5, "levels": [55.0, 75.0],
     "teacher": "my:teacher", "inputs": ["as-is", "compensated"], "enhancers": ["my:e"],
-    "simulator": "neuro-msbg-light", "gain_ears": ["N1"], "srt": True, "clean": "a", "before": "b", "after": "c",
+    "simulator": "neuro-msbg-light", "gain_ears": ["N1"],
+    "srt": True, "clean": "a", "before": "b", "after": "c",
     "manifest": "d", "root": "e", "baseline": "noisy", "better_ear": True, "spl": 60.0,
     "conditions": {"A": "a", "B": "b"}, "outputs": {"A": "a", "B": "b"},
     "microphones": [1, 3], "scenes": "a", "listeners": "b", "scenes_listeners": "c",
