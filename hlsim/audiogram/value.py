@@ -47,7 +47,8 @@ class Audiogram:
 
     Args:
         levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or
-            NaN was not measured, and is left out.
+            NaN was not measured, and is left out. A mapping or a ``Series`` of pandas that names
+            the frequencies is accepted, too, see ``as_audiogram``.
         frequencies: Ascending frequencies from 100 to 20000 Hz; by default 250, 500, 1000, 2000,
             3000, 4000, 6000 and 8000, the ``FREQUENCIES``.
 
@@ -66,6 +67,14 @@ class Audiogram:
     frequencies: tuple[float, ...] = FREQUENCIES
 
     def __post_init__(self) -> None:
+        names_frequencies = isinstance(self.levels, Mapping) or hasattr(self.levels, "to_dict")
+        ear = None
+        if names_frequencies and self.frequencies is FREQUENCIES:
+            ear = find_audiogram(self.levels)
+        if ear is not None:
+            object.__setattr__(self, "levels", ear.levels)
+            object.__setattr__(self, "frequencies", ear.frequencies)
+            return
         levels, frequencies = _as_array(self.levels), _as_array(self.frequencies)
         if len(levels) != len(frequencies):
             raise ValueError(

@@ -156,6 +156,13 @@ def test_a_series_is_an_ear_by_position_frequency_or_column() -> None:
     assert as_audiogram(by_hz) == as_audiogram({1000: 40, 4000: 60})
     row = pandas.Series({"listener": "A", "500 Hz": 35, "4 kHz": 60.0})
     assert as_audiogram(row) == as_audiogram({500: 35, 4000: 60})
+    for series in (by_hz, row, pandas.Series(n3.levels), pandas.Series(n3.levels[::-1], range(8))):
+        assert Audiogram(series) == as_audiogram(series)
+    octaves = pandas.Series(
+        [10, 20, 30, 40, 50, 60, 70, 80], [125, 250, 500, 1e3, 2e3, 4e3, 6e3, 8e3]
+    )
+    assert Audiogram(octaves).frequencies[0] == 125.0, "frequencies count, not positions"
+    assert Audiogram({500: 20, 4000: 50}) == as_audiogram({500: 20, 4000: 50})
     with pytest.raises(ValueError, match="DataFrame"):
         as_audiogram(pandas.DataFrame({"500 Hz": [20]}))
 
