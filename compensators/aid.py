@@ -144,7 +144,12 @@ class Aid(nn.Module):
         return as_thresholds(ears, highest=self.highest_level)
 
     def resolve_thresholds(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
-        """Return the thresholds with which a waveform is processed, see ``resolve_thresholds``."""
+        """Return the thresholds of the passed ears, or of the stored ones, for a waveform.
+
+        See ``hlsim.audiogram.thresholds.resolve_thresholds`` for shapes and errors.
+
+        Returns: Thresholds in dB HL on the waveform's device, (..., 8).
+        """
         return resolve_thresholds(
             self.thresholds,
             audiogram,

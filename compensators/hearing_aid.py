@@ -18,6 +18,7 @@ from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checkpoint import HubModel
+from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.torchtools import built_in_float32
 
 DEFAULT_NOISE_REDUCTION = 0.5
@@ -31,9 +32,6 @@ QUIET_FADE_DB = 15.0
 
 INITIAL_REDUCTION_LOGIT = -3.0
 """Initial logit of noise reduction: 5 % of the largest attenuation."""
-
-CATCH_UP_SPL = 105.0
-"""Level in dB SPL at which MSBG's recruitment ends."""
 
 NO_GAIN_SPL = 100.0
 """Level of a band in dB SPL from which on the restoring gain is 0.

@@ -153,12 +153,17 @@ def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Itera
 
 @contextmanager
 def _open_audio(path: str | Path) -> Iterator[soundfile.SoundFile]:
-    """Open an audio file; what soundfile raises in the ``with`` block becomes a ValueError."""
+    """Open an audio file.
+
+    A missing file raises ValueError, and each exception in the ``with`` block becomes one.
+    """
     if not Path(path).is_file():
         raise ValueError(f"{path}: there is no such audio file; correct the path")
     try:
         with soundfile.SoundFile(path) as file:
             yield file
+    except ValueError:
+        raise
     except Exception as error:  # For broken files, soundfile raises exceptions of many types.
         raise ValueError(f"{path}: cannot be read as audio: {error}") from error
 

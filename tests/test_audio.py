@@ -158,6 +158,10 @@ def test_parts_of_a_recording_are_read_and_written_as_the_whole_one(tmp_path: Pa
     write_parts(tmp_path / "parts.wav", consecutive, 2, 5000, 16000)
     expected = (tmp_path / "whole.wav").read_bytes()
     assert (tmp_path / "parts.wav").read_bytes() == expected
+    write_audio(tmp_path / "whole.wav", samples[:, :4000], 16000)
+    with pytest.raises(ValueError, match=r"whole\.wav: the file has changed; run again$") as raised:
+        list(read_parts(recording, bounds))
+    assert str(raised.value).count("whole.wav") == 1
     scipy.io.wavfile.write(tmp_path / "scipy.wav", 16000, samples.mT.numpy())
     assert (tmp_path / "scipy.wav").read_bytes() == expected
 

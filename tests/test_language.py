@@ -49,6 +49,15 @@ DESCRIPTION = re.compile(r"^\s*[a-z_]\w*(?:, \w+)*: (?P<text>[A-Za-z]\w*)")
 """A parameter or an attribute in a docstring, and the first word of its description."""
 
 
+def test_no_file_has_the_marks_of_a_conflict() -> None:
+    folders = ("hlsim", "compensators", "checkpoints", "docs", "examples", "tests")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*")]
+    texts = [*ROOT.glob("*.*"), *(path for path in files if path.suffix in {".md", ".py", ".js"})]
+    mark = re.compile(r"^(<{7}|>{7}) ", re.MULTILINE)
+    marked = [path for path in texts if path.is_file() and mark.search(path.read_text("utf-8"))]
+    assert marked == []
+
+
 def find_problems(source: str) -> Iterator[tuple[str, int, str]]:
     """Yield the rule, the line and the text of every violation in a module's source."""
     tree = ast.parse(source)

@@ -97,11 +97,12 @@ class Live:
         return getattr(self.stream, "sliders", {})
 
     def press(self, key: str) -> None:
-        """Move a slider by 0.1.
+        """Move a slider by 0.1, within 0 to 1.
 
         Args:
             key: One of ``KEYS``: n and N for less and more noise reduction, a and A for less and
-                more amplification. Other keys have no effect.
+                more amplification. Other keys, and keys of a slider that the stream does not have,
+                have no effect.
         """
         for name, (down, up) in KEYS.items():
             if key in (down, up) and name in self._sliders:

@@ -274,7 +274,15 @@ class QualityReference(Reference):
         noise: Tensor | None,
         extent: Extent,
     ) -> tuple[Tensor, Tensor]:
-        """Add noise to the motion, delay its channels, and compute ``segment_spectra``."""
+        """Add noise to the motion, delay its channels, and compute ``segment_spectra``.
+
+        Args:
+            motion: Motion of the channels, (items, channels, padded).
+            delays: Delays in samples, (items, channels).
+            channels: The channels.
+            noise: Noise with standard deviation 1 of all channels, or None for no noise.
+            extent: Lengths of the items. Samples after the longest are left out.
+        """
         motion = motion[..., : extent.longest]
         if noise is not None:
             amplitude = self._unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0)

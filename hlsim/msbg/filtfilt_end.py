@@ -116,8 +116,9 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
         denominator: Three coefficients 1, a1, a2.
 
     Returns:
-        Weights, (2, 4096), and oscillations, (samples, 2), which run backwards in time from
-        ``AHEAD`` steps after the end.
+        Weights of the last 4096 samples, the last one last, (2, 4096), and oscillations in an
+        orthonormal basis, (AHEAD * STEP + 4096, 2), which run backwards in time from ``AHEAD``
+        steps after the end.
     """
     transition = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
     input_vector = numerator[1:] - denominator[1:] * numerator[0]

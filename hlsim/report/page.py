@@ -262,7 +262,7 @@ def write_page(
 ) -> Path:
     """Write a page as ``report.html`` and ``report.md``, and its data as ``report.json``.
 
-    Either all files are written or, for example because the disk is full, all stay as they were.
+    No file is replaced before all are on the disk, so that a full disk leaves all as they were.
 
     Args:
         page: The page.
@@ -273,9 +273,9 @@ def write_page(
     Returns: The path of ``report.html``.
 
     Raises:
-        ValueError: The files cannot be written.
-        TypeError: JSON cannot represent the data.
-        MissingExtraError: jinja2 is not installed.
+        ValueError: The files cannot be written, or the data hold NaN or infinity.
+        TypeError: The data hold an object that JSON cannot represent.
+        MissingExtraError: jinja2 is not installed, or for pictures matplotlib.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:

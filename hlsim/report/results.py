@@ -88,9 +88,10 @@ def mean_level(score: str) -> Callable[[DataFrame], Any]:
 
 
 def score_columns(evaluation: Evaluation) -> Columns:
-    """Return the columns of a table of scores: number of items, and means of scores and levels.
+    """Return the columns of a table of scores.
 
-    The level is that of the items that have the most important score.
+    They are the number of items, mean and standard deviation of each score, and the mean output
+    level in dB SPL. Number and level are those of the items that have the first score.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES, Condition
