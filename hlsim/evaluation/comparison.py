@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 PlannedComparison = tuple[str, str, str]
-"""A comparison that was planned before the scores were known: measure and both conditions."""
+"""A comparison that was planned before the scores were known: measure and both conditions.
+
+The order of the conditions does not matter.
+"""
 
 
 @dataclass(frozen=True)
@@ -117,10 +120,11 @@ def _adjust(
     comparisons: Sequence[ConditionComparison], planned: Collection[PlannedComparison]
 ) -> list[ConditionComparison]:
     """Mark the planned comparisons of a measure, and adjust the p values of all others."""
-    marked = [
-        replace(c, planned=len(comparisons) > 1 and (c.measure, c.before, c.after) in planned)
-        for c in comparisons
-    ]
+    planned_pairs = {(measure, frozenset(pair)) for measure, *pair in planned}
+    marked = []
+    for c in comparisons:
+        is_planned = (c.measure, frozenset((c.before, c.after))) in planned_pairs
+        marked.append(replace(c, planned=len(comparisons) > 1 and is_planned))
     family = [index for index, comparison in enumerate(marked) if not comparison.planned]
     adjusted_t = holm(marked[index].p_t for index in family)
     adjusted_w = holm(marked[index].p_w for index in family)

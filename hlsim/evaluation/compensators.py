@@ -12,7 +12,8 @@ from torch import nn
 
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import Audiogram, as_audiogram
+from hlsim.audiogram.value import EarLike
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checks import check_attributes
 from hlsim.data.clips import Clips
@@ -52,7 +53,7 @@ def evaluate_compensators(
     speech: str | Path,
     store: str | Path | None = None,
     audiograms: str | Path | None = None,
-    audiogram: Audiogram | None = None,
+    audiogram: EarLike | None = None,
     noise: str | Path | None = None,
     enhancers: Sequence[str] = (),
     simulator: str | Path = "neuro-msbg",
@@ -136,7 +137,8 @@ def evaluate_compensators(
                 "audiogram and audiograms (--audiogram, --audiograms) exclude each other; pass one "
                 "of them"
             )
-        ears_of_aids = {ear_name(audiogram): audiogram}
+        ear = as_audiogram(audiogram)
+        ears_of_aids = {ear_name(ear): ear}
         ears = list(ears_of_aids.items())
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
     utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))

@@ -188,13 +188,14 @@ class RecordedItem:
 
 
 def _file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file, which is read again only if its size or time has changed."""
+    """Return the SHA-256 of a file, which is read again only if its size or times have changed."""
     state = path.stat()
-    return _hash_of_state(path, state.st_size, state.st_mtime_ns)
+    # Copying may set the time of modification, but not that of the change.
+    return _hash_of_state(path, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
 
 
 @lru_cache(maxsize=65536)
-def _hash_of_state(path: Path, size: int, time: int) -> str:
+def _hash_of_state(path: Path, *state: int) -> str:
     return sha256(path)
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import Audiogram, as_audiogram
 from hlsim.audiogram.scale import EARS
+from hlsim.audiogram.value import EarLike
 from hlsim.evaluation.comparison import PlannedComparison, compare
 from hlsim.evaluation.conditions import AFTER, BEFORE
 from hlsim.evaluation.measures import ALIGNMENT, LEVELS, find_lag, find_measures
@@ -42,7 +43,7 @@ def haspi_report(
     clean: str | Path | None = None,
     before: str | Path | None = None,
     after: str | Path | None = None,
-    audiogram: Audiogram | None = None,
+    audiogram: EarLike | None = None,
     *,
     conditions: Mapping[str, str | Path] | None = None,
     audiograms: str | Path | DataFrame | None = None,
@@ -116,15 +117,16 @@ def haspi_report(
             "expected either the folders before and after or named conditions, got both; name all "
             "folders as conditions"
         )
+    ear = None if audiogram is None else as_audiogram(audiogram)
     folders = {BEFORE: before, AFTER: after, **(conditions or {})}
     outputs = {name: folder for name, folder in folders.items() if folder is not None}
     if manifest is None and clean is not None and outputs:
         if root is not None:
             raise ValueError("root has no effect on folders; leave it out, or pass a manifest")
-        ears = _read_ears_of_folders(audiogram, audiograms)
+        ears = _read_ears_of_folders(ear, audiograms)
         recordings = read_folders(clean, outputs, ears, **settings)
     elif manifest is not None and clean is None and not outputs:
-        recordings = read_recordings(manifest, root, audiogram, audiograms, **settings)
+        recordings = read_recordings(manifest, root, ear, audiograms, **settings)
     else:
         raise ValueError(
             "expected either a manifest, or the folder clean with the folder after (and before) or "

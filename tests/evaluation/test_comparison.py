@@ -57,6 +57,7 @@ def test_the_p_values_of_all_but_planned_comparisons_are_adjusted() -> None:
     assert [c.p_t for c in pairs] == holm(c.overall.p_t for c in pairs)
     assert {(c.planned, c.family) for c in pairs} == {(False, 3)}
     pairs = compare(table(scores), ["haspi"], planned=[("haspi", "a", "c")])
+    assert compare(table(scores), ["haspi"], planned=[("haspi", "c", "a")]) == pairs
     planned, *adjusted = sorted(pairs, key=lambda c: not c.planned)
     assert (planned.before, planned.after, planned.p_t) == ("a", "c", planned.overall.p_t)
     assert [c.p_w for c in adjusted] == holm(c.overall.p_w for c in adjusted)

@@ -188,7 +188,8 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
         {"compensators": {"mine": NALR(full_scale_spl=100.0)}},
         {"items": 0},
         {"seconds": 0.01},
-        {"audiogram": Audiogram.standard("N7")},
+        {"audiogram": "N7"},
+        {"audiogram": 3},
         {"enhancers": ["no_such:module"]},
         {"audiograms": "ears.csv"},
     ):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +285,27 @@ def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
         path.write_bytes(b"no audio")
     with pytest.raises(ValueError, match="none of 2 items could be scored"):
         haspi_report(**folders(corpus), audiogram=N4)
+
+
+BY_FREQUENCY = dict(zip(N4.frequencies, N4.levels, strict=True))
+
+
+@pytest.mark.parametrize("ear", ["n4", [*N4.levels], BY_FREQUENCY])
+def test_an_ear_may_have_any_form(corpus: Path, ear: Any) -> None:
+    report = haspi_report(**folders(corpus), audiogram=ear, measures=["stoi"])
+    assert report.items[0].audiogram == N4
+
+
+def test_a_file_that_was_replaced_is_scored_again_whatever_its_time(corpus: Path) -> None:
+    path = corpus / "after" / "a.b.wav"
+    settings = {**folders(corpus), "audiogram": N4, "measures": ["stoi"]}
+    store, state = corpus / "scores.jsonl", path.stat()
+    before = haspi_report(**settings, store=store).table
+    waveform, rate = read_audio(path)
+    write_audio(path, waveform.roll(100, -1), rate)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+    after = haspi_report(**settings, store=store).table
+    assert (before["stoi"] != after["stoi"]).tolist() == [False, True, False, False]
 
 
 def test_links_to_one_clean_file_are_items_of_their_own(corpus: Path) -> None:
