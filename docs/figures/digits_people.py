@@ -276,6 +276,11 @@ def main() -> None:
     rows = [row for row in everything if row["seed"] == options.seed and row["person"] in names]
     tests = {name: [row for row in rows if row["simulator"] == name] for name in SIMULATORS}
     report(tests)
+    tested = [{row["person"] for row in rows} for rows in tests.values() if rows]
+    common = set.intersection(*tested)
+    if any(common < names for names in tested):
+        print("\nOnly people whom all ears have")
+        report({name: [row for row in tests[name] if row["person"] in common] for name in tests})
     for seed in sorted({row["seed"] for row in everything} - {options.seed}):
         report_retest(rows, [row for row in everything if row["seed"] == seed])
     draw(tests, everybody)
