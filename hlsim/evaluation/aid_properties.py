@@ -286,21 +286,27 @@ def measure_look_ahead(
     return largest
 
 
-def measure_reception_thresholds(aids: Aids, ears: Ears, reference: str, seed: int) -> Results:
+def measure_reception_thresholds(
+    aids: Aids, ears: Ears, reference: str, test: DigitTest
+) -> Results:
     """Measure how much noise ears tolerate with hearing aids, by a test with digits in noise.
 
     Args:
         aids: Hearing aids, each under its name.
         ears: Audiograms, each under its name.
         reference: Name of the aid, such as none, to which benefits are relative.
-        seed: Seed of digits and noises, which are the same for all ears and aids.
+        test: Test with the same digits and noises for all ears and aids.
 
     Returns:
         One dictionary per ear and aid, as ``measure_aids`` returns it, with ``threshold_db``, the
         signal-to-noise ratio at which half of the triplets are understood, and ``benefit_db``, the
         threshold with the reference minus that with the aid, both with their 95 % intervals.
+
+    >>> test = DigitTest.draw(30, simulator="attenuation")
+    >>> aids, ears = {"unaided": lambda signal, ear: signal}, {"N3": Audiogram.standard("N3")}
+    >>> measure_reception_thresholds(aids, ears, "unaided", test)[0]["benefit_db"].value
+    0.0
     """
-    test = DigitTest.draw(seed=seed)
     results = measure_aids(aids, ears, _measure_reception_threshold, test)
     unaided = {row["ear"]: row["threshold_db"] for row in results if row["aid"] == reference}
     for row in results:

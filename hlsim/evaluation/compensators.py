@@ -35,6 +35,7 @@ from hlsim.evaluation.conditions import (
     Unaided,
     load_enhancers,
 )
+from hlsim.evaluation.digits import DigitTest
 from hlsim.evaluation.items import INPUT_LEVELS, draw_aid_items, ear_name, read_ears
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
@@ -158,7 +159,7 @@ def evaluate_compensators(
     }
     if srt:
         details["reception_thresholds"] = measure_reception_thresholds(
-            with_unaided, ears_of_aids, UNAIDED, seed
+            with_unaided, ears_of_aids, UNAIDED, DigitTest.draw(seed=seed)
         )
     settings: dict[str, Any] = {
         "items": items,
