@@ -35,6 +35,8 @@ NOT_RUN = {
     "http.server": "does not end",
     "HLSIM_GOLDEN": "takes minutes, and .ci/run does the same",
     "push_to_hub": "needs a network",
+    "speechbrain": "needs the toolkit; tests/test_toolkits.py runs it",
+    "asteroid": "needs the toolkit; tests/test_toolkits.py runs it",
     "LightningModule": "is part of a program",
     "mine.ckpt": "is part of a program",
     "read_sas": "needs a file of NHANES; tests/audiogram/test_table.py runs it",

@@ -37,6 +37,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def test_the_wheel_is_small(wheel: Path) -> None:
+    assert wheel.stat().st_size < 20e6
+
+
 def requirements(name: str) -> set[str]:
     """Return the names of all distributions that a distribution requires without any extra."""
     names = set()
