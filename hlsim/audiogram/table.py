@@ -167,7 +167,10 @@ def _read_ears(
 ) -> dict[EarName | None, Audiogram]:
     """Return the audiograms of a row by ear, which its columns or its column ``ear`` name."""
     ears = ears_in_row(row, highest)
-    name = EAR_NAMES.get(row.get("ear", "").lower())
+    text = row.get("ear", "")
+    name = EAR_NAMES.get(text.lower())
+    if text and name is None:
+        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
     if None in ears:
         return {name: ears[None]}
     if name is not None:
@@ -189,7 +192,12 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
                 f"{rows[0][0]}: expected one column of each kind, got {other} and {column}; remove "
                 "one of them"
             )
-    is_long = {"frequency", "threshold"} <= columns.keys() and not threshold_columns(rows[0][1])
+    is_long = {"frequency", "threshold"} <= columns.keys()
+    if is_long and (others := threshold_columns(rows[0][1])):
+        raise ValueError(
+            f"{rows[0][0]}: expected thresholds in the column {columns['threshold']} alone, got "
+            f"some in {', '.join(others)} as well; remove one of both"
+        )
     return _widen(rows, columns["frequency"], columns["threshold"]) if is_long else rows
 
 

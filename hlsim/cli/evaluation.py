@@ -349,7 +349,9 @@ def _run_study(
     print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path.as_uri()}")
     failed = len(evaluation.failures)
     if failed:
+        first = evaluation.failures.iloc[0]
         text = (
-            f"{failed} of {len(evaluation.table)} outputs lack scores; the page lists the reasons"
+            f"{failed} of {len(evaluation.table)} outputs lack scores; the page lists the reasons, "
+            f"of which the first is: {first.failure}"
         )
         print(f"hlsim: {text}", file=sys.stderr)

@@ -81,20 +81,41 @@ def _prepare_quality(
     return kind(clean.samples, ear, **settings, whole_khz=True)
 
 
-def _score_for_ear(name: str, precision: torch.dtype, item: Item, output: Tensor) -> Values:
-    """Compute a score with pyclarity's noise, and with its rounding of the rate to whole kHz.
+def _clean_signal(item: Item, precision: torch.dtype) -> _CleanSignal:
+    """Return the clean signal of an item in a precision."""
+    samples = item.clean.to(precision)
+    return _CleanSignal(value_hash(samples), samples)
 
-    The clean signal is prepared once for all conditions, and for HASPI, which needs it in a normal
-    ear, for all ears.
-    """
-    samples, output = item.clean.to(precision), output.to(precision)
-    clean = _CleanSignal(value_hash(samples), samples)
-    level = item.sample_rate, item.full_scale_spl
-    draw: dict[str, Any] = {"noise": "seeded", "seed": item.seed}
-    if name == "haspi":
-        return {name: float(_prepare_haspi(clean, *level).score(output, item.ear, **draw))}
-    kind = HasqiReference if name == "hasqi" else HaaqiReference
-    return {name: float(_prepare_quality(kind, clean, *level, item.ear).score(output, **draw))}
+
+def _noise(item: Item) -> dict[str, Any]:
+    """Return how the noise of an item's ear is drawn: as pyclarity draws it."""
+    return {"noise": "seeded", "seed": item.seed}
+
+
+def _haspi(precision: torch.dtype, item: Item, output: Tensor) -> Tensor:
+    """Compute HASPI. The clean signal is prepared once for all conditions and ears."""
+    clean = _clean_signal(item, precision)
+    reference = _prepare_haspi(clean, item.sample_rate, item.full_scale_spl)
+    return reference.score(output.to(precision), item.ear, **_noise(item))
+
+
+def _quality(
+    kind: type[HasqiReference] | type[HaaqiReference],
+    precision: torch.dtype,
+    item: Item,
+    output: Tensor,
+) -> Tensor:
+    """Compute HASQI or HAAQI. The clean signal is prepared once for all conditions of an ear."""
+    clean = _clean_signal(item, precision)
+    reference = _prepare_quality(kind, clean, item.sample_rate, item.full_scale_spl, item.ear)
+    return reference.score(output.to(precision), **_noise(item))
+
+
+def _score_for_ear(
+    name: str, score: Callable[[Item, Tensor], Tensor], item: Item, output: Tensor
+) -> Values:
+    """Compute a score that depends on the ear, with pyclarity's rounding of the rate to kHz."""
+    return {name: float(score(item, output))}
 
 
 def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
@@ -104,7 +125,12 @@ def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tens
 
 def _ear_measure(name: str, bits: int = 32) -> Measure:
     """Return the measure of HASPI, HASQI or HAAQI in a precision, which stored scores state."""
-    compute = partial(_score_for_ear, name, PRECISIONS[bits])
+    scores: dict[str, Callable[..., Tensor]] = {
+        "haspi": _haspi,
+        "hasqi": partial(_quality, HasqiReference),
+        "haaqi": partial(_quality, HaaqiReference),
+    }
+    compute = partial(_score_for_ear, name, partial(scores[name], PRECISIONS[bits]))
     packages = ["numpy"]  # NumPy draws the ear's noise.
     settings = f"{bits} bits"
     return Measure(name, compute, packages, settings, uses_facts=False, scores=[name])

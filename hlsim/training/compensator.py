@@ -58,9 +58,6 @@ class CompensatorTraining(TrainingModule):
         elif isinstance(network, HearingAid) and not recipe.trains_noise_reduction():
             network.noise_reduction_network.requires_grad_(False)
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        return self.log_loss(self.compute_loss(batch))
-
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         self.measured_values.append(self.compute_loss(batch)[None])
 

@@ -18,6 +18,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.checkpoint import read_record
 from hlsim.simulators import BUILT_IN, PluginSimulator, load_simulator
+from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
 
 _WARM_UP_STEPS = 50
@@ -28,8 +29,8 @@ class TrainingModule(L.LightningModule):
     """Lightning module of both trainings: a network with its loss and its validation.
 
     The learning rate depends on the step alone, and the training ends with a validation after the
-    recipe's last step. Subclasses implement ``training_step``, which returns the result of
-    ``log_loss``; ``validation_step``, which appends to ``measured_values``; and ``summarise``.
+    recipe's last step. Subclasses implement ``compute_loss``; ``validation_step``, which
+    appends to ``measured_values``; and ``summarise``.
 
     Args:
         network: Network to train.
@@ -54,6 +55,10 @@ class TrainingModule(L.LightningModule):
         self.validation: dict[str, float] = {}
         self.measured_values: list[Tensor] = []
 
+    def compute_loss(self, batch: Batch) -> Tensor:
+        """Compute the loss of a batch, a scalar."""
+        raise NotImplementedError
+
     def summarise(self, values: Tensor) -> dict[str, float]:
         """Summarise the measured values of all validation batches.
 
@@ -65,12 +70,13 @@ class TrainingModule(L.LightningModule):
         """
         raise NotImplementedError
 
-    def log_loss(self, loss: Tensor) -> Tensor:
-        """Log the loss of a training step, and return it.
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Compute the loss of a batch, and log it.
 
         Raises:
             ValueError: The loss is not finite.
         """
+        loss = self.compute_loss(batch)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ValueError(

@@ -52,7 +52,8 @@ class SimulatorTraining(TrainingModule):
         super().__init__(network, recipe)
         self._teacher = (teacher,)  # in a tuple, because it is neither trained nor saved
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+    def compute_loss(self, batch: Batch) -> Tensor:
+        """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria."""
         target, perceived = self._simulate(batch)
         unit = target if self.recipe.unit_power == "truth" else batch["signal"]
         scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
@@ -64,7 +65,7 @@ class SimulatorTraining(TrainingModule):
             parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
         if set(weights) - {"snr", "log_spectrum"}:
             parts |= paper_parts(perceived, target)
-        return self.log_loss(weighted_sum(parts, weights).mean())
+        return weighted_sum(parts, weights).mean()
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         # ratio of the teacher's output to the network's error in dB

@@ -112,6 +112,8 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
         ("frequency,threshold\n500,20\n500,30\n", ["line 3", "500 Hz", "second"]),
         ("frequency,threshold\n500,20\n.5k,30\n", ["line 2", "same frequency"]),
         ("frequency,threshold\n1,20\n2,30\n", ["line 2", "1 Hz"]),
+        ("frequency,threshold,500 Hz\n1000,20,30\n", ["column threshold", "500 Hz", "remove"]),
+        ("listener,ear,500 Hz\nA,both,20\n", ["line 2", "left or right", "'both'"]),
     ],
 )
 def test_errors_name_the_file_and_the_cell(tmp_path: Path, text: str, words: list[str]) -> None:

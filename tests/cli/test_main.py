@@ -395,6 +395,7 @@ def test_haspi_report_of_a_manifest(
     printed = capsys.readouterr()
     assert printed.out.startswith("aided") and (out / "report.html").as_uri() in printed.out
     assert "1 of 4 outputs lack scores" in printed.err
+    assert "broken.wav: cannot be read" in printed.err.rpartition("the first is: ")[2]
     scores = [row["stoi"] for row in json.loads((out / "report.json").read_text())["rows"]]
     assert [score is None for score in scores] == [False, False, False, True]
     stored = (out / "scores.jsonl").read_text()
