@@ -169,9 +169,9 @@ def _read_ears(
     ears = ears_in_row(row, highest)
     text = row.get("ear", "")
     name = EAR_NAMES.get(text.lower())
-    if text and name is None:
-        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
     if None in ears:
+        if text and name is None:
+            raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
         return {name: ears[None]}
     if name is not None:
         raise ValueError(
@@ -193,10 +193,10 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
                 "one of them"
             )
     is_long = {"frequency", "threshold"} <= columns.keys()
-    if is_long and (others := threshold_columns(rows[0][1])):
+    if is_long and (wide_columns := threshold_columns(rows[0][1])):
         raise ValueError(
             f"{rows[0][0]}: expected thresholds in the column {columns['threshold']} alone, got "
-            f"some in {', '.join(others)} as well; remove one of both"
+            f"some in {', '.join(wide_columns)} as well; remove one of both"
         )
     return _widen(rows, columns["frequency"], columns["threshold"]) if is_long else rows
 
