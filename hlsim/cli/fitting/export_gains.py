@@ -14,7 +14,6 @@ def export_gains(parser: Parser) -> None:
     """Declare the options of the command ``export-gains``."""
     parser.set_command(
         _export_gains,
-        "--audiogram N3 --to csv",
         "--audiogram N3 --to camilladsp --level 70 --sample-rate 48000 --out aid.yml",
         "--audiogram N3 --to openmha --compensator wdrc --out gains.cfg",
     )
