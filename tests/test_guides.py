@@ -35,6 +35,7 @@ NOT_RUN = {
     "http.server": "does not end",
     "HLSIM_GOLDEN": "takes minutes, and .ci/run does the same",
     "push_to_hub": "needs a network",
+    "--srt": "takes minutes; tests/evaluation/test_compensators.py measures thresholds in noise",
     "speechbrain": "needs the toolkit; tests/test_toolkits.py runs it",
     "asteroid": "needs the toolkit; tests/test_toolkits.py runs it",
     "LightningModule": "is part of a program",

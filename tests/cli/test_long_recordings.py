@@ -70,7 +70,7 @@ import numpy as np, soundfile
 import compensators, hlsim.simulators
 from hlsim.cli.main import main
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-rate, minutes, command = int(sys.argv[2]), 15, sys.argv[3:]
+rate, minutes, command = int(sys.argv[2]), 5, sys.argv[3:]
 noise = 0.01 * np.random.default_rng(0).standard_normal((60 * rate, 2), dtype=np.float32)
 with soundfile.SoundFile(sys.argv[1] + "/in.wav", "w", rate, 2, "PCM_16") as file:
     for _ in range(minutes):
