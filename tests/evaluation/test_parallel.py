@@ -36,9 +36,9 @@ def test_a_single_task_needs_no_other_process() -> None:
 @pytest.mark.slow  # Processes take seconds to start, because they import hlsim.
 @pytest.mark.parametrize("settings", [{"jobs": 2}, {"jobs": 1, "in_processes": True}])
 def test_a_process_that_ends_costs_only_its_task(settings: dict[str, Any]) -> None:
-    results = dict(run_parallel(end_process_at_three, range(8), **settings))
+    results = dict(run_parallel(end_process_at_three, range(4), **settings))
     assert isinstance(results.pop(3), Crash)
-    assert results == {number: number**2 for number in (0, 1, 2, 4, 5, 6, 7)}
+    assert results == {number: number**2 for number in (0, 1, 2)}
 
 
 @pytest.mark.slow
