@@ -212,6 +212,9 @@ def compare_recruitment(path: Path, out: Path) -> None:
         row["full recruitment (dB SPL)"] = with_interval(part, full_recruitment, 0)
         table.append(row)
     print_table("Slope of UCL over threshold, dB per dB, all persons", pd.DataFrame(table))
+    line = censored_line(rows)
+    intercept, slope = line.coefficients
+    print(f"All frequencies: {intercept:.1f} + {slope:.2f} T, deviation {line.deviation:.1f} dB")
 
     even = rows[~is_odd]
     names = [*SIMULATORS, "line"]

@@ -114,8 +114,19 @@ def _quality(
 def _score_for_ear(
     name: str, score: Callable[[Item, Tensor], Tensor], item: Item, output: Tensor
 ) -> Values:
-    """Compute a score that depends on the ear, with pyclarity's rounding of the rate to kHz."""
+    """Compute a score that depends on the ear."""
     return {name: float(score(item, output))}
+
+
+_EAR_SCORES: dict[str, Callable[..., Tensor]] = {
+    "haspi": _haspi,
+    "hasqi": partial(_quality, HasqiReference),
+    "haaqi": partial(_quality, HaaqiReference),
+}
+"""Functions of precision, item and output that compute the scores for an ear, by their names.
+
+They draw noise as pyclarity does, and round the rate to whole kHz as it does.
+"""
 
 
 def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
@@ -125,19 +136,14 @@ def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tens
 
 def _ear_measure(name: str, bits: int = 32) -> Measure:
     """Return the measure of HASPI, HASQI or HAAQI in a precision, which stored scores state."""
-    scores: dict[str, Callable[..., Tensor]] = {
-        "haspi": _haspi,
-        "hasqi": partial(_quality, HasqiReference),
-        "haaqi": partial(_quality, HaaqiReference),
-    }
-    compute = partial(_score_for_ear, name, partial(scores[name], PRECISIONS[bits]))
+    compute = partial(_score_for_ear, name, partial(_EAR_SCORES[name], PRECISIONS[bits]))
     packages = ["numpy"]  # NumPy draws the ear's noise.
     settings = f"{bits} bits"
     return Measure(name, compute, packages, settings, uses_facts=False, scores=[name])
 
 
 MEASURES = {
-    **{name: _ear_measure(name) for name in ("haspi", "hasqi", "haaqi")},
+    **{name: _ear_measure(name) for name in _EAR_SCORES},
     "stoi": Measure(
         "stoi",
         partial(_score_signal, "stoi", fidelity.stoi),
@@ -183,7 +189,7 @@ def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
     measures = []
     for name in dict.fromkeys(names):
         measure = MEASURES[name] if name in MEASURES else load_measure(name)
-        if precision != 32 and name in ("haspi", "hasqi", "haaqi"):
+        if precision != 32 and name in _EAR_SCORES:
             measure = _ear_measure(name, precision)
         measures.append(measure)
     return measures

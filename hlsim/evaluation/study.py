@@ -317,7 +317,11 @@ def run_measures(
     tasks.sort(key=lambda task: task.source.clean_name)
     total = len(items) * len(conditions) * len(measures)
     report_progress(len(results), total)
-    running["in_processes"] = any(measure.may_crash for measure in measures)
+    # Compiled code behind a measure of a user's own may crash, too; one job keeps it debuggable.
+    isolates_own = running.get("jobs") != 1
+    running["in_processes"] = any(
+        measure.may_crash or (isolates_own and ":" in measure.name) for measure in measures
+    )
     while tasks:
         tasks_of_crashes = []
         for task, measured in run_parallel(_measure_item, tasks, **running):

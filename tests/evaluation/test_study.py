@@ -242,6 +242,19 @@ def test_a_crash_costs_only_its_score(items: list[Item]) -> None:
     assert "crash in compiled code" in table.failure[1]
 
 
+@pytest.mark.slow  # Processes take seconds to start.
+def test_a_crash_of_a_users_measure_does_not_end_a_study_of_one_item(
+    items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("crash.py").write_text(
+        "import os, signal\n\ndef crash(item, output):\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    table = run_study(items[:1], gains(1), [MEASURES[0], load_measure("crash:crash")])
+    assert table.peak.tolist() == pytest.approx([0.2])
+    assert "crash in compiled code" in table.failure[0]
+
+
 def test_only_missing_values_are_computed(items: list[Item], tmp_path: Path) -> None:
     path = tmp_path / "scores.jsonl"
     first = run_study(items, gains(1), MEASURES, store=ScoreStore(path), jobs=1)

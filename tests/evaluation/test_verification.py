@@ -90,6 +90,12 @@ def test_recordings_that_do_not_belong_together_are_refused() -> None:
         verify(speech[:8000], speech[:8000], "N3", RATE)
     with pytest.raises(ValueError, match="save the channel of the ear as a mono file"):
         verify(torch.stack([speech, speech]), speech, "N3", RATE)
+    with pytest.raises(ValueError, match="output holds samples that are NaN or infinite"):
+        verify(speech, speech * torch.nan, "N3", RATE)
+    with pytest.raises(ValueError, match="input_ is silent"):
+        verify(torch.zeros_like(speech), speech, "N3", RATE)
+    with pytest.raises(ValueError, match="expected input_ to be a floating-point tensor"):
+        verify((1000.0 * speech).short(), speech, "N3", RATE)
 
 
 def test_command_prints_a_table_and_writes_it_with_a_plot(

@@ -74,6 +74,7 @@ def _verify(options: argparse.Namespace) -> None:
 def _print_result(result: Verification) -> None:
     """Print a row per third octave, in dB SPL and dB, and the audible shares of speech."""
     rows = result.rows()
+    # Short labels, such as "in 30" for input_30, keep the table within the width of a terminal.
     labels = [name.replace("put_", " ").replace("_", " ") for name in rows[0]]
     print("  ".join(f"{label:>6}" for label in labels))
     for row in rows:

@@ -16,8 +16,9 @@ from torch import Tensor
 from compensators import load_compensator
 from hlsim.audiogram import FREQUENCIES, as_audiogram
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals, level_spl
-from hlsim.checks import check_rate
+from hlsim.checks import check_rate, check_waveform
 from hlsim.metrics.band_levels import normal_threshold
+from hlsim.metrics.pair import check_finite
 from hlsim.metrics.sii import SII_BANDS, sii
 
 Array = NDArray[np.float64]
@@ -111,8 +112,8 @@ def verify(
             that depend on the level are those for average speech at the level of the input.
 
     Raises:
-        ValueError: A signal has several channels or is too short, the lengths do not fit, or an
-            argument is not valid.
+        ValueError: A signal has several channels, NaN or infinity, or is too short; the input is
+            silent; the lengths do not fit; or an argument is not valid.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()
@@ -127,6 +128,10 @@ def verify(
             f"expected one channel each, got shapes {tuple(input_.shape)} and "
             f"{tuple(output.shape)}; save the channel of the ear as a mono file"
         )
+    for name, signal in (("input_", input_), ("output", output)):
+        check_finite(name, check_waveform(signal, name, full_scale_spl=full_scale_spl)[None])
+    if not bool(input_.any()):
+        raise ValueError("input_ is silent; pass the sound that the aid received")
     if min(len(input_), len(output)) < MIN_SECONDS * rate:
         raise ValueError("expected at least 1 s of sound; 15 s of speech and more are better")
     if abs(len(input_) - len(output)) > rate:
