@@ -16,8 +16,8 @@ FLOORS = [
     "report training",
     "evaluation losses export",
     "compensators simulators",
-    "data neuro",
-    "metrics msbg",
+    "neuro",
+    "data metrics msbg",
     "audiogram dsp calibration audio checkpoint",
     "checks files extras progress suggestions torchtools plugins version",
 ]

@@ -1,4 +1,4 @@
-"""Alignment in time of a channel of an output with the same channel of the clean signal."""
+"""Alignment in time of an output with the clean signal: first as a whole, then by channel."""
 
 from __future__ import annotations
 
@@ -12,10 +12,60 @@ from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.extent import Extent, integers
+from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 MAX_LAG = 2400
 """Largest time in samples, 100 ms, by which a channel of an output is shifted to be aligned."""
+
+HEADROOM = RATE // 500
+"""Samples, 2 ms, by which the output is late after alignment.
+
+An aid may delay some frequencies less than the whole signal; these would be early otherwise.
+"""
+
+
+def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
+    """Return the spectra of signals without their means, from which ``bulk_delays`` are computed.
+
+    Args:
+        signals: Signals at 24 kHz. Shape: (items, time).
+        extent: Number of samples of each item before padding.
+
+    Returns:
+        Spectra, long enough for correlations at all delays. Shape: (items, frequencies).
+
+    >>> spectrum_for_alignment(torch.randn(1, 100), Extent((100,))).shape
+    torch.Size([1, 101])
+    """
+    points = fft_length(2 * extent.longest, 2)
+    return torch.fft.rfft(extent.centred(signals.detach()), points)
+
+
+def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> Tensor:
+    """Return the delay that each output of an aid needs to lie 2 ms behind its clean signal.
+
+    The delay is found by the largest magnitude of the cross-covariance of the whole signals.
+
+    Args:
+        reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``.
+        output: Outputs at 24 kHz. Shape: (items, time).
+        extent: Number of samples of each item, equal for clean signals and outputs.
+
+    Returns:
+        Delays in samples; negative ones advance the output. Shape: (items,), int64.
+
+    >>> reference, extent = torch.randn(1, 100), Extent((100,))
+    >>> bulk_delays(spectrum_for_alignment(reference, extent), reference, extent)
+    tensor([48])
+    """
+    time, points = extent.longest, fft_length(2 * extent.longest, 2)
+    with torch.no_grad():
+        spectrum = reference_spectrum * spectrum_for_alignment(output, extent).conj()
+        covariance = torch.fft.irfft(spectrum, points).abs()
+        # in order of the lag, from 1 - time to time - 1
+        by_lag = torch.cat((covariance[:, points - time + 1 :], covariance[:, :time]), -1)
+        return by_lag.argmax(-1) - (time - 1) + HEADROOM
 
 
 def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hlsim.metrics.ear import input as ear_input
-from hlsim.metrics.ear.alignment import shift
+from hlsim.metrics.ear import alignment, ear_rate
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE, apply_filter, middle_ear
 
@@ -70,7 +69,7 @@ class CleanBatch:
         variance = self._extent.mean(self._extent.centred(signals).square())
         levels = 10.0 * variance.clamp_min(1e-30).log10() + full_scale_spl
         at_ear = self._to_ear_rate(signals)
-        first, last = ear_input.audible_ends(at_ear)
+        first, last = ear_rate.audible_ends(at_ear)
         lengths = (last - first + 1).tolist()
         for item, level, length in zip(
             range(len(clean))[items], levels.tolist(), lengths, strict=True
@@ -87,20 +86,20 @@ class CleanBatch:
                     f"{label} has sound for only {1000.0 * length / RATE:.2g} ms; expected "
                     f"{1000.0 * MIN_AUDIBLE_SAMPLES / RATE:g} ms or more; leave this signal out"
                 )
-        self._resampled = ear_input.at_ear_rate(self._extent, sample_rate)
-        self._spectrum = ear_input.spectrum_for_alignment(at_ear.to(self.dtype), self._resampled)
+        self._resampled = ear_rate.at_ear_rate(self._extent, sample_rate)
+        self._spectrum = alignment.spectrum_for_alignment(at_ear.to(self.dtype), self._resampled)
         self._first = first
         self.audible = Extent(tuple(lengths))
         self.signals = self._cut(at_ear, -first)
 
     def _to_ear_rate(self, signals: Tensor) -> Tensor:
         """Resample signals to 24 kHz, and convert them to multiples of 20 uPa."""
-        return ear_input.to_ear_rate(signals, self._rate, self._extent) * self._gain
+        return ear_rate.to_ear_rate(signals, self._rate, self._extent) * self._gain
 
     def _cut(self, at_ear: Tensor, delays: Tensor) -> Tensor:
         """Delay signals at 24 kHz, and cut them to the length of the audible parts."""
         audible = self.audible
-        return shift(at_ear, delays, self._resampled.ends, audible.ends, audible.padded)
+        return alignment.shift(at_ear, delays, self._resampled.ends, audible.ends, audible.padded)
 
     def align(self, output: Tensor) -> Tensor:
         """Return the parts of outputs that match the audible parts of the clean signals.
@@ -114,7 +113,7 @@ class CleanBatch:
         """
         at_ear = self._to_ear_rate(self._extent.cut(output[self.items].double()))
         waveform = at_ear.detach().to(self.dtype)
-        delays = ear_input.bulk_delays(self._spectrum, waveform, self._resampled)
+        delays = alignment.bulk_delays(self._spectrum, waveform, self._resampled)
         return self.through_middle_ear(self._cut(at_ear, delays - self._first))
 
     def through_middle_ear(self, signals: Tensor) -> Tensor:

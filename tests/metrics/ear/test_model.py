@@ -11,8 +11,8 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.metrics.ear import (
     alignment,
+    ear_rate,
     envelope_modulation as envelopes,
-    input as ear_input,
     model as ear_model,
     recursions as recursions,
 )
@@ -48,14 +48,14 @@ def of_clarity(name: str = "eb") -> object:
 def test_rate_and_alignment_are_those_of_pyclarity(pair: tuple[Tensor, Tensor], rate: int) -> None:
     eb = of_clarity()
     extent = Extent((len(pair[0]),))
-    clean, late = (ear_input.to_ear_rate(signal[None], rate, extent) for signal in pair)
+    clean, late = (ear_rate.to_ear_rate(signal[None], rate, extent) for signal in pair)
     before = [eb.resample_24khz(signal.numpy(), rate)[0] for signal in pair]
     np.testing.assert_allclose(clean[0].numpy(), before[0], rtol=0, atol=1e-12)
     expected = eb.input_align(*before)
-    extent = ear_input.at_ear_rate(extent, rate)
-    spectrum = ear_input.spectrum_for_alignment(clean, extent)
-    delay = ear_input.bulk_delays(spectrum, -late, extent)  # the sign does not count
-    first, last = ear_input.audible_ends(clean)
+    extent = ear_rate.at_ear_rate(extent, rate)
+    spectrum = alignment.spectrum_for_alignment(clean, extent)
+    delay = alignment.bulk_delays(spectrum, -late, extent)  # the sign does not count
+    first, last = ear_rate.audible_ends(clean)
     length = int(last - first) + 1
     for signal, moved, wanted in ((clean, -first, expected[0]), (late, delay - first, expected[1])):
         part = alignment.shift(signal, moved, extent.ends, (length,), length)
@@ -67,15 +67,15 @@ def test_padded_items_are_resampled_and_aligned_as_alone(rate: int) -> None:
     ends = (3000, 2001)
     extent = Extent(ends)
     signals = extent.cut(torch.randn(2, 3000, dtype=torch.float64))
-    batch = ear_input.to_ear_rate(signals, rate, extent)
-    both = ear_input.at_ear_rate(extent, rate)
+    batch = ear_rate.to_ear_rate(signals, rate, extent)
+    both = ear_rate.at_ear_rate(extent, rate)
     late = both.cut(batch.roll(40, -1))
-    delays = ear_input.bulk_delays(ear_input.spectrum_for_alignment(batch, both), late, both)
+    delays = alignment.bulk_delays(alignment.spectrum_for_alignment(batch, both), late, both)
     for item, end in enumerate(ends):
-        alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, Extent((end,)))[0]
+        alone = ear_rate.to_ear_rate(signals[item : item + 1, :end], rate, Extent((end,)))[0]
         torch.testing.assert_close(batch[item, : len(alone)], alone, rtol=0, atol=1e-13)
         assert not batch[item, len(alone) :].any()
-    assert (delays + 40 == ear_input.HEADROOM).all()
+    assert (delays + 40 == alignment.HEADROOM).all()
 
 
 def test_middle_ear_and_adaptation(pair: tuple[Tensor, Tensor]) -> None:

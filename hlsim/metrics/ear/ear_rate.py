@@ -1,8 +1,6 @@
 """Preparation of signals for Kates' ear, before its filters.
 
-Signals are resampled to 24 kHz, silence before and after the clean signal is found, and the delay
-of the whole output of an aid relative to the clean signal is measured. (Later, each channel of the
-ear is aligned once more; see ``alignment.align_channels``.)
+Signals are resampled to 24 kHz, and silence before and after the clean signal is found.
 """
 
 from __future__ import annotations
@@ -29,12 +27,6 @@ OUTPUTS_PER_ROW = 64
 
 RING_SAMPLES = 4096
 """Number of samples after which the response of the Chebyshev filters has vanished."""
-
-HEADROOM = RATE // 500
-"""Samples, 2 ms, by which the output is late after alignment.
-
-An aid may delay some frequencies less than the whole signal; these would be early otherwise.
-"""
 
 AUDIBLE_RATIO = 0.001
 """Magnitude, relative to the maximum, below which the clean signal is silent at its ends."""
@@ -153,46 +145,3 @@ def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
     loud = magnitude > AUDIBLE_RATIO * magnitude.amax(-1, keepdim=True)
     indices = torch.arange(time, device=references.device)
     return torch.where(loud, indices, time).amin(-1), torch.where(loud, indices, -1).amax(-1)
-
-
-def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
-    """Return the spectra of signals without their means, from which ``bulk_delays`` are computed.
-
-    Args:
-        signals: Signals at 24 kHz. Shape: (items, time).
-        extent: Number of samples of each item before padding.
-
-    Returns:
-        Spectra, long enough for correlations at all delays. Shape: (items, frequencies).
-
-    >>> spectrum_for_alignment(torch.randn(1, 100), Extent((100,))).shape
-    torch.Size([1, 101])
-    """
-    points = fft_length(2 * extent.longest, 2)
-    return torch.fft.rfft(extent.centred(signals.detach()), points)
-
-
-def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> Tensor:
-    """Return the delay that each output of an aid needs to lie 2 ms behind its clean signal.
-
-    The delay is found by the largest magnitude of the cross-covariance of the whole signals.
-
-    Args:
-        reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``.
-        output: Outputs at 24 kHz. Shape: (items, time).
-        extent: Number of samples of each item, equal for clean signals and outputs.
-
-    Returns:
-        Delays in samples; negative ones advance the output. Shape: (items,), int64.
-
-    >>> reference, extent = torch.randn(1, 100), Extent((100,))
-    >>> bulk_delays(spectrum_for_alignment(reference, extent), reference, extent)
-    tensor([48])
-    """
-    time, points = extent.longest, fft_length(2 * extent.longest, 2)
-    with torch.no_grad():
-        spectrum = reference_spectrum * spectrum_for_alignment(output, extent).conj()
-        covariance = torch.fft.irfft(spectrum, points).abs()
-        # in order of the lag, from 1 - time to time - 1
-        by_lag = torch.cat((covariance[:, points - time + 1 :], covariance[:, :time]), -1)
-        return by_lag.argmax(-1) - (time - 1) + HEADROOM
