@@ -166,14 +166,15 @@ def verification_picture(result: Verification) -> Picture:
     """
     limit = {"color": UNAIDED_COLOUR, "linestyle": "--"}
     curves: dict[str, Curve] = {"uncomfortable level": (result.hertz, result.uncomfortable, limit)}
-    for share, levels, style in zip(
-        PERCENTILES, result.output_levels, (":", "-", "--"), strict=True
-    ):
+    styles = (":", "-", "--")
+    for share, levels, style in zip(PERCENTILES, result.output_levels, styles, strict=True):
         line = {"color": _COLOURS[0], "linestyle": style}
         curves[f"output, {share} % of sections"] = (result.hertz, levels, line)
     curves["threshold"] = (result.hertz, result.thresholds, {"color": UNAIDED_COLOUR})
-    target = {"color": _COLOURS[1]}
-    curves["target for 65 %"] = (result.hertz, result.input_levels[1] + result.targets, target)
+    targets = result.input_levels + result.targets
+    for share, levels, style in zip(PERCENTILES, targets, styles, strict=True):
+        line = {"color": _COLOURS[1], "linestyle": style}
+        curves[f"target, {share} %"] = (result.hertz, levels, line)
     return curves_picture(curves, "Output of the aid in third octaves", "level (dB SPL)")
 
 

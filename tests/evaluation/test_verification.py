@@ -8,12 +8,12 @@ import torch
 
 import hlsim
 from compensators import NALR, WDRC
-from compensators.filter_bank import speech_density
+from compensators.filter_bank import SPEECH_SPECTRUM, speech_density
 from hlsim.audio import write_audio
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
-from hlsim.evaluation.fitting.verification import section_powers, verify
+from hlsim.evaluation.fitting.verification import prescribed_gains, section_powers, verify
 from hlsim.metrics.sii import INTERNAL_NOISE, SII_BANDS, sii
 
 RATE = 16000
@@ -66,11 +66,26 @@ def test_gains_are_those_of_a_known_compressor_at_three_levels(steady_noise: tor
         expected = aid.gains(level=level).numpy()
         expected = np.interp(np.log(SII_BANDS), np.log(FREQUENCIES), expected)
         assert np.abs(gains - expected)[at_audiogram].max() < 1.0
+    # The same compressor as a prescription has these gains as its targets, one per percentile.
+    assert np.abs(result.gains - result.targets)[:, at_audiogram].max() < 1.0
+    assert (result.targets[0] - result.targets[2])[at_audiogram].min() > 3.0
+
+
+def test_the_target_of_a_band_is_the_gain_at_its_own_level() -> None:
+    aid = WDRC()
+    audiogram = hlsim.Audiogram.standard("N3")
+    # Average speech at 70 dB SPL, of which the bands from 3150 Hz on are 20 dB louder.
+    louder = np.array([SPEECH_SPECTRUM[band] + 20.0 * (band > 2500) for band in SII_BANDS])
+    targets = prescribed_gains(aid, audiogram, louder)
+    for hertz, level in ((500, 70.0), (4000, 90.0)):
+        expected = aid.gains(audiogram, level)[FREQUENCIES.index(hertz)]
+        assert targets[SII_BANDS.index(hertz)] == pytest.approx(float(expected), abs=0.1)
 
 
 def test_targets_thresholds_and_scale() -> None:
     speech = hlsim.example_speech()
     result = verify(speech, NALR("N3")(speech), "N3", RATE)
+    assert np.ptp(result.targets, axis=0).max() < 1e-6  # a linear prescription
     upper = slice(SII_BANDS.index(1000), None)
     assert np.abs(result.gains - result.targets)[:, upper].max() < 1.0
     assert 0.0 < result.unaided_sii < result.aided_sii < 1.0
@@ -115,7 +130,9 @@ def test_command_prints_a_table_and_writes_it_with_a_plot(
     expected = verify(set_level(speech, 65.0), speech, "N3", RATE)
     assert float(at_1_khz["input_65"]) == pytest.approx(expected.input_levels[1, 8], abs=0.1)
     assert at_1_khz["gain_65"] == "6.0"
-    assert "uncomfortable level" in (tmp_path / "plot.svg").read_text()
+    assert at_1_khz["target_30"] == at_1_khz["target_99"] == "19.6"
+    plot = (tmp_path / "plot.svg").read_text()
+    assert all(label in plot for label in ("uncomfortable level", "target, 30 %", "target, 99 %"))
 
     write_audio(tmp_path / "out.wav", torch.cat([speech] * 3)[:130000], 48000)
     assert main(["verify", *files, "--audiogram", "N3"]) == 2

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from compensators import load_compensator
-from hlsim.audiogram import FREQUENCIES, as_audiogram
-from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals, level_spl
+from compensators.aid import Aid
+from compensators.filter_bank import SPEECH_SPECTRUM
+from hlsim.audiogram import FREQUENCIES, Audiogram, as_audiogram
+from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.metrics.band_levels import normal_threshold
 from hlsim.metrics.pair import check_finite
@@ -32,6 +34,9 @@ SECTION_SECONDS = 0.125
 MIN_SECONDS = 1.0
 """Shortest recording, in which the 99 % percentile is the loudest section."""
 
+TARGET_STEP = 5.0
+"""Distance in dB of the levels of speech at which a prescription is asked for its gains."""
+
 UNCOMFORTABLE_LEVEL = (88.8, 0.25)
 """Level in dB HL from which a tone is uncomfortable for a normal ear, and its rise per dB of loss.
 
@@ -47,7 +52,8 @@ class Verification:
         hertz: Centres of the third octaves, (bands,).
         input_levels: Levels of the input in dB SPL at the ``PERCENTILES``, (3, bands).
         output_levels: Levels of the output, (3, bands).
-        targets: Insertion gains in dB that the prescription gives, (bands,).
+        targets: Insertion gains in dB that the prescription gives at each percentile of the input,
+            (3, bands); equal at all three where the prescription is linear.
         thresholds: Thresholds of the ear in dB SPL, (bands,).
         uncomfortable: Uncomfortable levels in dB SPL as a line predicts them, (bands,).
         unaided_sii: Audible share of the input, 0 to 1.
@@ -76,12 +82,16 @@ class Verification:
     def rows(self) -> list[dict[str, float]]:
         """Return a row per third octave, with levels in dB SPL and gains in dB by name."""
         columns: dict[str, Array] = {"hertz": self.hertz}
-        tables = {"input": self.input_levels, "output": self.output_levels, "gain": self.gains}
+        tables = {
+            "input": self.input_levels,
+            "output": self.output_levels,
+            "gain": self.gains,
+            "target": self.targets,
+        }
         for name, table in tables.items():
             columns |= {
                 f"{name}_{share}": line for share, line in zip(PERCENTILES, table, strict=True)
             }
-        columns["target_gain"] = self.targets
         columns["threshold"] = self.thresholds
         columns["uncomfortable"] = self.uncomfortable
         table = np.stack([*columns.values()], 1).round(1).tolist()
@@ -108,8 +118,7 @@ def verify(
         ear: Audiogram of the ear.
         sample_rate: Sample rate of both in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
-        prescription: Aid whose gains are the targets: ``nalr``, ``wdrc``, or a checkpoint. Gains
-            that depend on the level are those for average speech at the level of the input.
+        prescription: Aid whose gains are the targets: ``nalr``, ``wdrc``, or a checkpoint.
 
     Raises:
         ValueError: A signal has several channels, NaN or infinity, or is too short; the input is
@@ -148,8 +157,6 @@ def verify(
     losses = _interpolate(audiogram.levels, audiogram.frequencies)
     normal = normal_threshold(hertz)
     base, slope = UNCOMFORTABLE_LEVEL
-    level = float(level_spl(gain * input_).clamp(0.0, 120.0))
-    prescribed = load_compensator(prescription).gains(audiogram, level)
     unaided_sii, aided_sii = (
         sii(_level(power.mean(0)) - _bandwidth_db(), thresholds=losses) for power in powers
     )
@@ -157,11 +164,49 @@ def verify(
         hertz=hertz,
         input_levels=input_levels,
         output_levels=output_levels,
-        targets=_interpolate(prescribed.tolist(), FREQUENCIES),
+        targets=prescribed_gains(load_compensator(prescription), audiogram, input_levels),
         thresholds=losses + normal,
         uncomfortable=base + slope * losses + normal,
         unaided_sii=unaided_sii,
         aided_sii=aided_sii,
+    )
+
+
+def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Array:
+    """Compute the insertion gains of an aid for levels in third octaves.
+
+    Each band stands for itself: its gain is that for average speech of the overall level at which
+    this band has its level. The gain is the static one: an aid that adapts slowly gives soft and
+    loud sections gains that lie closer together.
+
+    Args:
+        aid: Aid, linear or compressive.
+        audiogram: Audiogram of the ear.
+        band_levels: Levels in dB SPL, (..., 18).
+
+    Returns:
+        Gains in dB, (..., 18).
+
+    >>> import hlsim
+    >>> from hlsim import Audiogram, NALR, WDRC
+    >>> levels = np.full((3, 18), 20.0) + np.array([[0.0], [15.0], [30.0]])
+    >>> prescribed_gains(NALR(), Audiogram.standard("N3"), levels)[:, 8].round()  # at 1 kHz
+    array([20., 20., 20.])
+    >>> prescribed_gains(WDRC(), Audiogram.standard("N3"), levels)[:, 8].round()
+    array([27., 23., 17.])
+    """
+    spectrum = np.array([*SPEECH_SPECTRUM.values()])
+    total = 10.0 * np.log10((10.0 ** (spectrum / 10.0)).sum())
+    speech_levels = band_levels - [SPEECH_SPECTRUM[band] for band in SII_BANDS] + total
+    speech_levels = speech_levels.clip(0.0, 120.0)
+    first, last = speech_levels.min(), speech_levels.max()
+    steps = np.linspace(first, last, 1 + int(np.ceil((last - first) / TARGET_STEP)))
+    gains = np.stack(
+        [_interpolate(aid.gains(audiogram, level).tolist(), FREQUENCIES) for level in steps]
+    )
+    bands = range(len(SII_BANDS))
+    return np.stack(
+        [np.interp(speech_levels[..., band], steps, gains[:, band]) for band in bands], -1
     )
 
 
