@@ -38,6 +38,7 @@ NOT_RUN = {
     "--srt": "takes minutes; tests/evaluation/test_compensators.py measures thresholds in noise",
     "speechbrain": "needs the toolkit; tests/test_toolkits.py runs it",
     "asteroid": "needs the toolkit; tests/test_toolkits.py runs it",
+    "espnet2": "needs the toolkit; tests/test_toolkits.py runs it",
     "LightningModule": "is part of a program",
     "mine.ckpt": "is part of a program",
     "read_sas": "needs a file of NHANES; tests/audiogram/test_table.py runs it",

@@ -1,5 +1,10 @@
-"""The metric for VERSA scores utterances by VERSA's interface, which is copied as a fact."""
+"""The metric for VERSA scores utterances by VERSA's interface, which is copied as a fact.
 
+The copies follow versa/definition.py of VERSA's commit b7b9dd4. Where VERSA is installed, its own
+scorer scores a list of files.
+"""
+
+import json
 import sys
 from collections.abc import Iterator
 from enum import Enum
@@ -13,6 +18,7 @@ import pytest
 import torch
 
 import hlsim
+from hlsim.audio import write_audio
 from hlsim.calibration import level_spl
 from hlsim.metrics import haspi, mbstoi
 
@@ -58,13 +64,18 @@ def registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[Registry]:
     definition.MetricType = Enum("MetricType", "FLOAT DICT")
     monkeypatch.setitem(sys.modules, "versa", ModuleType("versa"))
     monkeypatch.setitem(sys.modules, "versa.definition", definition)
+    registry = Registry()
+    load_example().register_hearing_metric(registry)
+    yield registry
+
+
+def load_example() -> Any:
+    """Load the file that a user copies into VERSA."""
     spec = util.spec_from_file_location("hearing", FOLDER / "hearing.py")
     assert spec and spec.loader
     module = util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    registry = Registry()
-    module.register_hearing_metric(registry)
-    yield registry
+    return module
 
 
 def test_the_yaml_scores_an_utterance_as_hlsim_does(registry: Registry) -> None:
@@ -100,3 +111,32 @@ def test_settings_and_missing_signals_are_refused(registry: Registry) -> None:
         hearing({"audiogram": "N3", "measures": ["pesq"]})
     with pytest.raises(ValueError, match="must be provided"):
         hearing({"audiogram": "N3"}).compute(np.ones(16000))
+
+
+def test_the_scorer_of_versa_scores_a_kaldi_list(tmp_path: Path) -> None:
+    yaml = pytest.importorskip("yaml")
+    shared = pytest.importorskip("versa.scorer_shared", exc_type=ImportError)
+    definition = pytest.importorskip("versa.definition")
+    clean = hlsim.example_speech()[8000:20000]
+    output = hlsim.compensate(clean, "N3", compensator="nalr")
+    lists = []
+    for name, signal in (("clean", clean), ("output", output)):
+        write_audio(tmp_path / f"{name}.wav", 0.1 * signal, 16000)
+        lists.append(tmp_path / f"{name}.scp")
+        lists[-1].write_text(f"first {tmp_path}/{name}.wav\n")
+    registry = definition.MetricRegistry()
+    load_example().register_hearing_metric(registry)
+    scorer = shared.VersaScorer(registry)
+    clean_files, output_files = (
+        shared.audio_loader_setup(str(path), "soundfile") for path in lists
+    )
+    suite = scorer.load_metrics(yaml.safe_load((FOLDER / "hearing.yaml").read_text()))
+    (row,) = scorer.score_utterances(
+        output_files, suite, clean_files, output_file=str(tmp_path / "scores.jsonl"), io="soundfile"
+    )
+    scale = 10.0 ** ((65.0 - float(level_spl(clean))) / 20.0)
+    assert row["key"] == "first"
+    assert row["haspi"] == pytest.approx(
+        float(haspi(scale * output, scale * clean, "N3")), abs=0.01
+    )
+    assert json.loads((tmp_path / "scores.jsonl").read_text())["haspi"] == row["haspi"]
