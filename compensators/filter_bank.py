@@ -186,7 +186,8 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
 def frame_power(samples: Tensor) -> Tensor:
     """Compute the power spectrum of the last 16 ms (a frame) at the end of every 4 ms (a hop).
 
-    The sum over frequencies is the mean square of the windowed frame.
+    The sum over frequencies is the mean square of the frame, weighted by its squared window:
+    samples of 1 Pa give 1 Pa^2.
 
     Args:
         samples: Samples of whole hops in pascals, after the ``HISTORY`` = 192 samples before them

@@ -164,6 +164,8 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 def _average_over_stride(levels: Tensor, stride: int) -> Tensor:
     """Average twice over ``stride`` frames, which removes the decoder's pattern from steady input.
 
+    Before the first frame and after the last one, these are repeated.
+
     Shape: (items, frames, bands) -> the same.
     """
     padded = functional.pad(levels.mT, (stride - 1, stride - 1), mode="replicate")

@@ -327,15 +327,15 @@ class Wearable(Aid):
     ) -> Tensor:
         """Stack the values of the sliders, such as noise reduction, to one row per item.
 
-        Values on a GPU are not read, because the host would wait for the GPU. Those that are out of
-        range become NaN instead of raising an error.
+        Values on a GPU or in a compiled program are not read. Those that are out of range become
+        NaN instead of raising an error.
 
         Args:
             sliders: Value under each slider's name; by default those of ``SLIDERS``.
             batch: Leading dimensions of the signals and ears.
             like: Tensor whose dtype and device the result has.
 
-        Returns: Values from 0 to 1, (items, sliders).
+        Returns: Values from 0 to 1, (items, sliders), in the order of ``SLIDERS``.
 
         Raises:
             ValueError: A value is outside 0 to 1, or the aid has no such slider.
@@ -453,7 +453,11 @@ class Stream:
         return rest
 
     def _prepare(self, chunk: Tensor) -> None:
-        """Fit the aid to the ears with the first chunk, and read the sliders."""
+        """Fit the aid to the ears with the first chunk, and read the sliders.
+
+        Raises:
+            ValueError: The chunk has another shape than the first one.
+        """
         is_first = not self._state
         if is_first:
             self._shape = chunk.shape[:-1]

@@ -297,8 +297,9 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
 
     Links to files and folders are followed. A file that is found several times, because links lead
     to it or to a folder that contains it, is listed once, where it lies or else under one of its
-    paths, and a warning counts the others. Links may form a circle. Audio in formats that
-    libsndfile does not read, such as M4A, causes a warning.
+    paths, and a warning counts the links that are left out. Links may form a circle. Files are
+    audio if their names have one of the ``EXTENSIONS``. Audio in formats that libsndfile does not
+    read, such as M4A, causes a warning.
 
     Args:
         folder: Folder to search.
@@ -307,7 +308,7 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
 
     Raises:
         ValueError: There is no such folder, a folder in it cannot be read, there is no audio in it,
-            or a link in it leads nowhere.
+            or a link that is named like audio, or has no extension, leads nowhere.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> [path.name for path in find_audio(EXAMPLE_FILE.parent)][:1]

@@ -178,7 +178,11 @@ def read_record(name: str | Path) -> dict[str, Any]:
 
 
 def _find_folder(name: str | Path) -> Path:
-    """Return the folder of a checkpoint, also if the name is that of the folder of a training."""
+    """Return the folder of a checkpoint, also if the name is that of the folder of a training.
+
+    Raises:
+        ValueError: There is no such checkpoint.
+    """
     path = Path(str(name))
     for folder in (path, path / "checkpoint", checkpoints_folder() / path):
         if (folder / CONFIG).is_file():

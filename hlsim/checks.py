@@ -221,7 +221,7 @@ def check_waveform(
 
     Raises:
         ValueError: It is not a floating-point tensor with time last, has no samples, or has a
-            sample above 1e9.
+            sample whose magnitude is above 1e9 (unless another one is NaN or infinite).
 
     >>> check_waveform(torch.zeros(2, 16000)).shape
     torch.Size([2, 16000])

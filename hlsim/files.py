@@ -242,7 +242,11 @@ def warn_of_unused(columns: Collection[str], contents: str, known_columns: Colle
 
 
 def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns of a file, and the number and the texts of each line."""
+    """Return the names of the columns of a file, and the number and the texts of each line.
+
+    Raises:
+        ValueError: The file cannot be read, or has another encoding.
+    """
     try:
         with io.StringIO(_decode(path.read_bytes()), newline="") as file:
             header = file.readline()

@@ -203,7 +203,11 @@ def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
 
 
 def _import_file(path: Path) -> ModuleType:
-    """Import a file, which can import modules from its folder."""
+    """Import a file, which can import modules from its folder.
+
+    Raises:
+        ImportError: Python has no loader for the file.
+    """
     sys.path.insert(0, str(path.parent))
     spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:

@@ -222,7 +222,9 @@ def listen(
 
 
 def info() -> str:
-    """Return the versions of hlsim, Python and the packages it uses, for a bug report.
+    """Return versions for a bug report: hlsim, Python, operating system, packages, CUDA; threads.
+
+    Each stands on a line of its own.
 
     Example:
         >>> import hlsim
@@ -242,7 +244,11 @@ def info() -> str:
 
 
 def _as_finite_tensor(audio: Samples) -> Tensor:
-    """Return the samples as a tensor, without NaN and infinity."""
+    """Return the samples as a tensor, without NaN and infinity.
+
+    Raises:
+        ValueError: A sample is NaN or infinite.
+    """
     samples = as_samples(audio)
     invalid = int((~samples.isfinite()).sum())
     if invalid:

@@ -108,7 +108,11 @@ def read_listeners(
 
 
 def _read_entries(path: str | Path) -> _Builders:
-    """Read Clarity's ``listeners.json``, and return functions that build the listeners."""
+    """Read Clarity's ``listeners.json``, and return functions that build the listeners.
+
+    Raises:
+        ValueError: The file is no JSON, or has another structure.
+    """
     try:
         text = Path(path).read_text(encoding="utf-8")
         entries = json.loads(text, object_pairs_hook=reject_duplicates)
@@ -123,7 +127,11 @@ def _read_entries(path: str | Path) -> _Builders:
 
 
 def _group_rows(path: str | Path | Any) -> _Builders:
-    """Read the rows of a table, and return functions that build the listeners."""
+    """Read the rows of a table, and return functions that build the listeners.
+
+    Raises:
+        ValueError: A row has no name of a listener, or an error of ``_read_ears``.
+    """
     rows: dict[str, list[_Row]] = {}
     for place, row in _read_rows(path):
         name = row.get("listener")
@@ -165,7 +173,12 @@ def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
 def _read_ears(
     row: Mapping[str, str], highest: float = HIGHEST_LEVEL
 ) -> dict[EarName | None, Audiogram]:
-    """Return the audiograms of a row by ear, which its columns or its column ``ear`` name."""
+    """Return the audiograms of a row by ear, which its columns or its column ``ear`` name.
+
+    Raises:
+        ValueError: The column ``ear`` has another word than left, right or both, or columns name
+            the ear as well.
+    """
     ears = ears_in_row(row, highest)
     text = row.get("ear", "")
     name = EAR_NAMES.get(text.lower())
@@ -182,7 +195,11 @@ def _read_ears(
 
 
 def _read_rows(table: str | Path | Any) -> list[_Row]:
-    """Read the rows of a table of ears, and join those of a long one."""
+    """Read the rows of a table of ears, and join those of a long one.
+
+    Raises:
+        ValueError: Columns contradict each other.
+    """
     rows = read_table(table, "audiograms", ("listener", "ear"))
     columns: dict[str, str] = {}
     for column in rows[0][1]:
@@ -214,6 +231,10 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         rows: Rows of the table.
         frequency: Name of the column of frequencies in Hz.
         threshold: Name of the column of thresholds in dB HL.
+
+    Raises:
+        ValueError: A column is missing, a frequency is no number, or an ear has two thresholds at
+            one frequency.
     """
     names = [column for column in rows[0][1] if column not in (frequency, threshold)]
     has_ears = {"listener", "ear"} <= set(names)

@@ -73,6 +73,9 @@ def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None
 
     The result is ``None`` for a tensor, a sequence of tensors, and a value that does not describe
     ears.
+
+    Raises:
+        ValueError: A listener lacks an ear.
     """
     if isinstance(audiogram, Tensor):
         return None

@@ -313,7 +313,11 @@ def find_audiogram(ear: Any) -> Audiogram | None:
 
 
 def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
-    """Convert a mapping from frequencies in Hz to thresholds in dB HL into an audiogram."""
+    """Convert a mapping from frequencies in Hz to thresholds in dB HL into an audiogram.
+
+    Raises:
+        ValueError: It is no mapping of numbers.
+    """
     try:
         frequencies = sorted(levels, key=float)
     except (TypeError, ValueError):
@@ -448,7 +452,11 @@ def _check_remark(text: str, column: str) -> None:
 
 
 def _parse_level(text: str, column: str, highest: float) -> float:
-    """Convert the text of a threshold, which may have a decimal comma, into a number."""
+    """Convert the text of a threshold, which may have a decimal comma, into a number.
+
+    Raises:
+        ValueError: The text is no number, or one out of range.
+    """
     try:
         level = float(text.replace(",", "."))
     except ValueError:
@@ -463,7 +471,11 @@ def _parse_level(text: str, column: str, highest: float) -> float:
 
 
 def _as_array(values: Any) -> NDArray[np.float64]:
-    """Convert a sequence of numbers into an array with NaN in place of ``None``."""
+    """Convert a sequence of numbers into an array with NaN in place of ``None``.
+
+    Raises:
+        ValueError: It is no sequence of numbers.
+    """
     try:
         numbers = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):

@@ -258,7 +258,11 @@ def _read_labels(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _named_folder(text: str) -> tuple[str, Path]:
-    """Convert NAME=FOLDER to the name and the folder."""
+    """Convert NAME=FOLDER to the name and the folder.
+
+    Raises:
+        argparse.ArgumentTypeError: The text has no ``=``.
+    """
     name, _, folder = text.partition("=")
     if not name or not folder:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=FOLDER")
@@ -266,7 +270,11 @@ def _named_folder(text: str) -> tuple[str, Path]:
 
 
 def _by_name(named_folders: Sequence[tuple[str, Path]], option: str) -> dict[str, Path]:
-    """Return folders by their names, which must differ."""
+    """Return folders by their names, which must differ.
+
+    Raises:
+        ValueError: Two of them have the same name.
+    """
     folders = dict(named_folders)
     if len(folders) < len(named_folders):
         raise ValueError(f"two of {option} have the same name; rename one")

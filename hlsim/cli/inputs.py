@@ -98,7 +98,12 @@ def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
 
 
 def _read_listener(text: str) -> Listener:
-    """Read the value of ``--listener``, which is FILE or FILE:NAME."""
+    """Read the value of ``--listener``: FILE, which has exactly one listener, or FILE:NAME.
+
+    Raises:
+        ValueError: NAME is missing although the file has several listeners, the listener lacks an
+            ear, or the file cannot be read as a table of listeners.
+    """
     from hlsim.audiogram.table import read_listeners
 
     file, name = text, ""

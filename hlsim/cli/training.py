@@ -97,7 +97,11 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
 
 def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keyword arguments that both training functions have."""
+    """Return the keyword arguments that both training functions have.
+
+    Raises:
+        ValueError: There is a root without a manifest.
+    """
     from hlsim.training.batches import TrainingData
 
     names = ("noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms", "workers")

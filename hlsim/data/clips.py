@@ -241,6 +241,9 @@ def hash_source(source: AudioFiles) -> str:
 
 
 def _find_pairs(source: AudioFiles) -> list[tuple[Path | None, Path]]:
-    """Return the files of a source, each with its clean version if it stands for noise."""
+    """Return pairs of a clean version and a file: None and the file for a plain recording.
+
+    A pair of clean and noisy speech stands for the noise between them.
+    """
     files = find_audio(source) if isinstance(source, str | Path) else source
     return [file if isinstance(file, tuple) else (None, file) for file in files]

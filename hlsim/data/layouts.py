@@ -240,7 +240,12 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
 
 
 def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
-    """Read utterances from the paths of files, which must all match the pattern of a layout."""
+    """Read utterances from the paths of files, which must all match the pattern of a layout.
+
+    Raises:
+        ValueError: A file does not match the pattern, or lacks its counterpart; or two folders or
+            files claim one place.
+    """
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}
     file_of: dict[tuple[str, str], str] = {}  # by condition and key

@@ -262,7 +262,11 @@ def _read_pairs(
 
 
 def _read_names(path: Path) -> list[tuple[str, str]]:
-    """Return the names of scenes and listeners in ``scenes_listeners.json``."""
+    """Return the names of scenes and listeners in ``scenes_listeners.json``.
+
+    Raises:
+        ValueError: The file cannot be read, or has another structure.
+    """
     try:
         text = path.read_text(encoding="utf-8")
         entries = json.loads(text, object_pairs_hook=reject_duplicates)

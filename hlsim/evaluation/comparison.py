@@ -136,7 +136,11 @@ def _adjust(
 def _compare_pair(
     table: DataFrame, measure: str, before: str, after: str, unit: str
 ) -> ConditionComparison | None:
-    """Compare two conditions, or return None if no item has both scores."""
+    """Compare ``after`` with ``before`` over the items that have both scores; None without any.
+
+    The table has columns ``item``, ``condition`` and the measure, and may have ``level`` and the
+    unit. The p values are not adjusted.
+    """
     scores = table.pivot(index="item", columns="condition", values=measure)[[before, after]]
     pairs = scores.dropna()
     if pairs.empty:

@@ -199,8 +199,8 @@ def _make_conditions(
 ) -> list[Condition]:
     """Return the conditions, each of which is compared with all earlier ones.
 
-    They are: unaided; each prescription, followed by its enhanced versions; and each trained aid,
-    after NAL-R and the equaliser at its level, followed by its enhanced versions.
+    They are: unaided; each prescription, followed by its enhanced versions; and for each trained
+    aid NAL-R and the equaliser at its level, its enhanced versions, and then the aid itself.
 
     Args:
         aids: Prescriptions, NAL-R among them, and trained aids, each under its name.
@@ -231,6 +231,9 @@ def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
     """Return the evaluations of clean speech and of speech in noise, by name.
 
     An item that lacks a value in one condition is in no group.
+
+    Raises:
+        ValueError: No item has all values.
     """
     table = evaluation.table[~evaluation.table["item"].isin(evaluation.failures["item"])]
     if table.empty:

@@ -268,6 +268,9 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
     Args:
         audiograms: Table of ears, see ``read_audiograms``, or Clarity's ``listeners.json``.
 
+    Raises:
+        ValueError: An ear has several rows.
+
     >>> read_named_ears("standard")[0]
     ('N1', '', Audiogram('N1'))
     """
@@ -291,7 +294,11 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
 
 
 def _files_by_name(folder: str | Path) -> dict[str, Path]:
-    """Return the audio files of a folder by their path below it, without extension."""
+    """Return the audio files of a folder by their path below it, without extension.
+
+    Raises:
+        ValueError: Two files differ in their extension only.
+    """
     files: dict[str, Path] = {}
     for path in find_audio(folder, by_name=True):
         name = path.relative_to(folder).with_suffix("").as_posix()
@@ -392,6 +399,9 @@ def _read_row(
         listeners: Listeners by their name.
         audiogram: The ear if the row has no audiogram and ``listeners`` does not have its listener.
         settings: Further arguments of the recording.
+
+    Raises:
+        ValueError: A value is missing or not understood, or the ear is given twice or not at all.
     """
     for column in _REQUIRED_COLUMNS:
         if not row[column]:
@@ -433,7 +443,11 @@ def _read_row(
 
 
 def _parse_snr(text: str) -> float:
-    """Return the SNR in dB of a text such as "5", "2,5 dB" or "inf" (in quiet); NaN of no text."""
+    """Return the SNR in dB of a text such as "5", "2,5 dB" or "inf" (in quiet); NaN of no text.
+
+    Raises:
+        ValueError: The text is no number.
+    """
     number = text.lower().removesuffix("db").strip().replace(",", ".")
     if not number:
         return math.nan

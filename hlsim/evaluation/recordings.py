@@ -156,7 +156,11 @@ def haspi_report(
 def _read_ears_of_folders(
     audiogram: Audiogram | None, audiograms: Any
 ) -> list[tuple[str, str, Audiogram]]:
-    """Return the ears of files in folders, each with the names of listener and ear."""
+    """Return the ears of files in folders, each with the names of listener and ear.
+
+    Raises:
+        ValueError: There is neither an audiogram nor a table of them, or both.
+    """
     if (audiogram is None) == (audiograms is None):
         raise ValueError(
             "expected the ear of the files in folders (audiogram, --audiogram) or a table of ears "

@@ -332,7 +332,8 @@ class HearingLossLoss(nn.Module):
         The arguments are the results of ``_prepare``.
 
         Returns:
-            One tensor per part, of the shape of the leading dimensions.
+            Values of each part by its name, without weights and not yet reduced. Their shape is
+            that of the leading dimensions to which signals and ears broadcast.
         """
         limited = output
         if any(criterion.limits_gradient for criterion in self.criteria.values()):

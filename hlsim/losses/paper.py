@@ -146,7 +146,7 @@ class _FadedPhaseDifference(torch.autograd.Function):
 def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:
     """Return the real and the imaginary part of spectra.
 
-    Near silence, where the angle is rounding, the real part is small and positive.
+    Near silence, where the angle is rounding, a small positive number replaces the real part.
     """
     # Contiguous, because torch takes twenty times as long with interleaved numbers.
     real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()

@@ -130,6 +130,9 @@ class Reference(ABC):
 
         Args:
             audiogram: One ear, or one for each item.
+
+        Raises:
+            ValueError: The number of ears is neither 1 nor that of the items.
         """
         shape = self._clean.shape[:-1]
         ears = resolve_thresholds(None, audiogram, self._clean, highest=HIGHEST_LEVEL)

@@ -82,7 +82,11 @@ def _masking(speech: NDArray[np.float64], noise: NDArray[np.float64], hertz: NDA
 
 
 def _as_levels(levels: ArrayLike) -> NDArray[np.float64]:
-    """Return levels as an array of shape (18,)."""
+    """Return levels as an array of shape (18,).
+
+    Raises:
+        ValueError: The shape is another one.
+    """
     array = np.asarray(levels, dtype=float)
     if array.shape != (len(SII_BANDS),):
         raise ValueError(

@@ -357,6 +357,9 @@ def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
     """Return the thresholds of each item's ears on the CPU.
 
     Shape: (items, sides, 8) dB HL.
+
+    Raises:
+        ValueError: The shape of the ears fits neither all items nor each of them.
     """
     if isinstance(audiogram, Tensor):
         audiogram = audiogram.cpu()  # a level out of range is an error there, and NaN on a GPU

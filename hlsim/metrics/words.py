@@ -128,7 +128,7 @@ def load_curve() -> Curve:
 
 
 def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = None) -> WordsChange:
-    """Predict from HASPI how many words a new listener understands with two aids.
+    """Predict from HASPI the shares of words that a new listener understands with two aids.
 
     The interval of 90 % contains the differences between listeners, aids and sentences, and the
     uncertainty of the coefficients. In a test with listeners that were left out of the fit, 88 to
@@ -142,6 +142,10 @@ def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = No
             enhancement challenge (one interfering sound; two or three, and a head that moves). At
             the same HASPI, fewer words were understood in the second one. By default, the
             difference between two such tests is a part of the uncertainty.
+
+    Returns:
+        Mean shares of words (0 to 1) with each aid, the second minus the first, and the limits
+        between which this change lies for 90 % of new listeners.
 
     Raises:
         ValueError: There are no scores, or they have another shape or are outside 0 to 1, or there

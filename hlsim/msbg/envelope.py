@@ -164,8 +164,9 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
     """Compute the envelopes of band-pass signals at 44.1 kHz, their magnitudes that vary slowly.
 
-    The signals are rectified and low-passed without delay. One value is computed for every 24
-    samples. The signals are treated as periodic: their end is followed by their beginning.
+    The signals are rectified and low-passed without delay. One value is computed for the first
+    sample of every 24. The signals are treated as periodic: their end is followed by their
+    beginning.
 
     Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), where
         time is a multiple of 24.

@@ -86,8 +86,8 @@ def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
         offset: Samples from the first sample of the last step to the last sample of the signal.
 
     Returns:
-        Oscillations, (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps after the end
-        of the signal.
+        Oscillations at the first sample of each step, in the order of time, (channels, 170, 2).
+        The last of the 170 steps is ``AHEAD`` steps after the last step of the signal.
     """
     sampled = _oscillations(bank)[1][:, offset::STEP]
     return sampled[:, LOOK_BACK // STEP - 1 :: -1]

@@ -128,7 +128,10 @@ def from_cochlea(
 
 @constant
 def _inward_block_response() -> NDArray[np.complex128]:
-    """Compute the response of outer and middle ear at 44.1 kHz in blocks, complex (2049,)."""
+    """Compute the frequency response of outer and middle ear at 44.1 kHz, complex (2049,).
+
+    It is for ``filter_in_blocks``, whose transforms have ``BLOCK_POINTS`` points.
+    """
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 

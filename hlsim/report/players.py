@@ -142,7 +142,11 @@ def _describe_black(levels: Tensor) -> str:
 
 
 def _peak(group: Mapping[str, Tensor]) -> float:
-    """Return the largest magnitude of a sample in a group of signals."""
+    """Return the largest magnitude of a sample in a group of signals.
+
+    Raises:
+        ValueError: All signals are silent.
+    """
     peak = max(float(signal.abs().max()) for signal in group.values())
     if not peak:
         raise ValueError(

@@ -185,7 +185,11 @@ class DigitTest:
 
 
 def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) -> Tensor:
-    """Compute the outputs of an aid for a portion of signals, and check them."""
+    """Compute the outputs of an aid for a portion of signals, and check them.
+
+    Raises:
+        ValueError: The outputs have another shape, or samples that are not finite.
+    """
     inputs = signals[portion]
     outputs = aid(inputs, ear)
     if outputs.shape != inputs.shape or not bool(outputs.isfinite().all()):

@@ -55,7 +55,11 @@ class _Fitting(NamedTuple):
     sample_rate: int
 
     def gains(self, level: float) -> Array:
-        """Measure the insertion gains in dB for speech at a level in dB SPL, (8,)."""
+        """Measure the insertion gains in dB for speech at a level in dB SPL, (8,).
+
+        Raises:
+            ValueError: The aid has several ears.
+        """
         gains = self.aid.gains(self.ear, level).double().cpu().numpy()
         if gains.ndim != 1:
             raise ValueError(f"expected one ear to export, got {len(gains)}; export one at a time")

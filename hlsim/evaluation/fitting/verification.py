@@ -213,14 +213,16 @@ def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Arra
 def section_powers(signal: Tensor, sample_rate: int) -> Array:
     """Compute the power of a signal in third octaves, in each section of 125 ms.
 
-    Of a band that ends above the Nyquist frequency, the part below it stands for the whole one.
+    Sections overlap by half, and have a Hann window whose loss of power is compensated. Samples
+    after the last whole section are left out. Of a band that ends above the Nyquist frequency, the
+    part below it stands for the whole one.
 
     Args:
-        signal: Samples in pascals, (time,).
+        signal: Samples in pascals, (time,), of 125 ms or more.
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Powers in Pa^2, (sections, 18).
+        Powers in Pa^2 in the third octaves ``SII_BANDS``, (sections, 18).
 
     >>> import torch
     >>> tone = (2.0 * torch.pi * 1000.0 * torch.arange(16000) / 16000).sin()

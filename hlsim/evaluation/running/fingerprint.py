@@ -151,7 +151,8 @@ def _hash_source(kind: type) -> str | None:
 def _attributes(module: nn.Module) -> dict[str, Any]:
     """Return the attributes of a module without those that every module has.
 
-    Private attributes of hlsim and torch are values that calls have computed.
+    Private attributes are left out if the class belongs to hlsim, torch or Python, because calls
+    have computed them. Parameters, buffers and submodules are not included.
     """
     return {
         name: value

@@ -128,7 +128,11 @@ def run_parallel(
 
 
 def _connect(scheduler: str) -> Any:
-    """Return a client of the Dask scheduler at an address."""
+    """Return a client of the Dask scheduler at an address.
+
+    Raises:
+        ValueError: No scheduler answers.
+    """
     distributed = require("distributed", "cluster")
     try:
         return distributed.Client(scheduler, set_as_default=False, timeout=CONNECTION_TIMEOUT)

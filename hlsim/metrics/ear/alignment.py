@@ -104,7 +104,8 @@ def align_channels(
 ) -> Tensor:
     """Shift each channel of an output to where it correlates best with the clean signal.
 
-    Channels are shifted by whole samples, from -2399 to 2400. The shifts are constants for the
+    Channels are delayed by whole samples at 24 kHz, from -2399 to 2400 (100 ms), or by fewer than
+    the longest item has. Samples from outside of an item are 0. The shifts are constants for the
     gradient.
 
     Args:
