@@ -13,6 +13,7 @@ PATTERNS = (
     "examples/**/*.py",
     "examples/**/*.yaml",
     "examples/*.csv",
+    "examples/integrations/*/README.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
