@@ -1,13 +1,16 @@
-"""Compare simulated ears with people: uncomfortable levels, tuning, and words at a HASPI.
+"""Compare simulated ears with people: loudness, tuning, and words at a HASPI.
 
     python examples/people.py PEOPLE [OUT]
 
 It prints the tables of docs/people.md and draws its figures to the folder OUT, by default
-``people``. PEOPLE is a folder with up to three tables; a comparison without its table is left out.
+``people``. PEOPLE is a folder with up to four tables; a comparison without its table is left out.
 
 - ``thresholds_in_noise.csv``: ``person``, thresholds (``left_500``) and uncomfortable levels
   (``ucl_left_500``) in dB HL, such as those of the Oldenburg Hearing Health Record (Jafri et al.
   2025, doi 10.5281/zenodo.16919812, CC BY 4.0).
+- ``loudness.csv``, of the same record: ``person``, thresholds in dB HL (``left_1500`` and others),
+  and ``mlow_left`` and ``mlow_right``, slopes of the lower part of the loudness function of Brand
+  and Hohmann (2002) in categorical units per dB, means of noises around 1.5 and 4 kHz.
 - ``tuning.csv``: ``ear``, ``group`` (normal or impaired), ``frequency_hz``,
   ``threshold_500ms_db_spl`` and ``tuning_depth_db``, as measured by Lecluyse et al. (2013).
 - ``clarity_responses.csv``: see ``docs/figures/fit_words.py``.
@@ -29,6 +32,7 @@ import people_recruitment as recruitment
 import people_tuning as tuning
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.optimize import brentq
 from torch import nn
 
 from hlsim import MSBG, Audiogram, load_pretrained
@@ -45,8 +49,8 @@ SIMULATORS: dict[str, Callable[[], nn.Module]] = {
     "neuro-msbg": lambda: load_pretrained("neuro-msbg"),
 }
 
-TUNED = ("MSBG", "MSBG without smearing", "linear ear")
-"""Simulators whose tuning is measured. Networks have not learned from tones that short."""
+THREE_EARS = ("MSBG", "MSBG without smearing", "linear ear")
+"""Simulators without the network, which has not learned from sounds that short."""
 
 COLOURS = dict(zip(SIMULATORS, ("tab:blue", "tab:cyan", "tab:gray", "tab:purple"), strict=True))
 
@@ -58,6 +62,12 @@ TUNING_GROUPS = ((-20, 20), (20, 30), (30, 40), (40, 50), (50, 75))
 
 INTENDED = {"intended smearing": False, "intended, continuous": True}
 """Calculated tuning by name, and whether it follows the loss continuously."""
+
+NORMAL_THRESHOLD = 15.0
+"""Largest threshold in dB HL of an ear whose loudness counts as normal."""
+
+RECRUITING_THRESHOLD = 40.0
+"""Threshold in dB HL from which full recruitment is estimated from slopes."""
 
 FULL_RECRUITMENT_SPL = 105.0
 """Level in dB SPL at which MSBG's loudness is normal."""
@@ -259,6 +269,115 @@ def draw_recruitment(rows: pd.DataFrame, path: Path) -> None:
     save(figure, path)
 
 
+def compare_loudness(path: Path, out: Path) -> None:
+    """Compare the growth of loudness below the kink of simulated ears with that of people."""
+    rows = recruitment.read_loudness(path)
+    ears = list(rows.audiogram)
+    growths = out / "simulated-growth.csv"
+    simulate(
+        growths,
+        rows[["person", "ear", "threshold"]],
+        THREE_EARS,
+        lambda simulator: recruitment.growth_of_perceived_level(simulator, ears),
+    )
+    growth = pd.read_csv(growths)[[*THREE_EARS]].to_numpy()
+    is_odd = is_fitted(rows.person).to_numpy()
+    is_normal = is_odd & (rows.threshold <= NORMAL_THRESHOLD).to_numpy()
+    # A normal ear of this table has a loss of some dB, so its simulated growth is not quite one.
+    slope = rows.slope[is_normal].mean() / growth[is_normal].mean(0)
+    rows[[*THREE_EARS]] = growth * slope
+    print(f"\nFitted to {is_normal.sum()} ears of persons with odd numbers, slope at 0 dB HL:")
+    print({name: round(float(x), 3) for name, x in zip(THREE_EARS, slope, strict=True)})
+    line = np.polyfit(rows.threshold[is_odd], rows.slope[is_odd], 1)
+    rows["line"] = np.polyval(line, rows.threshold)
+    print(f"and the line of the slope over the threshold: {line[1]:.3f} + {line[0]:.5f} T")
+
+    even = rows[~is_odd]
+    names = [*THREE_EARS, "line"]
+    medians, biases, ranks = [], [], []
+    for label, mask in [*in_groups(even.threshold, LOSS_GROUPS), ("all", even.slope.notna())]:
+        part = even[mask]
+        first = {"threshold (dB HL)": label, "ears": len(part)}
+        low, middle, high = part.slope.quantile([0.25, 0.5, 0.75])
+        people = f"{middle:.2f} ({low:.2f} to {high:.2f})"
+        predicted = {name: f"{part[name].median():.2f}" for name in names}
+        medians.append(first | {"people": people} | predicted)
+        biases.append(first | _per_name(part, names, slope_bias, 0))
+        ranks.append(first | _per_name(part, ["threshold", *THREE_EARS[:2]], rank_correlation, 2))
+    print_table("Slope of loudness, median (middle half), even numbers", pd.DataFrame(medians))
+    print_table("Median slope compared with that of people in %", pd.DataFrame(biases))
+    print_table("Rank correlation with people's slopes", pd.DataFrame(ranks))
+    both = even.pivot(index="person", columns="ear", values=["slope", "threshold"]).dropna()
+    residual = np.log(both["slope"]) - np.log(np.polyval(line, both["threshold"]))
+    deviation = np.log(even.slope / even.line).quantile([0.16, 0.84]).round(2)
+    between_ears = residual.left.corr(residual.right, method="spearman")
+    print(f"Logarithm of slope over line, 16 and 84 %: {list(deviation)};", end=" ")
+    print(f"rank correlation of both ears of {len(both)} persons: {between_ears:.2f}")
+
+    normal = dict(zip(THREE_EARS, slope, strict=True))["MSBG without smearing"]
+    impaired = even[even.threshold >= RECRUITING_THRESHOLD].assign(normal=normal)
+    level = with_interval(impaired, full_recruitment_of_slopes, 0)
+    limit = f"{RECRUITING_THRESHOLD:.0f} dB HL"
+    print(f"Full recruitment that would give people's slopes from {limit} on: {level} dB SPL")
+    draw_loudness(rows, out / "people-loudness.png")
+
+
+def _per_name(
+    rows: pd.DataFrame,
+    names: Sequence[str],
+    statistic: Callable[[pd.DataFrame, str], float],
+    digits: int,
+) -> dict[str, str]:
+    """Return a statistic with its interval for each column."""
+    return {name: with_interval(rows, lambda p, n=name: statistic(p, n), digits) for name in names}
+
+
+def slope_bias(rows: pd.DataFrame, name: str) -> float:
+    """Return by how many percent the median predicted slope exceeds that of people."""
+    return 100.0 * (rows[name].median() / rows.slope.median() - 1.0)
+
+
+def rank_correlation(rows: pd.DataFrame, name: str) -> float:
+    """Return the rank correlation of a column with people's slopes."""
+    return float(rows.slope.corr(rows[name], method="spearman"))
+
+
+def full_recruitment_of_slopes(rows: pd.DataFrame) -> float:
+    """Return the level in dB SPL of full recruitment with which MSBG would have people's slopes.
+
+    An ear that grows by R / (R - loss) dB per dB for full recruitment at R has an effective loss,
+    which follows from its growth in MSBG without smearing, where R is 105 dB SPL. The median ratio
+    of measured and predicted slopes is 1 at the returned level.
+    """
+    growth = rows["MSBG without smearing"] / rows.normal
+    loss = FULL_RECRUITMENT_SPL * (1.0 - 1.0 / growth)
+
+    def median_difference(level: float) -> float:
+        return float(np.median(np.log(rows.slope / rows.normal * (level - loss) / level)))
+
+    return float(brentq(median_difference, loss.max() + 0.1, 1000.0))
+
+
+def draw_loudness(rows: pd.DataFrame, path: Path) -> None:
+    """Draw the slope of loudness over the threshold: people as dots, simulated ears as lines."""
+    figure = Figure(figsize=(9.2, 4.0), layout="constrained")
+    axes = figure.subplots()
+    jitter = np.random.default_rng(0).uniform(-1.0, 1.0, len(rows))
+    axes.scatter(rows.threshold + jitter, rows.slope, s=4, color="tab:orange", alpha=0.3)
+    centres = rows.threshold.round(-1)
+    is_group = centres.map(centres.value_counts()) >= 5
+    groups = rows[is_group].groupby(centres[is_group])
+    people = groups.slope.median()
+    axes.plot(people.index, people, color="tab:orange", linewidth=3, label="people, median")
+    for name in THREE_EARS:
+        medians = groups[name].median()
+        axes.plot(medians.index, medians, color=COLOURS[name], label=f"{name}, median")
+    axes.set(xlabel="threshold, mean of 1.5 and 4 kHz (dB HL)", ylim=(0.0, 1.9))
+    axes.set(ylabel="slope of loudness (units per dB)")
+    axes.legend(fontsize="small", loc="upper left")
+    save(figure, path)
+
+
 # Tuning
 
 
@@ -270,17 +389,17 @@ def compare_tuning(path: Path, out: Path) -> None:
     simulate(
         stored,
         rows[["ear", "hz"]],
-        TUNED,
+        THREE_EARS,
         lambda simulator: tuning.tuning_depths(simulator, ears, hz),
     )
-    for name, values in pd.read_csv(stored)[[*TUNED]].items():
+    for name, values in pd.read_csv(stored)[[*THREE_EARS]].items():
         rows[name] = values.to_numpy()
 
     for name, is_continuous in INTENDED.items():
         rows[name] = tuning.intended_depths(
             ears, hz, rows.hearing_level, rows["MSBG without smearing"].to_numpy(), is_continuous
         )
-    names = [*TUNED, *INTENDED]
+    names = [*THREE_EARS, *INTENDED]
 
     table = []
     for frequency, part in rows.groupby("hz"):
@@ -364,7 +483,10 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
     flat = ears * len(tuning.NOISE_SPECTRUM_LEVEL)
     path = out / "simulated-tuning-flat.csv"
     simulate(
-        path, keys, TUNED, lambda simulator: tuning.tuning_depths(simulator, flat, list(keys.hz))
+        path,
+        keys,
+        THREE_EARS,
+        lambda simulator: tuning.tuning_depths(simulator, flat, list(keys.hz)),
     )
     simulated = pd.read_csv(path)
 
@@ -390,7 +512,7 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
         axes.errorbar(
             means.index, means, deviations, label="people, mean and SD of 3 or more", **style
         )
-        for name in TUNED:
+        for name in THREE_EARS:
             curve = simulated[simulated.hz == hz]
             axes.plot(curve.threshold, curve[name], color=COLOURS[name], label=f"{name}, flat loss")
         for limit in SEVERITY_LIMITS:
@@ -456,6 +578,7 @@ def compare_words(path: Path, out: Path) -> None:
 
 COMPARISONS = {
     "thresholds_in_noise.csv": compare_recruitment,
+    "loudness.csv": compare_loudness,
     "tuning.csv": compare_tuning,
     "clarity_responses.csv": compare_words,
 }

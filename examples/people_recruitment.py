@@ -1,9 +1,12 @@
-"""Loudness of people and of simulated ears: uncomfortable levels over the hearing loss.
+"""Loudness of people and of simulated ears over the hearing loss: discomfort, and growth below it.
 
 An ear's uncomfortable level (UCL) is the level in dB HL from which a tone is uncomfortably loud. A
 simulated ear has one, too: the level at which it perceives what a normal ear perceives at the
 normal UCL. With full recruitment up to the UCL it would not depend on the loss, and in a linear ear
 it rises by 1 dB per dB of loss.
+
+People with a loss also rate loudness on a scale of categories, and their ratings grow faster with
+the level. A simulated ear's growth is that of a normal ear times the growth of the perceived level.
 
 ``examples/people.py`` uses these functions.
 """
@@ -41,6 +44,15 @@ _ABOVE_NORMAL_DB = np.append(np.arange(-5.0, 30.0, 5.0), [60.0, 110.0])
 The highest ones are for the linear ear.
 """
 
+LOUDNESS_HZ = (1500, 4000)
+"""Centre frequencies of the noises whose loudness was rated."""
+
+_GROWTH_SPL = np.array([70.0, 90.0])
+"""Levels in dB SPL between which the growth of the perceived level is computed.
+
+They lie above most thresholds, and in MSBG the growth hardly depends on the level up to 100 dB SPL.
+"""
+
 _EARS_AT_ONCE = 16
 
 
@@ -66,11 +78,7 @@ def read_uncomfortable_levels(path: str | Path) -> pd.DataFrame:
     for _, person in pd.read_csv(path).iterrows():
         for ear in ("left", "right"):
             levels = {hz: person[f"{ear}_{hz}"] for hz in MEASURED_HZ}
-            limited = {
-                hz: min(max(level, LOWEST_LEVEL), HIGHEST_SIMULATED)
-                for hz, level in levels.items()
-                if not np.isnan(level)
-            }
+            limited = _limit(levels)
             for hz in FREE_FIELD_THRESHOLD_SPL:
                 ucl = person[f"ucl_{ear}_{hz}"]
                 if np.isnan(ucl) or not levels[hz] <= HIGHEST_SIMULATED:
@@ -78,6 +86,36 @@ def read_uncomfortable_levels(path: str | Path) -> pd.DataFrame:
                 audiogram = Audiogram(tuple(limited.values()), tuple(map(float, limited)))
                 rows.append((person.person, ear, audiogram, hz, levels[hz], ucl))
     return pd.DataFrame(rows, columns=["person", "ear", "audiogram", "hz", "threshold", "ucl"])
+
+
+def read_loudness(path: str | Path) -> pd.DataFrame:
+    """Read one row per ear: person, ear, audiogram, threshold and slope.
+
+    The threshold is the mean at ``LOUDNESS_HZ``. Thresholds are limited as in
+    ``read_uncomfortable_levels``. Ears are left out whose slope or threshold at one of these
+    frequencies was not measured, or whose threshold at one of them is above the range.
+    """
+    rows = []
+    for _, person in pd.read_csv(path).iterrows():
+        for ear in ("left", "right"):
+            levels = {hz: person.get(f"{ear}_{hz}", np.nan) for hz in MEASURED_HZ}
+            limited = _limit(levels)
+            rated = [levels[hz] for hz in LOUDNESS_HZ]
+            slope = person[f"mlow_{ear}"]
+            if np.isnan(slope) or not np.max(rated) <= HIGHEST_SIMULATED:
+                continue
+            audiogram = Audiogram(tuple(limited.values()), tuple(map(float, limited)))
+            rows.append((person.person, ear, audiogram, np.mean(rated), slope))
+    return pd.DataFrame(rows, columns=["person", "ear", "audiogram", "threshold", "slope"])
+
+
+def _limit(levels: dict[int, float]) -> dict[int, float]:
+    """Limit the measured thresholds to the range that simulators accept, and drop the others."""
+    return {
+        hz: min(max(level, LOWEST_LEVEL), HIGHEST_SIMULATED)
+        for hz, level in levels.items()
+        if not np.isnan(level)
+    }
 
 
 def fit_censored(design: Array, levels: Array, limit: float | Array = NOT_REACHED) -> CensoredFit:
@@ -162,18 +200,38 @@ def bootstrap(
 def tones(hz: float, spl: Array) -> Tensor:
     """Synthesise tones of 0.1 s at several levels in dB SPL. Shape: -> (levels, time)."""
     seconds = torch.arange(RATE // 10) / RATE
+    tone = np.sqrt(2.0) * torch.sin(2.0 * torch.pi * hz * seconds)
+    return _at_levels(tone, spl)
+
+
+def noises(hz: float, spl: Array) -> Tensor:
+    """Synthesise a third-octave noise of 0.3 s at several levels in dB SPL.
+
+    Shape: -> (levels, time)
+    """
+    count = 3 * RATE // 10
+    frequencies = np.fft.rfftfreq(count, 1.0 / RATE)
+    is_inside = np.abs(np.log2(np.maximum(frequencies, 1.0) / hz)) <= 1.0 / 6.0
+    phases = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, len(frequencies))
+    noise = np.fft.irfft(is_inside * np.exp(1j * phases), count)
+    noise /= np.sqrt(np.square(noise).mean())
+    return _at_levels(torch.tensor(noise, dtype=torch.float32), spl)
+
+
+def _at_levels(sound: Tensor, spl: Array) -> Tensor:
+    """Give a sound with an RMS value of 1 several levels in dB SPL, and ramps of 20 ms."""
+    seconds = torch.arange(len(sound)) / RATE
     ramp = (torch.minimum(seconds, seconds.flip(0)) / 0.02).clamp_max(1.0)
-    tone = ramp * torch.sin(2.0 * torch.pi * hz * seconds)
-    peaks = np.sqrt(2.0) * 10.0 ** ((spl - PASCAL_SPL) / 20.0)
-    return torch.tensor(peaks, dtype=torch.float32)[:, None] * tone
+    amplitudes = 10.0 ** ((spl - PASCAL_SPL) / 20.0)
+    return torch.tensor(amplitudes, dtype=torch.float32)[:, None] * ramp * sound
 
 
 @torch.no_grad()
-def perceived_levels(
-    simulator: nn.Module, ears: Sequence[Audiogram], hz: float, spl: Array
-) -> Array:
-    """Compute the perceived levels of tones in dB SPL. Shape: -> (ears, levels of the tones)."""
-    inputs = tones(hz, spl)
+def perceived_levels(simulator: nn.Module, ears: Sequence[Audiogram], inputs: Tensor) -> Array:
+    """Compute the perceived levels of sounds in dB SPL, without their first and last 30 ms.
+
+    Shape: inputs (sounds, time) -> (ears, sounds)
+    """
     levels = []
     for first in range(0, len(ears), _EARS_AT_ONCE):
         batch = [[ear] for ear in ears[first : first + _EARS_AT_ONCE]]
@@ -198,7 +256,20 @@ def simulated_uncomfortable_levels(
     """
     levels = normal_ucl + _ABOVE_NORMAL_DB
     spl = levels + FREE_FIELD_THRESHOLD_SPL[hz]
-    [normal] = perceived_levels(simulator, [Audiogram.standard("NH")], hz, spl)
+    [normal] = perceived_levels(simulator, [Audiogram.standard("NH")], tones(hz, spl))
     target = np.interp(normal_ucl, levels, normal)
-    perceived = perceived_levels(simulator, ears, hz, spl)
+    perceived = perceived_levels(simulator, ears, tones(hz, spl))
     return np.array([np.interp(target, level_of_ear, levels) for level_of_ear in perceived])
+
+
+def growth_of_perceived_level(simulator: nn.Module, ears: Sequence[Audiogram]) -> Array:
+    """Compute by how many dB the perceived level of a noise grows per dB of its level.
+
+    Returns:
+        Mean growth at ``LOUDNESS_HZ``, (ears,).
+    """
+    growths = []
+    for hz in LOUDNESS_HZ:
+        perceived = perceived_levels(simulator, ears, noises(hz, _GROWTH_SPL))
+        growths.append(np.diff(perceived)[:, 0] / np.diff(_GROWTH_SPL))
+    return np.mean(growths, axis=0)

@@ -44,6 +44,40 @@ def test_the_uncomfortable_level_follows_the_loss_in_a_linear_ear_and_hardly_in_
     assert (slopes > 0.1).all() and (slopes < 0.25).all()
 
 
+def test_loudness_grows_by_one_in_a_linear_ear_and_with_the_loss_in_msbg() -> None:
+    recruitment = load_example("people_recruitment.py")
+    linear = recruitment.growth_of_perceived_level(Attenuation(), FLAT_EARS)
+    np.testing.assert_allclose(linear, 1.0, atol=1e-3)
+    # Full recruitment at 105 dB SPL.
+    growth = recruitment.growth_of_perceived_level(MSBG(smearing=False), FLAT_EARS)
+    np.testing.assert_allclose(growth, [1.0, 105.0 / 85.0, 105.0 / 65.0], rtol=0.03)
+
+
+def test_slopes_of_a_known_full_recruitment_give_it_back() -> None:
+    people = load_example("people.py")
+    loss = np.linspace(40.0, 80.0, 99)
+    rows = pd.DataFrame({"slope": 0.3 * 120.0 / (120.0 - loss), "normal": 0.3})
+    rows["MSBG without smearing"] = 0.3 * 105.0 / (105.0 - loss)
+    assert abs(people.full_recruitment_of_slopes(rows) - 120.0) < 0.01
+
+
+def test_slopes_are_read_with_the_mean_threshold_of_their_frequencies(tmp_path: Path) -> None:
+    recruitment = load_example("people_recruitment.py")
+    columns = ["left_500", "left_1500", "left_4000", "right_1500", "right_4000"]
+    table = pd.DataFrame(
+        [("P001", 10.0, 20.0, 60.0, 30.0, None), ("P002", 10.0, 20.0, 110.0, 30.0, 40.0)],
+        columns=["person", *columns],
+    ).assign(mlow_left=0.5, mlow_right=[0.4, 0.3])
+    table.to_csv(tmp_path / "loudness.csv", index=False)
+    rows = recruitment.read_loudness(tmp_path / "loudness.csv")
+    # An ear without a threshold at 4 kHz and one with a threshold above the range are left out.
+    assert rows[["person", "ear", "threshold", "slope"]].values.tolist() == [
+        ["P001", "left", 40.0, 0.5],
+        ["P002", "right", 35.0, 0.3],
+    ]
+    assert rows.audiogram[0] == Audiogram((10.0, 20.0, 60.0), (500.0, 1500.0, 4000.0))
+
+
 def test_a_loss_costs_tuning_in_msbg_and_none_in_a_linear_ear() -> None:
     tuning = load_example("people_tuning.py")
     ears = [FLAT_EARS[0], FLAT_EARS[2]]
@@ -107,9 +141,13 @@ def _depths_with_a_step(
     return 20.0 - 0.2 * losses + 5.0 * (losses > 35.0)
 
 
+def _growth_of_msbg(simulator: nn.Module, ears: Sequence[Audiogram]) -> np.ndarray:
+    return np.array([105.0 / (105.0 - np.mean(ear.levels)) for ear in ears])
+
+
 def _write_people(folder: Path) -> None:
     random = np.random.default_rng(0)
-    people, tuned = [], []
+    people, loudness, tuned = [], [], []
     for number in range(1, 13):
         loss = 5.0 * number
         row = {"person": f"P{number:03d}"}
@@ -118,11 +156,14 @@ def _write_people(folder: Path) -> None:
             for hz in (500, 1000, 2000, 4000):
                 row[f"ucl_{ear}_{hz}"] = 90.0 + 0.2 * loss + 5.0 * random.standard_normal()
         people.append(row)
+        slope = 0.3 * 105.0 / (105.0 - loss)
+        loudness.append(row | {"mlow_left": slope, "mlow_right": slope})
         for hz in (500, 1000, 2000, 4000):
             group = "normal" if number < 4 else "impaired"
             depth = 20.0 - 0.2 * loss + random.standard_normal()
             tuned.append((f"T{number:03d}", group, hz, loss, depth))
     pd.DataFrame(people).to_csv(folder / "thresholds_in_noise.csv", index=False)
+    pd.DataFrame(loudness).to_csv(folder / "loudness.csv", index=False)
     columns = "ear group frequency_hz threshold_500ms_db_spl tuning_depth_db".split()
     pd.DataFrame(tuned, columns=columns).to_csv(folder / "tuning.csv", index=False)
 
@@ -139,6 +180,7 @@ def test_one_command_prints_and_draws(
     simulators: dict[str, Callable[[], nn.Module]] = dict.fromkeys(people.SIMULATORS, Attenuation)
     monkeypatch.setattr(people, "SIMULATORS", simulators)
     monkeypatch.setattr(people.tuning, "tuning_depths", _depths_with_a_step)
+    monkeypatch.setattr(people.recruitment, "growth_of_perceived_level", _growth_of_msbg)
     bootstrap = people.recruitment.bootstrap
     monkeypatch.setattr(
         people.recruitment, "bootstrap", lambda rows, statistic: bootstrap(rows, statistic, 3)
@@ -154,8 +196,9 @@ def test_one_command_prints_and_draws(
     assert "| 1.00 |" in slopes  # that of the linear ear
     steps = next(line for line in lines if line.startswith("| MSBG | 0.0 ["))
     assert steps.split("| ")[3].startswith("5.0 [")  # at 35 dB HL
-    for name in ("people-recruitment.png", "people-tuning.png", "simulated-ucl.csv"):
-        assert (out / name).stat().st_size > 0
+    assert "from 40 dB HL on: 105 [105, 105]" in first
+    for name in ("recruitment", "loudness", "tuning"):
+        assert (out / f"people-{name}.png").stat().st_size > 0
     monkeypatch.setattr(people, "SIMULATORS", dict.fromkeys(simulators, None))
     people.main(str(tmp_path), str(out))  # The simulated values are used again.
     assert capsys.readouterr().out == first
