@@ -196,8 +196,8 @@ def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHE
     if not accepted or int(sample_rate) != sample_rate:
         raise ValueError(
             f"expected a sample rate that is a whole number from {lowest} to {highest} Hz, got "
-            f"{describe(sample_rate)}; use signals at such a rate; "
-            "hlsim.load_audio(path, sample_rate=16000) resamples a recording to 16000 Hz"
+            f"{describe(sample_rate)}; resample the signals, in Python for example with "
+            "hlsim.load_audio(path, sample_rate=16000)"
         )
     return int(sample_rate)
 
@@ -238,7 +238,7 @@ def check_waveform(
         if HIGHEST_SAMPLE < peak < math.inf:
             raise ValueError(
                 f"expected samples of {name} up to {HIGHEST_SAMPLE:g}, got a peak of {peak:.3g}; "
-                f"scale {name} to pascals, for example with hlsim.load_audio"
+                f"scale {name} to pascals, in Python for example with hlsim.load_audio"
             )
         if full_scale_spl is not None:
             _warn_if_loud(waveform, name, peak, full_scale_spl)
@@ -299,9 +299,9 @@ def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: floa
         _has_warned_of_level = True
         warnings.warn(
             f"{name} has a level of {20.0 * math.log10(rms) + full_scale_spl:.0f} dB SPL; did you "
-            "forget calibration? Load files with hlsim.load_audio, scale samples with "
-            "hlsim.calibration.set_level, or pass full_scale_spl. There are no further warnings "
-            "of this kind",
+            "forget calibration? Set the level of the signals (--spl on the command line, "
+            "hlsim.load_audio or hlsim.calibration.set_level in Python), or declare their scale "
+            "(--full-scale-spl, full_scale_spl). There are no further warnings of this kind",
             stacklevel=3,
         )
 

@@ -13,7 +13,6 @@ import tempfile
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
@@ -187,7 +186,7 @@ def read_table(
 
     Raises:
         ValueError: The file cannot be read, there are no rows, a column appears twice, or a row has
-            too many values.
+            too many or too few values.
 
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_atomically(f"{folder}/ears.csv", "Name;500 Hz\\nA;20\\n")
@@ -214,10 +213,17 @@ def read_table(
                 f"{place}: expected {len(names)} values, one for each column of the "
                 f"header, got {len(texts)}; put values that contain the separator into quotes"
             )
-        pairs = zip_longest(names, texts[: len(names)], fillvalue="")
+        pairs = zip(names, texts, strict=False)
         values = {name: text.strip() for name, text in pairs if name}
-        if any(values.values()):  # spreadsheets write rows of commas
-            rows.append((place, values))
+        if not any(values.values()):  # spreadsheets write rows of commas
+            continue
+        if missing := [name for name in names[len(texts) :] if name]:
+            raise ValueError(
+                f"{place}: expected {len(names)} values, one for each column of the header, got "
+                f"{len(texts)}, and none for {', '.join(missing)}; complete the line, with a "
+                "separator for each empty value"
+            )
+        rows.append((place, values))
     if not rows:
         raise ValueError(f"{source}: expected a table with rows, got no rows; add them")
     return rows

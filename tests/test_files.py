@@ -48,7 +48,8 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["a,b\n1,ü\n\n3\n", "a;b\r\n1;ü\r\n3;\r\n", "a\tb\n1\tü\n3\t\n", " a , b\n 1,ü\n3,,\n"]
+    "text",
+    ["a,b\n1,ü\n\n3,\n \n", "a;b\r\n1;ü\r\n3;\r\n", "a\tb\n1\tü\n3\t\n", " a , b\n 1,ü\n3,,\n"],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
 def test_tables_of_spreadsheets_are_read(tmp_path: Path, text: str, encoding: str) -> None:
@@ -63,3 +64,12 @@ def test_tables_that_cannot_be_read_are_named(tmp_path: Path, data: bytes | None
         (tmp_path / "t.csv").write_bytes(data)
     with pytest.raises(ValueError, match=r"t\.csv"):
         read_table(tmp_path / "t.csv", "a table")
+
+
+def test_a_row_with_fewer_fields_than_the_header_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("a,b,c,\n1,2,3\n4,,\n5,6\n")
+    with pytest.raises(ValueError, match=r"t\.csv, line 4: expected .* got 2, and none for c;"):
+        read_table(path, "a table")
+    path.write_text("a,b,c,\n1,2,3\n4,,\n,\n")
+    assert [row["a"] for _, row in read_table(path, "a table")] == ["1", "4"]

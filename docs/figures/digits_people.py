@@ -14,7 +14,6 @@ the error of each person, it is the mean difference of all others.
 """
 
 import argparse
-import csv
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,6 +26,7 @@ from scipy.stats import spearmanr
 
 from hlsim import Audiogram, reception_threshold
 from hlsim.audiogram import HIGHEST_SIMULATED
+from hlsim.files import read_table
 from hlsim.progress import ProgressLine
 
 Array = NDArray[np.float64]
@@ -63,16 +63,15 @@ Person = tuple[str, float, Audiogram]
 def read_people(path: Path) -> list[Person]:
     """Read name, threshold in noise and better ear of each person, in the order of PTA."""
     people = []
-    with path.open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            ears = []
-            for side in ("left", "right"):
-                measured = {hz: row[f"{side}_{hz}"] for hz in HERTZ if row[f"{side}_{hz}"]}
-                levels = {hz: min(float(x), HIGHEST_SIMULATED) for hz, x in measured.items()}
-                if {500, 1000, 2000, 4000} <= levels.keys():
-                    ears.append(Audiogram(tuple(levels.values()), tuple(levels)))
-            better = min(ears, key=lambda ear: ear.pta)
-            people.append((row["person"], float(row["srt_db_snr"]), better))
+    for _, row in read_table(path, "the people"):
+        ears = []
+        for side in ("left", "right"):
+            measured = {hz: row[f"{side}_{hz}"] for hz in HERTZ if row[f"{side}_{hz}"]}
+            levels = {hz: min(float(x), HIGHEST_SIMULATED) for hz, x in measured.items()}
+            if {500, 1000, 2000, 4000} <= levels.keys():
+                ears.append(Audiogram(tuple(levels.values()), tuple(levels)))
+        better = min(ears, key=lambda ear: ear.pta)
+        people.append((row["person"], float(row["srt_db_snr"]), better))
     return sorted(people, key=lambda person: person[2].pta)
 
 

@@ -18,7 +18,7 @@ _USUAL_HZ = {
 _KNOWN_WORDS = {
     *EAR_NAMES,
     *("ac", "air", "conduction", "ear", "freq", "frequency", "hl", "htl", "hz"),
-    *("pt", "t", "thr", "threshold"),
+    *("pt", "t", "thr", "thresh", "threshold", "thresholds"),
 }
 
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}

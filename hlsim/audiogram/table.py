@@ -134,7 +134,12 @@ def _group_rows(path: str | Path | Any) -> _Builders:
     """
     rows: dict[str, list[_Row]] = {}
     for place, row in _read_rows(path):
-        name = row.get("listener")
+        if "listener" not in row:
+            raise ValueError(
+                f"{place}: expected a column listener, got the columns {', '.join(row)}; add it, "
+                "or rename one of them"
+            )
+        name = row["listener"]
         if not name:
             raise ValueError(f"{place}: expected a name in the column listener, got none; add it")
         rows.setdefault(name, []).append((place, row))
@@ -203,6 +208,8 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
     rows = read_table(table, "audiograms", ("listener", "ear"))
     columns: dict[str, str] = {}
     for column in rows[0][1]:
+        if re.search(r"\d", column):  # "threshold 500" is a column of a wide table
+            continue
         other = columns.setdefault(_without_units(column), column)
         if other != column and _without_units(column) in ("frequency", "threshold"):
             raise ValueError(
@@ -210,7 +217,8 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
                 "one of them"
             )
     is_long = {"frequency", "threshold"} <= columns.keys()
-    if is_long and (wide_columns := threshold_columns(rows[0][1])):
+    wide_columns = convert_at(rows[0][0], threshold_columns, rows[0][1]) if is_long else {}
+    if wide_columns:
         raise ValueError(
             f"{rows[0][0]}: expected thresholds in the column {columns['threshold']} alone, got "
             f"some in {', '.join(wide_columns)} as well; remove one of both"

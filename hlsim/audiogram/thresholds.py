@@ -219,9 +219,9 @@ def check_two_channels(waveform: Tensor) -> None:
     """
     if waveform.shape[-2:-1] != (2,):
         raise ValueError(
-            "expected a waveform of shape (..., 2, time) for two ears, left first, "
-            f"got {tuple(waveform.shape)}; pass torch.stack([left, right], -2), with the same "
-            "signal twice if it is mono"
+            "expected two channels for two ears, left first (a stereo file, or a waveform of "
+            f"shape (..., 2, time)), got shape {tuple(waveform.shape)}; put the signal of each ear "
+            "into its channel, the same signal into both if it is mono"
         )
 
 

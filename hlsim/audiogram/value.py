@@ -80,8 +80,8 @@ class Audiogram:
             raise ValueError(
                 f"expected one level per frequency, got {len(levels)} levels for "
                 f"{len(frequencies)} frequencies, {frequencies.tolist()} Hz; for other "
-                "frequencies pass a dictionary of each frequency in Hz to its threshold, such as "
-                "{500: 20, 4000: 50}"
+                "frequencies name each with its threshold, such as 500:20,4000:50 on the command "
+                "line, and {500: 20, 4000: 50} in Python"
             )
         is_measured = ~np.isnan(levels)
         levels, frequencies = levels[is_measured], frequencies[is_measured]

@@ -359,7 +359,8 @@ def _run_study(
     if failed:
         first = evaluation.failures.iloc[0]
         text = (
-            f"{failed} of {len(evaluation.table)} outputs lack scores; the page lists the reasons, "
-            f"of which the first is: {first.failure}"
+            f"{failed} of {len(evaluation.table)} outputs (one per item and condition) lack scores "
+            "(one per output and measure); the page lists the reasons, of which the first is: "
+            f"{first.failure}"
         )
         print(f"hlsim: {text}", file=sys.stderr)

@@ -103,6 +103,7 @@ def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> 
 
     from hlsim.audio import read_parts, scan_audio
     from hlsim.calibration import gain_to_pascals
+    from hlsim.files import convert_at
     from hlsim.report.page import Section
     from hlsim.report.players import make_player
 
@@ -113,7 +114,8 @@ def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> 
     stop = min(recording.samples, max(1, round(options.seconds * rate)))
     (waveform,) = read_parts(recording, [(0, stop)])
     with torch.no_grad():
-        sounds = make_sounds(waveform * 10.0 ** ((target_level - level) / 20.0), rate)
+        scaled = waveform * 10.0 ** ((target_level - level) / 20.0)
+        sounds = convert_at(str(file), make_sounds, scaled, rate)
     gain = gain_to_pascals(options.full_scale_spl)
     player = make_player({"": {label: gain * sound for label, sound in sounds.items()}}, rate)
     text = f"{file}, {target_level:.0f} dB SPL, {stop / rate:.1f} s"

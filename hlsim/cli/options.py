@@ -277,22 +277,28 @@ def ear(text: str) -> str | list[float] | dict[float, float]:
     from frequencies in Hz to levels in dB HL.
 
     Raises:
-        argparse.ArgumentTypeError: A frequency occurs twice.
+        argparse.ArgumentTypeError: A frequency occurs twice, or a level is not a number.
 
     >>> ear("N3"), ear("500:30,4000:60")
     ('N3', {500.0: 30.0, 4000.0: 60.0})
     >>> ear("20,30,40,50,60,60,70,70")
     [20.0, 30.0, 40.0, 50.0, 60.0, 60.0, 70.0, 70.0]
     """
-    if ":" in text:
+    try:
+        if ":" not in text:
+            return [float(level) for level in text.split(",")] if "," in text else text
         points = [point.split(":") for point in text.split(",")]
         levels = {float(frequency): float(level) for frequency, level in points}
-        if len(levels) < len(points):
-            raise argparse.ArgumentTypeError(
-                f"got {text!r}, expected one level for each frequency; leave all but one out"
-            )
-        return levels
-    return [float(level) for level in text.split(",")] if "," in text else text
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a name such as N3, eight levels in dB HL separated by commas, "
+            "or a level for each frequency, such as 500:30,4000:60"
+        ) from None
+    if len(levels) < len(points):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected one level for each frequency; leave all but one out"
+        )
+    return levels
 
 
 def _limited(

@@ -159,10 +159,13 @@ class PluginAid(nn.Module):
     Attributes:
         takes_microphones: Whether the function has this attribute, set to True. It then receives
             the signals of several microphones, with shape (microphones, 2, time).
+        may_crash: True, because compiled code of the function may end the process.
 
     >>> PluginAid("builtins:max", 16000)
     PluginAid()
     """
+
+    may_crash = True
 
     def __init__(self, name: str, sample_rate: int) -> None:
         super().__init__()
@@ -192,10 +195,15 @@ class Enhanced(nn.Module):
         sample_rate: Sample rate of all signals in Hz.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0 in the inputs and outputs.
 
+    Attributes:
+        may_crash: True, because compiled code of the enhancer may end the process.
+
     >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
     tensor([16000., 16000.])
     """
+
+    may_crash = True
 
     def __init__(
         self,

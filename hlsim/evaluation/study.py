@@ -144,7 +144,8 @@ class Condition:
     Args:
         name: Name in tables.
         process: Function ``(signal, ear) -> output``, for a signal with shape (time,) and an
-            ``Audiogram``; None if the outputs were recorded. A module is set to evaluation mode.
+            ``Audiogram``; None if the outputs were recorded. A module is set to evaluation mode. If
+            its attribute ``may_crash`` is True, a study of one item runs in another process, too.
         kind: Role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
         of: Name of the condition to which this one belongs, such as the aid whose level it has.
 
@@ -244,9 +245,11 @@ def run_study(
         store: Scores of earlier runs, to which new scores are added. A score is computed again only
             if samples, ear, condition, measure or the code of hlsim have changed, if the measure
             uses facts and these have changed, or if a fingerprint is unknown.
-        jobs: Number of processes; all cores by default.
+        jobs: Number of processes; all cores by default. With 1, your own code runs in this process,
+            as debuggers need it, and a crash of its compiled parts ends the process.
         dask: Address of a Dask scheduler, whose workers replace the processes.
-        progress: Function that is called with the numbers of finished scores and of all scores.
+        progress: Function that is called with the numbers of finished scores and of all scores, one
+            for each item, condition and measure.
 
     Returns:
         One row per item and condition: ``item`` (its number), ``name``, the item's facts,
@@ -317,11 +320,12 @@ def run_measures(
     tasks.sort(key=lambda task: task.source.clean_name)
     total = len(items) * len(conditions) * len(measures)
     report_progress(len(results), total)
-    # Compiled code behind a measure of a user's own may crash, too; one job keeps it debuggable.
-    isolates_own = running.get("jobs") != 1
-    running["in_processes"] = any(
-        measure.may_crash or (isolates_own and ":" in measure.name) for measure in measures
-    )
+    # Compiled code behind a measure or an aid of a user's own may crash, too; one job keeps it
+    # debuggable.
+    own_code = [":" in measure.name for measure in measures]
+    own_code += [getattr(condition.process, "may_crash", False) for condition in conditions]
+    isolates_own = running.get("jobs") != 1 and any(own_code)
+    running["in_processes"] = isolates_own or any(measure.may_crash for measure in measures)
     while tasks:
         tasks_of_crashes = []
         for task, measured in run_parallel(_measure_item, tasks, **running):

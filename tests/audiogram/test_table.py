@@ -46,6 +46,7 @@ def read_text(folder: Path, text: str) -> list[Audiogram]:
         "threshold_500ms_db_spl,250,500,1000\n7,10,22.5,30\n",
         "hl_250,hl_500,hl_1000\n,,\n10,22.5,30\n,,\n",
         "Frequency (Hz),Threshold (dB HL)\n1000,30\n250,10\n500,22.5\n",
+        "threshold_250,thresh_500,Threshold 1k\n10,22.5,30\n",
     ],
 )
 def test_columns_are_found_whatever_their_order_case_and_delimiter(
@@ -114,6 +115,8 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
         ("frequency,threshold\n1,20\n2,30\n", ["line 2", "1 Hz"]),
         ("frequency,threshold,500 Hz\n1000,20,30\n", ["column threshold", "500 Hz", "remove"]),
         ("listener,ear,500 Hz\nA,both,20\n", ["line 2", "left or right", "'both'"]),
+        ("frequency,threshold,threshold 2\n500,20,30\n", ["line 2", "'threshold 2'"]),
+        ("250 Hz,500 Hz\n10,20\n10\n", ["line 3", "none for 500 Hz", "complete the line"]),
     ],
 )
 def test_errors_name_the_file_and_the_cell(tmp_path: Path, text: str, words: list[str]) -> None:

@@ -105,7 +105,11 @@ compensate {speech} {out} --audiogram N3 --compensator nalr --noise-reduction 1 
 compensate {speech} {out} --listener {ears} | NAME is one of the 2 listeners, such as a, b
 compensate {speech} {out} --listener {ears}:c | no listener 'c'
 compensate {speech} {out} --listener {ears}:b | expected two ears
-compensate {speech} {out} --listener {ears}:a | (..., 2, time) for two ears
+compensate {speech} {out} --listener {ears}:a | two channels for two ears, left first (a stereo
+compensate {speech} {out} --audiogram N3 --compensator wdrc --linked | expected two channels
+listen {speech} --listener {ears}:a --out {out} | in.flac: expected two channels
+simulate {speech} {out} --audiogram 10,20 | such as 500:20,4000:50 on the command line
+simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
 train-simulator --speech {folder} --root {folder} --out o | no effect without --manifest
@@ -126,6 +130,7 @@ def test_errors_are_one_line_and_nothing_is_written(
     call, part = line.split(" | ")
     error = error_of(capsys, *call.format(**paths).split())
     assert part in error
+    assert "torch." not in error  # advice in Python does not help on the command line
     assert error.endswith("--help") or error.startswith("hlsim: error: ")
     assert set(tmp_path.rglob("*")) == before
 
@@ -394,7 +399,7 @@ def test_haspi_report_of_a_manifest(
     assert run(*call) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith("aided") and (out / "report.html").as_uri() in printed.out
-    assert "1 of 4 outputs lack scores" in printed.err
+    assert "1 of 4 outputs (one per item and condition) lack scores (one per" in printed.err
     assert "broken.wav: cannot be read" in printed.err.rpartition("the first is: ")[2]
     scores = [row["stoi"] for row in json.loads((out / "report.json").read_text())["rows"]]
     assert [score is None for score in scores] == [False, False, False, True]

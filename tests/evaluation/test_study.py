@@ -15,7 +15,9 @@ from torch import Tensor
 
 from hlsim import Audiogram
 from hlsim.evaluation import Condition, Item, Measure, ScoreStore, run_study
+from hlsim.evaluation.conditions import Enhanced, PluginAid, Unaided
 from hlsim.evaluation.measures import load_measure
+from hlsim.plugins import WaveformPlugin
 
 pytest.importorskip("pandas")
 
@@ -243,15 +245,20 @@ def test_a_crash_costs_only_its_score(items: list[Item]) -> None:
 
 
 @pytest.mark.slow  # Processes take seconds to start.
-def test_a_crash_of_a_users_measure_does_not_end_a_study_of_one_item(
+def test_a_crash_of_a_users_code_does_not_end_a_study_of_one_item(
     items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("crash.py").write_text(
-        "import os, signal\n\ndef crash(item, output):\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "import os, signal\n\ndef crash(*arguments):\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
+    own_aid = Condition("own", PluginAid("crash:crash", 16000))
+    assert Enhanced(WaveformPlugin("crash:crash", "enhancer"), Unaided()).may_crash
     table = run_study(items[:1], gains(1), [MEASURES[0], load_measure("crash:crash")])
     assert table.peak.tolist() == pytest.approx([0.2])
+    assert "crash in compiled code" in table.failure[0]
+    table = run_study(items[:1], [own_aid, *gains(1)], MEASURES[:1])
+    assert table.peak.tolist() == pytest.approx([np.nan, 0.2], nan_ok=True)
     assert "crash in compiled code" in table.failure[0]
 
 

@@ -79,7 +79,8 @@ class CleanBatch:
                 raise UnscorableError(
                     f"{label} is silent or too soft, at {level:.1f} dB SPL with full_scale_spl "
                     f"{full_scale_spl:g}; expected {LOWEST_REFERENCE_SPL:g} dB SPL or more; "
-                    "calibrate the signal, for example with hlsim.load_audio, or leave it out"
+                    "calibrate the signal (--spl on the command line, hlsim.load_audio in Python), "
+                    "or leave it out"
                 )
             if length < MIN_AUDIBLE_SAMPLES:
                 raise UnscorableError(
