@@ -6,6 +6,7 @@ seconds of one core, so functions import it and what depends on it.
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import shutil
@@ -26,6 +27,26 @@ if TYPE_CHECKING:
 
 SPEECH_DIR = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
 
+
+LONGEST = (
+    "test_parallel.py::test_a_process_that_ends",
+    "test_clarity.py::test_the_baseline",
+    "test_gpu_measurement_on_a_cpu",
+    "test_commands_and_programs_of_a_page_run",
+    "test_model.py::test_output_equals_pyclaritys_sample_by_sample",
+    "test_long_recordings.py::test_memory",
+    "test_export.py::test_onnx",
+    "test_parallel.py",
+    "test_study.py",
+    "test_demo.py",
+    "test_startup.py",
+    "test_compensators.py",
+    "test_scores.py::test_a_batch_equals_its_items",
+)
+"""Parts of the names of the longest tests, which the workers begin with.
+
+A long test that began last would keep one core busy and let the others wait.
+"""
 
 NEW_OUTPUTS = pytest.StashKey[dict[str, Any]]()
 
@@ -49,9 +70,27 @@ def pytest_configure(config: pytest.Config) -> None:
     if distributes_tests and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SignOfLife(config))
         return
+    gc.disable()  # until all modules are imported
     import torch
 
     torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Let the workers begin with the longest tests."""
+    if hasattr(config, "workerinput"):
+        places = {
+            item: next((i for i, name in enumerate(LONGEST) if name in item.nodeid), len(LONGEST))
+            for item in items
+        }
+        items.sort(key=places.__getitem__)
+
+
+def pytest_collection_finish() -> None:
+    """Exempt what was imported from garbage collection, which would visit it again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -9,7 +9,9 @@ from tests.helpers import mostly_slow
 
 # scores that take as long as all other cases together, and of which other cases cover most
 SLOW = re.compile(
-    "(haspi|hasqi|haaqi)(, float64| at 44100 Hz| with noise .*)|(HASPILoss|loss hasqi) through msbg"
+    "(haspi|hasqi|haaqi)(, float64| at 44100 Hz| with noise .*)"
+    "|(hasqi|haaqi)(, float32| with lengths)"
+    "|(HASPILoss|loss hasqi) through .*|loss haspi through msbg"
 )
 FAST_CASES = [name for name in CASES if not SLOW.fullmatch(name)]
 

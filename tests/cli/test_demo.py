@@ -21,8 +21,9 @@ def test_demo_writes_a_page_that_agrees_with_the_table(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(DurationEstimate, "last_step", 12)
-    text = run_short_demo(tmp_path, speech_dir, steps=13)
+    monkeypatch.setattr(DurationEstimate, "first_step", 2)
+    monkeypatch.setattr(DurationEstimate, "last_step", 3)
+    text = run_short_demo(tmp_path, speech_dir, steps=4)
     assert capsys.readouterr().out.count("The demo will take about ") == 1
     out = tmp_path / "out"
     report = json.loads((out / "report.json").read_text())
@@ -68,7 +69,7 @@ def test_demo_writes_a_page_that_agrees_with_the_table(
     transcripts = (SPEECH / "README.md").read_text().splitlines()
     (row,) = [line for line in transcripts if f"/{rows[-1]['name']}.flac" in line]
     assert f"Its words: {row.split(' | ')[2]}" in page
-    assert "for 13 steps" in page and "exceeds 110 dB SPL" in page
+    assert "for 4 steps" in page and "exceeds 110 dB SPL" in page
 
 
 def test_the_duration_follows_from_the_pace_of_the_first_steps(

@@ -50,7 +50,7 @@ def test_chunks_of_any_size_equal_the_whole_signal(
 ) -> None:
     aid: Any = build_wearable(name)
     ears = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
-    signal = noise[:, : 600 * max(sizes)]
+    signal = noise[:, : 300 * max(sizes)]
     stream = aid.stream(ears)
     outputs, place = [], 0
     while place < signal.shape[-1]:

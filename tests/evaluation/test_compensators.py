@@ -46,7 +46,7 @@ def options(
     """Return settings of an evaluation that takes seconds."""
     monkeypatch.setattr(aid_properties, "TONES", (1000,))
     monkeypatch.setattr(aid_properties, "CHANGE_POSITIONS", [24001])
-    monkeypatch.setattr("hlsim.evaluation.compensators.UTTERANCES", 2)
+    monkeypatch.setattr("hlsim.evaluation.compensators.UTTERANCES", 1)
     folders = {"speech": speech_dir / "valid", "noise": speech_dir / "train"}
     settings = {"seconds": 0.4, "levels": (60.0, 75.0), "gain_ears": ("N3",)}
     return {**folders, **settings, "jobs": 1}
@@ -85,6 +85,8 @@ def test_conditions_groups_and_page(
     tmp_path: Path, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    # ``test_command`` draws pictures.
+    monkeypatch.setattr("hlsim.report.plots._draw_svg", lambda *_: b"<svg></svg>")
     Path("my_enhancer.py").write_text(ENHANCERS)
     enhancers = ["my_enhancer:half"]
     study = evaluate_compensators(

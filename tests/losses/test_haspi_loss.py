@@ -10,12 +10,12 @@ from hlsim.calibration import set_level
 from hlsim.metrics import haspi, hasqi
 from tests.losses.signals import add_noise, excerpt, gain_slope
 
-TIME = 12000
+TIME = 11600
 
 
 @pytest.fixture
 def clean(speech: list[tuple[Tensor, int]]) -> Tensor:
-    """0.75 s of two voices at 65 dB SPL. Shape: (2, 12000)."""
+    """0.73 s of two voices at 65 dB SPL. Shape: (2, TIME)."""
     return excerpt(speech, 10000, 10000 + TIME)
 
 
@@ -27,7 +27,6 @@ def test_value_is_1_minus_the_scores_and_the_cost_of_the_level(clean: Tensor) ->
     torch.testing.assert_close(parts["hasqi"], 1.0 - hasqi(aided, clean, "N3"))
     level = sum(loss.weights[name] * parts[name] for name in ("levels", "louder", "peaks"))
     value = parts["haspi"] + 0.5 * parts["hasqi"] + level
-    torch.testing.assert_close(loss(aided[1], clean[1]), value[1])
     assert set(HASPILoss("N3", level=0.0).weights) == {"haspi"}
     torch.testing.assert_close(HASPILoss("N3", quality=0.5)(aided, clean), value.mean())
 
