@@ -260,6 +260,9 @@ def pair_items(
     Returns:
         The leading dimensions of the batch; the signals, (items, time); and the ears, (items, n).
 
+    Raises:
+        RuntimeError: The leading dimensions do not broadcast.
+
     >>> batch, signals, ears = pair_items(torch.zeros(3, 1, 9), torch.zeros(2, 8), torch.float32)
     >>> batch, signals.shape, ears.shape
     (torch.Size([3, 2]), torch.Size([6, 9]), torch.Size([6, 8]))

@@ -343,5 +343,10 @@ def _band_powers(signal: Tensor) -> Tensor:
 
 
 def _perceived_level(sounds: Tensor, ear: Audiogram) -> Tensor:
-    """Return the level of the middle second in dB SPL. Shape: (items, time) -> (items,)."""
+    """Return the level in dB SPL of what an ear perceives of sounds of 2 s, by the exact MSBG.
+
+    The level is that of the middle second.
+
+    Shape: (items, 32000) in pascals at 16 kHz -> (items,).
+    """
     return level_spl(perceive(sounds, ear, NEURO_RATE)[:, _MIDDLE])

@@ -36,7 +36,7 @@ class ConditionComparison:
             not known.
         unit: Column of the table that several items share, such as ``"listener"``.
         unit_means: The same statistics over one mean score per unit, because items of one listener
-            are not independent; None unless there are two units or more.
+            are not independent; None if an item has no unit, or with fewer than two units.
         left_out: Number of items that lack one of the two scores.
         p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state, adjusted by Holm
             unless the comparison is planned; None if a test is not defined.
@@ -170,7 +170,15 @@ def _compare_pair(
 def _compare_units(
     units: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> PairedComparison | None:
-    """Compare the means of each unit, or return None unless two units or more have names."""
+    """Compare the means of each unit, second minus first.
+
+    Args:
+        units: Name of the unit of each item, empty if it is unknown. Shape: (items,).
+        first, second: Scores under both conditions. Shape: (items,).
+
+    Returns:
+        The comparison; None if an item has no unit, or if there are fewer than two units.
+    """
     names = list(dict.fromkeys(units))
     if not all(units) or len(names) < 2:
         return None

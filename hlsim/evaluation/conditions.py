@@ -116,9 +116,11 @@ class EqualiserLike(nn.Module):
         self._identifier = uuid.uuid4().hex  # the same in every process that receives a copy
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Filter a waveform at 16 kHz with the aid's mean gain for an ear.
+        """Filter a waveform at 16 kHz with the aid's mean gain for one ear, without delay.
 
-        The gains of an ear are measured once per process.
+        The gains of an ear are measured once per process. Later changes of the aid have no effect.
+
+        Shape: (..., time) -> (..., time).
         """
         key = self._identifier, audiogram
         if key not in _GAINS:
@@ -174,14 +176,18 @@ class PluginAid(nn.Module):
         self.takes_microphones = bool(getattr(self.plugin.function, "takes_microphones", False))
 
     def forward(self, waveform: Tensor, listener: Any) -> Tensor:
-        """Call the user's function.
+        """Call the user's function, without a gradient.
 
         Args:
-            waveform: Signals at the left and the right ear. Shape: (2, time).
+            waveform: Signals at the left and the right ear. Shape: (2, time), or (microphones, 2,
+                time) if ``takes_microphones``.
             listener: Audiograms of both ears, an ``hlsim.Listener``.
 
         Returns:
             Outputs for both ears. Shape: (2, time), where ``time`` may differ from the input's.
+
+        Raises:
+            ValueError: The function fails, or its output is not finite or has another shape.
         """
         return self.plugin(waveform, listener, self.sample_rate)
 

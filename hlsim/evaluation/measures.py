@@ -334,13 +334,14 @@ difference of levels in 24 bands, and by ``HearingLossLoss(criterion="bands")``.
 
 
 def network_loss(simulator: nn.Module) -> Measure:
-    """Return the measure of the column ``loss_neuro``, the training loss of an aid.
+    """Return the measure of the column ``loss_neuro``, the training loss of an aid in dB.
 
-    The loss is ``HearingLossLoss(criterion="bands")`` through a network. The column ``loss_msbg``
+    The loss is ``HearingLossLoss(criterion="bands")`` through a network, for the output and the ear
+    of the item, with the clean speech as a normal ear perceives it. The column ``loss_msbg``
     of the measure ``PERCEPTION`` has the same loss through the exact MSBG.
 
     Args:
-        simulator: The network, a Neuro-MSBG.
+        simulator: The network, a Neuro-MSBG for the sample rate of the items.
 
     >>> network_loss(nn.Identity()).name
     'network loss'

@@ -62,7 +62,8 @@ def haspi_report(
 ) -> Evaluation:
     """Score recorded speech by HASPI v2 and other measures, and compare its conditions.
 
-    An interrupted run can be continued. A file that cannot be scored is listed with the reason.
+    With ``store``, an interrupted run can be continued. A file that cannot be scored is listed with
+    the reason.
 
     Args:
         clean: Folder of clean speech.
@@ -97,12 +98,15 @@ def haspi_report(
             and of all scores.
 
     Returns:
-        The evaluation. The comparison of the last condition with the first by the first measure
-        counts as planned before the scores were known, so its p values are not adjusted.
+        The evaluation. The comparison of the last condition with the first, or with ``baseline``,
+        by the first measure counts as planned before the scores were known, so its p values are
+        not adjusted.
 
     Raises:
         ValueError: Folders, manifest and ears do not go together, files do not match, a row of
-            the manifest is not valid, or nothing could be scored.
+            the manifest is not valid, ``better_ear`` is set and an utterance lacks an ear or has
+            other speech at it, there is no such measure, precision or baseline, or nothing could
+            be scored.
         MissingExtraError: The package of a measure is not installed.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE

@@ -157,7 +157,9 @@ def peak_excess(output: Tensor) -> Tensor:
 
 
 def _average_segments(frames: Tensor) -> Tensor:
-    """Average over segments of 96 ms, every 48 ms.
+    """Average frames, which are 16 ms apart, over segments of 96 ms, every 48 ms.
+
+    Frames that the last 48 ms lack count as zeros. Up to three frames give one segment of 48 ms.
 
     Shape: (items, frames, n) -> (items, segments, n).
     """

@@ -204,10 +204,11 @@ def _score(
 
 
 def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
-    """Convert two signals whose relative error is defined to arrays.
+    """Convert two signals whose relative error is defined to float64 arrays, (time,).
 
     Raises:
-        ValueError: The shapes differ, a sample is not finite, or the reference is silent.
+        ValueError: A signal is empty or has several dimensions, the lengths differ, a
+            sample is not finite, or the reference is silent.
     """
     x, y = (
         np.asarray(signal.detach().cpu() if isinstance(signal, Tensor) else signal, np.float64)

@@ -69,8 +69,9 @@ class _Comparison(NamedTuple):
             (HASQI) or 8 ms (HAAQI). Shape: (items, channels, segments).
         coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
             (items, channels, segments).
-        energy: Mean square of the clean signal in each segment of 16 ms. Shape: (items, channels,
-            segments).
+        energy: Mean square of the envelope of the clean signal's fine structure, with the noise
+            of the ear, in each segment of 16 ms; see ``segment_spectra``. Shape: (items, channels,
+            segments), with fewer segments than the levels of HAAQI.
         clean_spectrum, output_spectrum: Long-term levels in dB over threshold. Shape: (items,
             channels).
     """

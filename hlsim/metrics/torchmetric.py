@@ -263,8 +263,8 @@ class HASQI(_MeanScore):
     """Mean HASQI v2, the quality of outputs, over all items since the last ``reset``.
 
     The arguments and attributes are those of ``HASPI``. Outputs are compared with clean speech that
-    NAL-R has amplified, and every difference lowers the score. On a CPU one second of audio takes
-    about 0.2 s.
+    NAL-R has amplified. Noise, distortion and changes of the spectrum lower the score, and a delay
+    is compensated. On a CPU one second of audio takes about 0.2 s.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASQI()

@@ -230,8 +230,9 @@ def envelope_lowpass(
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Design the low-pass at 44.1 kHz that smooths the envelope of each channel of a filter bank.
 
-    It is an elliptic filter of second order. Its cut-off frequency is 75 Hz, or three quarters of
-    the channel's equivalent rectangular bandwidth if this is lower.
+    It is an elliptic filter of second order, with 0.25 dB of ripple up to its cut-off frequency.
+    This is 75 Hz, or three quarters of the equivalent rectangular bandwidth of a normal filter at
+    the channel's centre frequency if that is lower. The broadening of the bank does not count.
 
     Returns:
         Numerator and denominator for each channel, three coefficients each.

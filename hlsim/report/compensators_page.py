@@ -20,7 +20,7 @@ from hlsim.report.plots import (
     means_pictures,
     scores_pictures,
 )
-from hlsim.report.results import (
+from hlsim.report.tables import (
     GAIN_NOTE,
     HASQI_NOTE,
     SEVERITY_NOTE,

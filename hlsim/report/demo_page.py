@@ -14,7 +14,7 @@ from hlsim.report.plots import (
     curves_picture,
     gain_picture,
 )
-from hlsim.report.results import (
+from hlsim.report.tables import (
     Columns,
     mean_level,
     score_details,

@@ -103,7 +103,7 @@ class Sound:
     Attributes:
         label: Name on the button.
         level: Level in dB SPL, which is shown beside the name.
-        audio: Contents of a FLAC file.
+        audio: Contents of a WAV file.
         loudness: Level in dB relative to full scale with which the sound is played.
         spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram.
         note: Text on the spectrogram, which says why it is black.
@@ -344,7 +344,7 @@ def _escape_markdown(text: str) -> str:
 
 
 def _data_uri(data: bytes) -> str:
-    """Return the contents of a file as a URI, whose type is known from its first bytes."""
+    """Return the contents of a file as a URI: PNG or WAV by its first bytes, or else SVG."""
     types = {b"\x89PNG": "image/png", b"RIFF": "audio/wav"}
     media_type = types.get(data[:4], "image/svg+xml")
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"

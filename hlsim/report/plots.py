@@ -1,6 +1,6 @@
 """Pictures of a study's scores and curves, narrow enough for a phone, on light and dark pages.
 
-All functions raise MissingExtraError without matplotlib. They do not use pyplot, so that no
+Drawing a picture raises MissingExtraError without matplotlib. Pyplot is not used, so that no
 window, no global state and no notebook's backend is involved.
 """
 
@@ -75,7 +75,7 @@ def _draw_picture(
     """Return an SVG picture for a page, which a function draws on matplotlib axes.
 
     Args:
-        draw: Function that is called with the axes.
+        draw: Function that is called with the axes when the picture is needed (``Picture.data``).
         title: Heading above the picture.
         note: Sentence below the picture.
         height: Height in inches.

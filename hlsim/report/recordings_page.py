@@ -12,7 +12,7 @@ from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Section, Table
 from hlsim.report.players import listening_sections
 from hlsim.report.plots import means_pictures, scores_pictures
-from hlsim.report.results import (
+from hlsim.report.tables import (
     GAIN_NOTE,
     HASQI_NOTE,
     Columns,

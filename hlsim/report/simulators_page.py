@@ -10,7 +10,7 @@ from hlsim.evaluation.simulators import agreement
 from hlsim.extras import install_command, is_installed
 from hlsim.report.page import Page, Section
 from hlsim.report.players import listening_sections
-from hlsim.report.results import (
+from hlsim.report.tables import (
     Columns,
     comparison_table,
     detail_section,

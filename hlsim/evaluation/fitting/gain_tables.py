@@ -66,7 +66,11 @@ class _Fitting(NamedTuple):
         return gains
 
     def gain_table(self) -> Array:
-        """Measure the insertion gains in dB at all ``LEVELS``, (21, 8)."""
+        """Measure the insertion gains in dB for speech at all ``LEVELS``, (levels, frequencies).
+
+        Raises:
+            ValueError: The aid has several ears.
+        """
         return np.stack([self.gains(level) for level in LEVELS])
 
 

@@ -47,7 +47,9 @@ def code_version() -> str:
 
 @cache
 def _hash_sources(*folders: Path) -> str:
-    """Compute the SHA-256 of all source files and tables by which scores may be computed.
+    """Compute the SHA-256 of the names and contents of all .py and .json files that scores may use.
+
+    The folders ``cli``, ``report`` and ``training`` are left out.
 
     Args:
         folders: Folders of the packages.

@@ -274,7 +274,10 @@ def coherence(
 
 @constant
 def _lag_weights() -> NDArray[np.float64]:
-    """Return the inverse autocorrelations of the windows at lags 0 to 24 and -24 to -1: (3, 49)."""
+    """Return 1 over the autocorrelation of the window of the first, inner and last segments.
+
+    The lags are 0 to 24 and -24 to -1 samples. Shape: (3, 49).
+    """
     lags = [*range(MAX_LAG + 1), *range(MAX_LAG, 0, -1)]
     rows = []
     for window in _windows():

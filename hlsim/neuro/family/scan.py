@@ -42,9 +42,9 @@ def selective_scan(
     result is (C[t] h[t] + D u[t]) silu(z[t]).
 
     The function calls that of ``mamba_ssm``, which has the same names of arguments, for tensors on
-    a GPU where it is installed. Otherwise, the recurrence is computed in about log2(time) steps,
-    each of which is parallel over time. The gradient computes the states again, so that they are
-    not stored. There is no second derivative.
+    a GPU where it is installed, except in float64. Otherwise, the recurrence is computed in about
+    log2(time) steps, each of which is parallel over time. The gradient computes the states again,
+    so that they are not stored. There is no second derivative.
 
     Shape: (items, channels, time) -> (items, channels, time).
 

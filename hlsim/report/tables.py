@@ -308,7 +308,8 @@ def detail_section(
 def score_details(evaluation: Evaluation) -> Section:
     """Return the section "Details" of a page about scores.
 
-    It has all comparisons, and means by SNR and by degree of loss.
+    It has, if there are any: several comparisons, the planned one by listener, means by SNR and by
+    degree of loss, the items that failed, and how the values were computed.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report
