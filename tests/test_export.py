@@ -82,7 +82,11 @@ def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: 
 
 @pytest.mark.parametrize(
     ("name", "items", "hops"),
-    [("wdrc", 2, 1), pytest.param("wdrc", 1, 5, marks=pytest.mark.slow), ("aid", 2, 3)],
+    [
+        pytest.param("wdrc", 2, 1, marks=pytest.mark.slow),
+        pytest.param("wdrc", 1, 5, marks=pytest.mark.slow),
+        ("aid", 2, 3),
+    ],
 )
 def test_a_program_of_hops_gives_the_outputs_of_the_stream(
     name: str, items: int, hops: int

@@ -1,6 +1,7 @@
 """The commands and programs of the guides run as printed, on a small corpus.
 
-Trainings take two steps, and studies two items of one second. Pages with commands are slow tests.
+Trainings take two steps, and studies two items of one second. Pages with commands are slow tests,
+and so is that on metrics, whose functions have examples that test_doctests.py runs.
 """
 
 import csv
@@ -157,7 +158,8 @@ def _cases() -> Iterator[Any]:
     for page in PAGES:
         kinds = {kind for kind, _ in _read_steps(page)}
         if kinds:
-            yield pytest.param(page, marks=pytest.mark.slow if "sh" in kinds else (), id=page.stem)
+            is_slow = "sh" in kinds or page.stem == "metrics"
+            yield pytest.param(page, marks=pytest.mark.slow if is_slow else (), id=page.stem)
 
 
 @pytest.mark.parametrize("page", list(_cases()))

@@ -15,6 +15,7 @@ pytest.importorskip("lightning")
 pytest.importorskip("joblib")
 
 
+@pytest.mark.slow
 def test_demo_writes_a_page_that_agrees_with_the_table(
     tmp_path: Path,
     speech_dir: Path,

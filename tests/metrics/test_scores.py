@@ -267,7 +267,7 @@ def test_full_scale_is_pyclaritys_level1_and_rates_are_exact_by_default() -> Non
     assert abs(exact - expected) < abs(rounded - expected)
 
 
-@pytest.mark.parametrize(  # HASQI and HAAQI add the same noise
+@pytest.mark.parametrize(  # HASQI and HAAQI add the same noise, and share the steps of a batch
     ("name", "noise"),
     [
         ("haspi", "expected"),
@@ -276,7 +276,7 @@ def test_full_scale_is_pyclaritys_level1_and_rates_are_exact_by_default() -> Non
         pytest.param("hasqi", "expected", marks=pytest.mark.slow),
         ("hasqi", "seeded"),
         pytest.param("hasqi", "none", marks=pytest.mark.slow),
-        ("haaqi", "expected"),
+        pytest.param("haaqi", "expected", marks=pytest.mark.slow),
         pytest.param("haaqi", "seeded", marks=pytest.mark.slow),
         pytest.param("haaqi", "none", marks=pytest.mark.slow),
     ],

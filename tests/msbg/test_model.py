@@ -358,9 +358,8 @@ def test_the_number_of_threads_changes_only_rounding(rate: int, items: int) -> N
     assert relative_error(output.numpy(), expected.numpy()) <= (5e-6 if items == 1 else 0.0)
 
 
-@pytest.mark.parametrize(
-    ("rate", "aligned"), [(16000, True), pytest.param(44100, False, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow  # test_long_recordings.py compares the outputs of blocks with the whole
+@pytest.mark.parametrize(("rate", "aligned"), [(16000, True), (44100, False)])
 def test_blocks_give_the_output_and_the_gradient_of_the_whole(
     monkeypatch: pytest.MonkeyPatch, rate: int, aligned: bool
 ) -> None:

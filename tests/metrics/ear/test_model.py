@@ -80,7 +80,7 @@ def test_padded_items_are_resampled_and_aligned_as_alone(rate: int) -> None:
 
 def test_middle_ear_and_adaptation(pair: tuple[Tensor, Tensor]) -> None:
     eb = of_clarity()
-    signal = blocks(pair[0])
+    signal = blocks(pair[0][:5000])
     expected_sound = eb.middle_ear(signal[0].numpy(), 24000.0)
     level = 60.0 * (signal.abs() / signal.abs().max())
     level[level < 10.0] = 0.0
