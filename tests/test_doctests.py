@@ -10,6 +10,7 @@ import pytest
 
 import compensators
 import hlsim
+from tests.helpers import mostly_slow
 
 # Modules in which a public function or class may lack an example, such as those of commands and
 # pages, whose results are files. Remove yours when each has one.
@@ -34,8 +35,12 @@ def one_position(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hlsim.evaluation.aid_properties.CHANGE_POSITIONS", [24001])
 
 
+# This example takes four seconds, and test_compensators.py evaluates as it does.
+FAST_MODULES = set(MODULES) - {"hlsim.evaluation.compensators"}
+
+
 @pytest.mark.usefixtures("one_position")
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", mostly_slow(MODULES, FAST_MODULES))
 def test_examples_print_what_they_say(name: str) -> None:
     results = doctest.testmod(importlib.import_module(name))
     assert results.attempted > 0 or name not in WITH_EXAMPLES

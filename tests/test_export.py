@@ -26,7 +26,6 @@ from tests.compensators.aids import (
     build_wearable,
     varied_hearing_aid,
 )
-from tests.helpers import mostly_slow
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 EARS = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
@@ -157,10 +156,8 @@ def test_what_cannot_be_exported_is_a_value_error(call: Callable[[], object]) ->
         call()
 
 
-@pytest.mark.parametrize(
-    "name",
-    mostly_slow(["neuro-msbg-light", "compensator-general", "hearing-aid"], ["hearing-aid"]),
-)
+@pytest.mark.slow  # the other tests export with hlsim.export, which calls torch.export
+@pytest.mark.parametrize("name", ["neuro-msbg-light", "compensator-general", "hearing-aid"])
 def test_torch_exports_a_network_by_itself(name: str) -> None:
     """Levels that are out of range give NaN, because a program cannot raise an error."""
     model: Any = load_pretrained(name) if "msbg" in name else load_compensator(name)

@@ -176,7 +176,12 @@ def test_amplifying_the_reference_twice_changes_the_score(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "unaided", "amplified"), [("NH", 0.91, 0.91), ("N2", 0.73, 0.90), ("N4", 0.28, 0.94)]
+    ("name", "unaided", "amplified"),
+    [
+        pytest.param("NH", 0.91, 0.91, marks=pytest.mark.slow),
+        pytest.param("N2", 0.73, 0.90, marks=pytest.mark.slow),
+        ("N4", 0.28, 0.94),
+    ],
 )
 def test_identical_music_has_pyclaritys_score_below_1(
     pyclarity: PyclarityOutputs, name: str, unaided: float, amplified: float
@@ -359,7 +364,7 @@ def test_gradient_equals_finite_differences(name: str) -> None:
     ("name", "ear", "noise"),
     [
         ("haspi", N6, "none"),
-        ("hasqi", NH, "none"),
+        pytest.param("hasqi", NH, "none", marks=pytest.mark.slow),  # see test_score_loss.py
         pytest.param("haspi", N6, "expected", marks=pytest.mark.slow),
         pytest.param("hasqi", N6, "expected", marks=pytest.mark.slow),
         pytest.param("haaqi", NH, "expected", marks=pytest.mark.slow),
