@@ -125,12 +125,19 @@ def trained_for(name: str | Path) -> Audiogram | None:
         name: Name or folder, as in ``load_compensator``.
 
     Raises:
-        ValueError: There is no such checkpoint.
+        ValueError: There is no such checkpoint, or its record of the ear is not valid.
 
     >>> trained_for("hearing-aid") is None
     True
     """
     if str(name) in UNTRAINED:
         return None
-    audiogram = read_record(name).get("about", {}).get("audiogram")
-    return None if audiogram is None else Audiogram(**audiogram)
+    about = read_record(name).get("about", {})
+    try:
+        audiogram = about.get("audiogram")
+        return None if audiogram is None else Audiogram(**audiogram)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}: expected levels and frequencies as about.audiogram in config.json, or null "
+            f"for all ears, got {about!r}; correct the file ({error})"
+        ) from error

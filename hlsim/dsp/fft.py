@@ -27,9 +27,17 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
         signals: Real signals, which are cut or followed by zeros to the length of the transform.
         points: Length of the transform, by default that of the signals.
 
+    Raises:
+        ValueError: The signals are in half precision, for which there are no transforms.
+
     >>> rfft(torch.tensor([1.0, 0.0, -1.0, 0.0]))
     tensor([0.+0.j, 2.+0.j, 0.+0.j])
     """
+    if signals.dtype.itemsize < torch.float32.itemsize:
+        raise ValueError(
+            f"expected signals of float32 or float64, got {signals.dtype}; convert the model with "
+            ".float() and, for speed, use torch.autocast"
+        )
     points = signals.shape[-1] if points is None else points
     return _RFFT.apply(signals[..., :points], points)
 

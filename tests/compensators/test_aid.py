@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from compensators import NALR, WDRC, load_compensator
+from compensators import NALR, WDRC, HearingAid, MappingCompensator, load_compensator
 from compensators.filter_bank import speech_density
 from hlsim import Listener
 from hlsim.audiogram import FREQUENCIES
@@ -49,6 +49,14 @@ def test_linked_gains_of_any_number_of_ears(name: str) -> None:
     linked, alone = load_compensator(name, linked=True), load_compensator(name)
     for ears in ("N3", ["N2", "N3", "S2"], [Listener("N2", "N4")]):
         torch.testing.assert_close(linked.gains(ears), alone.gains(ears))
+
+
+@pytest.mark.parametrize("kind", [NALR, WDRC, HearingAid, MappingCompensator])
+def test_every_aid_takes_an_ear_first(kind: Any) -> None:
+    aid = kind("N3").eval()
+    torch.testing.assert_close(aid.gains(), aid.gains("N3"))
+    waveform = torch.from_numpy(0.02 * np.random.default_rng(0).normal(size=2000)).float()
+    torch.testing.assert_close(aid(waveform), aid(waveform, "N3"))
 
 
 def test_gains_have_the_shape_of_the_ears_and_need_valid_ones() -> None:

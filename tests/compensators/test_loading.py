@@ -1,5 +1,6 @@
 """Compensators are loaded by name and saved in folders."""
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,15 @@ def test_a_checkpoint_names_the_ear_that_it_was_trained_for(tmp_path: Path) -> N
     save_compensator(model, tmp_path / "all", EAR)
     assert trained_for(tmp_path / "all") == EAR
     assert trained_for("nalr") is trained_for("compensator-general") is None
+
+
+@pytest.mark.parametrize("about", [None, ["N3"], {"audiogram": 5}, {"audiogram": {"hl": [1]}}])
+def test_an_ear_that_was_edited_wrongly_is_an_error(tmp_path: Path, about: Any) -> None:
+    save_checkpoint(tmp_path, "mapping-compensator", torch.nn.Linear(2, 2), {}, {})
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"about": about}))
+    with pytest.raises(ValueError, match=r"as about\.audiogram in config\.json.*correct the file"):
+        trained_for(tmp_path)
 
 
 def test_what_is_no_compensator_raises_value_error(tmp_path: Path) -> None:

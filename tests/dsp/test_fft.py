@@ -31,3 +31,9 @@ def test_power_and_its_gradient_equal_the_squared_modulus() -> None:
 def test_second_derivatives() -> None:
     source = torch.randn(2, 9, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradgradcheck(lambda signal: power(rfft(signal)), source)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_rejected_with_a_fix(dtype: torch.dtype) -> None:
+    with pytest.raises(ValueError, match=r"got torch\.\w*float16; convert the model with"):
+        rfft(torch.zeros(8, dtype=dtype))
