@@ -241,8 +241,8 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         threshold: Name of the column of thresholds in dB HL.
 
     Raises:
-        ValueError: A column is missing, a frequency is no number, or an ear has two thresholds at
-            one frequency.
+        ValueError: A column is missing, a frequency is no number, an ear has two thresholds at one
+            frequency, or a row lacks the listener or the ear that other rows have.
     """
     names = [column for column in rows[0][1] if column not in (frequency, threshold)]
     has_ears = {"listener", "ear"} <= set(names)
@@ -251,12 +251,22 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
             f"{rows[0][0]}: expected the columns listener and ear beside {frequency} and "
             f"{threshold}, got {', '.join(names)}; add or rename columns"
         )
+    # A spreadsheet with merged cells has the listener and the ear in the first row of each ear only.
+    required_names = [
+        name for name in ("listener", "ear") if has_ears and any(row[name] for _, row in rows)
+    ]
     ears: dict[tuple[str, ...], _Row] = {}
     first_rows: dict[tuple[str, ...], dict[str, str]] = {}
     differing_names = set()
     for place, row in rows:
         ear = {name: row[name] for name in ("listener", "ear") if has_ears}
-        key = tuple(ear.values())
+        for name in required_names:
+            if not row[name]:
+                raise ValueError(
+                    f"{place}: expected a value in the column {name}, as in other rows, got none; "
+                    "fill it in"
+                )
+        key = tuple(EAR_NAMES.get(text.lower(), text) for text in ear.values())
         _, wide = ears.setdefault(key, (place, ear))
         first_row = first_rows.setdefault(key, row)
         differing_names |= {name for name in names if row[name] != first_row[name]}

@@ -75,6 +75,18 @@ def test_columns_that_differ_within_an_ear_of_a_long_table_are_named(tmp_path: P
         assert len(read_audiograms(path)) == 2
 
 
+def test_an_ear_of_a_long_table_may_be_spelt_in_several_ways(tmp_path: Path) -> None:
+    rows = "A,R,250,10\nA,right,1000,20\nA,RE,4000,30\n"
+    ears = read_text(tmp_path, f"listener,ear,frequency,threshold\n{rows}")
+    assert ears == [Audiogram((10, 20, 30), (250, 1000, 4000))]
+
+
+@pytest.mark.parametrize(("row", "column"), [(",,500,20", "listener"), ("A,,500,20", "ear")])
+def test_merged_cells_of_a_long_table_are_rejected(tmp_path: Path, row: str, column: str) -> None:
+    with pytest.raises(ValueError, match=rf"line 3: expected a value in the column {column}, as"):
+        read_text(tmp_path, f"listener,ear,frequency,threshold\nA,L,250,10\n{row}\n")
+
+
 @pytest.mark.parametrize("text", ["", "NA", "n/a", "null", "None", "nan"])
 def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
     tmp_path: Path, text: str

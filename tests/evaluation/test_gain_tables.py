@@ -129,6 +129,14 @@ def test_steep_gains_of_the_trained_aid_are_those_of_the_equaliser() -> None:
     assert np.abs(error).max() < TOLERANCE_DB
 
 
+@pytest.mark.parametrize("rate", [16000, 96000, 192000])
+def test_low_frequencies_have_their_gain_at_every_sample_rate(rate: int) -> None:
+    aid = load_compensator("nalr")
+    text = export_gains(aid, "S3", "camilladsp", sample_rate=rate)
+    error = apply_camilladsp(text, 65.0) - aid.gains("S3", 65.0).double().numpy()
+    assert np.abs(error).max() < TOLERANCE_DB
+
+
 def test_command_prints_or_writes_the_text(
     tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:

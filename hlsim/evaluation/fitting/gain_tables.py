@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -30,7 +31,9 @@ BAND_LEVELS = tuple(float(level) for level in range(0, 121, 3))
 """Levels in dB SPL of a band of openMHA for which its table has gains."""
 
 TAPS = 1023
-"""Coefficients of the filter for CamillaDSP."""
+"""Coefficients of the filter for CamillaDSP up to ``TAPS_RATE``, in Hz; faster ones have more."""
+
+TAPS_RATE = 48000
 
 _HERTZ = np.arange(1, RATE // 2 + 1)
 """Frequencies of ``speech_density``, and those at which filters are designed."""
@@ -148,7 +151,9 @@ def _write_camilladsp(fitting: _Fitting) -> str:
     points = _equaliser_points(fitting.gains(fitting.level))
     hertz = np.array([0, *_HERTZ, *[fitting.sample_rate / 2][: fitting.sample_rate > RATE]])
     response = 10.0 ** (np.interp(hertz, _HERTZ, _interpolate(points)) / 20.0)
-    linear_phase = scipy.signal.firwin2(TAPS, hertz, response, fs=fitting.sample_rate)
+    # A filter resolves low frequencies by its duration, which must not fall with a higher rate.
+    taps = (TAPS + 1) * math.ceil(fitting.sample_rate / TAPS_RATE) - 1
+    linear_phase = scipy.signal.firwin2(taps, hertz, response, fs=fitting.sample_rate)
     filter_ = scipy.signal.minimum_phase(linear_phase, half=False)
     values = ", ".join(f"{value:.8g}" for value in filter_)
     return f"""\
