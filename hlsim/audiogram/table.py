@@ -251,7 +251,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
             f"{rows[0][0]}: expected the columns listener and ear beside {frequency} and "
             f"{threshold}, got {', '.join(names)}; add or rename columns"
         )
-    # A spreadsheet with merged cells has the listener and the ear in the first row of each ear only.
+    # A spreadsheet with merged cells names the listener and the ear in the first row only.
     required_names = [
         name for name in ("listener", "ear") if has_ears and any(row[name] for _, row in rows)
     ]
