@@ -16,8 +16,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.signal import correlate
 from torch import Tensor, nn
 
 MAX_DELAY_SECONDS = 2e-3
@@ -176,7 +176,7 @@ class WaveformPlugin:
                 f"{self.kind} {self.name} returned silence for sound, expected an output that is "
                 "time-aligned with the input"
             )
-        correlation = np.abs(correlate(*channels, method="fft"))
+        correlation = np.abs(scipy.signal.correlate(*channels, method="fft"))
         delay = int(correlation.argmax()) - (waveform.shape[-1] - 1)
         if abs(delay) > MAX_DELAY_SECONDS * sample_rate:
             raise ValueError(

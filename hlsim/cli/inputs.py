@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hlsim.extras import require
+from hlsim.extras import is_installed, require
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
@@ -40,7 +40,8 @@ def check_extras(*extras: str) -> None:
     """
     for extra in extras:
         for package in PACKAGES[extra]:
-            require(package, extra)
+            if not is_installed(package):
+                require(package, extra)  # raises the error
 
 
 def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:

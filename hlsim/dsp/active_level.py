@@ -3,8 +3,7 @@
 import math
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
-from scipy.signal import lfilter
+import scipy
 from torch import Tensor
 
 _TIME_CONSTANT = 0.03
@@ -48,12 +47,14 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     if not samples.any():
         raise ValueError("expected speech, got a waveform that is silent or empty")
     pole = math.exp(-1.0 / (sample_rate * _TIME_CONSTANT))
-    smoothed_once = lfilter([1.0 - pole], [1.0, -pole], np.abs(samples))
-    envelope = lfilter([1.0 - pole], [1.0, -pole], smoothed_once)
+    smoothed_once = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], np.abs(samples))
+    envelope = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], smoothed_once)
     thresholds = _THRESHOLDS * envelope.max()
     # A sample is active if the envelope reaches the threshold there or within the hangover before.
     width = max(1, round(_HANGOVER * sample_rate))
-    recent_maximum = maximum_filter1d(envelope, width, mode="constant", origin=(width - 1) // 2)
+    recent_maximum = scipy.ndimage.maximum_filter1d(
+        envelope, width, mode="constant", origin=(width - 1) // 2
+    )
     inactive_samples = np.searchsorted(np.sort(recent_maximum), thresholds)
     active_samples = np.maximum(len(samples) - inactive_samples, 1)
     levels = 10.0 * np.log10(np.square(samples).sum() / active_samples)

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.signal import firwin2
 from torch import Tensor, nn
 
 from hlsim.audio import read_audio
@@ -146,7 +146,7 @@ def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
     """
     hertz = np.linspace(0.0, NEURO_RATE / 2.0, _EQUALISER_TAPS)
     gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
-    taps = firwin2(_EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
+    taps = scipy.signal.firwin2(_EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
     return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
 
 

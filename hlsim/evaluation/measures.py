@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.signal import correlate, correlation_lags
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
@@ -285,11 +285,15 @@ def find_lag(output: Tensor, clean: Tensor) -> int | None:
     32
     """
     signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
-    correlation = np.abs(correlate(*signals, method="fft"))
-    peak = correlation.argmax()
+    points = scipy.fft.next_fast_len(len(output) + len(clean), real=True)
+    spectra = [scipy.fft.rfft(signal, points) for signal in signals]
+    # Negative lags are at the end.
+    correlation = np.abs(scipy.fft.irfft(spectra[0] * spectra[1].conj(), points))
+    peak = int(correlation.argmax())
     lowest = _CORRELATION_FLOOR * np.prod([np.linalg.norm(signal) for signal in signals])
-    lags = correlation_lags(len(output), len(clean))
-    return int(lags[peak]) if correlation[peak] > lowest else None
+    if not correlation[peak] > lowest:
+        return None
+    return peak if peak < len(output) else peak - points
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 import torch
-from scipy import stats
 from torch import Tensor, nn
 
 from hlsim.calibration import NEURO_RATE
@@ -188,8 +188,8 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
     x, y = rows.reindex(columns=columns).astype(float).dropna().to_numpy().T
     is_defined = len(x) >= 2 and np.ptp(x) > 0.0 and np.ptp(y) > 0.0
     return {
-        "lcc": float(stats.pearsonr(x, y)[0]) if is_defined else None,
-        "srcc": float(stats.spearmanr(x, y)[0]) if is_defined else None,
+        "lcc": float(scipy.stats.pearsonr(x, y)[0]) if is_defined else None,
+        "srcc": float(scipy.stats.spearmanr(x, y)[0]) if is_defined else None,
         "mse": float(np.mean((x - y) ** 2)) if len(x) else None,
     }
 

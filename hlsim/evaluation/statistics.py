@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 RESAMPLES = 9999
 """Number of bootstrap resamples."""
@@ -98,7 +98,7 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     zeros = int(np.count_nonzero(difference == 0.0))
     t = p_t = w = p_w = d = None
     if spread and spread > tolerance:
-        t, p_t = (float(value) for value in stats.ttest_1samp(difference, 0.0))
+        t, p_t = (float(value) for value in scipy.stats.ttest_1samp(difference, 0.0))
         d = float(difference.mean()) / spread
     if n > 1 and zeros < n:
         # SciPy counts zeros when it chooses between the exact and the approximate p value.
@@ -106,7 +106,7 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
         precision = np.float32 if (both.astype(np.float32) == both).all() else np.float64
         # Two differences of scores contain the rounding of four scores.
         tied = _join_ties(changes, 4.0 * _ROUNDING[precision] * float(np.abs(both).max()))
-        w, p_w = (float(value) for value in stats.wilcoxon(tied))
+        w, p_w = (float(value) for value in scipy.stats.wilcoxon(tied))
     before_mean, after_mean, delta = (float(x.mean()) for x in (first, second, difference))
     interval = bootstrap_interval(difference) if n >= MIN_ITEMS_FOR_INTERVAL else (None, None)
     return PairedComparison(
@@ -163,8 +163,8 @@ def bootstrap_interval(values: Iterable[float]) -> tuple[float, float]:
     if n < MIN_ITEMS_FOR_INTERVAL:
         raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}; add items")
     indices = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
-    expanded = stats.t.ppf(0.975, n - 1) * math.sqrt(n / (n - 1))
-    tail = 100.0 * stats.norm.cdf(-expanded)
+    expanded = scipy.special.stdtrit(n - 1, 0.975) * math.sqrt(n / (n - 1))
+    tail = 100.0 * scipy.special.ndtr(-expanded)
     low, high = np.percentile(data[indices].mean(-1), [tail, 100.0 - tail])
     return float(low), float(high)
 
