@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -23,9 +24,10 @@ _GRID_POINTS = 513
 
 
 def frequency_sampling_fir(
+    taps: int,
     frequencies: NDArray[np.float64],
     gains: NDArray[np.float64],
-    window: NDArray[np.float64],
+    window: str | tuple[str, float] = "hamming",
 ) -> NDArray[np.float64]:
     """Design a linear-phase FIR filter from gains at some frequencies, as MATLAB's ``fir2`` does.
 
@@ -35,19 +37,19 @@ def frequency_sampling_fir(
     they are close. MSBG and pyclarity's NAL-R follow ``fir2``.
 
     Args:
+        taps: Number of coefficients, odd and at most 1023. The filter delays by (taps - 1) / 2
+            samples.
         frequencies: Ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
         gains: Linear gain at each frequency.
-        window: Window by which the coefficients are multiplied, (taps,), where the number of taps
-            is odd and at most 1023. The filter delays by (taps - 1) / 2 samples.
+        window: Window by which the coefficients are multiplied, as in ``scipy.signal.get_window``.
 
     Returns:
         Coefficients of the filter, (taps,).
 
-    >>> flat = frequency_sampling_fir(np.array([0.0, 1.0]), np.array([2.0, 2.0]), np.ones(3))
+    >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), "boxcar")
     >>> print(abs(flat).round(6))
     [0. 2. 0.]
     """
-    taps = len(window)
     grid_gains = np.zeros(_GRID_POINTS)
     grid_gains[0] = gains[0]
     start = 0
@@ -60,28 +62,7 @@ def frequency_sampling_fir(
     intervals = _GRID_POINTS - 1
     delay = np.exp(-0.5j * (taps - 1) * np.pi * np.arange(_GRID_POINTS) / intervals)
     impulse_response = np.fft.irfft(grid_gains * delay, 2 * intervals)
-    return impulse_response[:taps] * window
-
-
-def windowed_sinc_fir(low: float, high: float, window: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Design a linear-phase FIR filter for a band by a window, as ``scipy.signal.firwin`` does.
-
-    Args:
-        low, high: Edges of the band from 0 to 1, where 1 is the Nyquist frequency. The gain is 1 in
-            its middle, at 0 Hz if ``low`` is 0, and at the Nyquist frequency if ``high`` is 1.
-        window: Window by which the coefficients are multiplied, (taps,).
-
-    Returns:
-        Coefficients of the filter, (taps,).
-
-    >>> print(windowed_sinc_fir(0.0, 0.5, np.ones(3)).round(3))
-    [0.28 0.44 0.28]
-    """
-    place = np.arange(len(window)) - (len(window) - 1) / 2.0
-    taps = (high * np.sinc(high * place) - low * np.sinc(low * place)) * window
-    middle = 0.0 if low == 0.0 else high if high == 1.0 else (low + high) / 2.0
-    gain: float = taps @ np.cos(np.pi * middle * place)
-    return taps / gain
+    return impulse_response[:taps] * scipy.signal.get_window(window, taps, fftbins=False)
 
 
 def filters_with_gains(
@@ -117,8 +98,7 @@ def _unit_filters(order: int) -> NDArray[np.float64]:
     Returns: (order + 1, order + 1), one row per frequency.
     """
     grid = np.arange(order + 1) / order
-    window = np.hamming(order + 1)
-    return np.stack([frequency_sampling_fir(grid, gain, window) for gain in np.eye(order + 1)])
+    return np.stack([frequency_sampling_fir(len(grid), grid, gain) for gain in np.eye(len(grid))])
 
 
 def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:

@@ -285,15 +285,11 @@ def find_lag(output: Tensor, clean: Tensor) -> int | None:
     32
     """
     signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
-    points = scipy.fft.next_fast_len(len(output) + len(clean), real=True)
-    spectra = [scipy.fft.rfft(signal, points) for signal in signals]
-    # Negative lags are at the end.
-    correlation = np.abs(scipy.fft.irfft(spectra[0] * spectra[1].conj(), points))
-    peak = int(correlation.argmax())
+    correlation = np.abs(scipy.signal.correlate(*signals, method="fft"))
+    peak = correlation.argmax()
     lowest = _CORRELATION_FLOOR * np.prod([np.linalg.norm(signal) for signal in signals])
-    if not correlation[peak] > lowest:
-        return None
-    return peak if peak < len(output) else peak - points
+    lags = scipy.signal.correlation_lags(len(output), len(clean))
+    return int(lags[peak]) if correlation[peak] > lowest else None
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:

@@ -23,9 +23,8 @@ on Audio, Speech, and Language Processing 24(2), 354-365, doi 10.1109/TASLP.2015
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -34,7 +33,6 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.dsp.fft import fft_length
-from hlsim.dsp.fir import windowed_sinc_fir
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.recursions import RATE
@@ -138,9 +136,13 @@ def _split_by_rate(waves: Tensor) -> Tensor:
 @constant
 def _modulation_responses(points: int) -> NDArray[np.float64]:
     """Return the frequency responses of the bands of modulation: (4, points // 2 + 1)."""
-    edges = [*(edge / (ENVELOPE_RATE / 2) for edge in MODULATION_EDGES), 1.0]
-    window = np.hanning(MODULATION_ORDER + 1)
-    filters = [windowed_sinc_fir(low, high, window) for low, high in pairwise(edges)]
+    filters = []
+    for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
+        edges = [low] if high is None else [low, high]
+        taps = scipy.signal.firwin(
+            MODULATION_ORDER + 1, edges, window="hann", pass_zero=False, fs=ENVELOPE_RATE
+        )
+        filters.append(taps)
     return zero_phase_responses(filters, points)
 
 

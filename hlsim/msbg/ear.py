@@ -5,9 +5,10 @@ cochlea. Its inverse turns the output of the cochlea back into sound, and a low-
 """
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from hlsim.dsp.fir import frequency_sampling_fir, windowed_sinc_fir
+from hlsim.dsp.fir import frequency_sampling_fir
 
 MSBG_RATE = 44100
 """Sample rate in Hz at which MSBG is defined."""
@@ -59,7 +60,7 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     # 23 ms, so that the gain is accurate down to about 100 Hz
     taps = 2 * EAR_DELAY + 1
     gains = 10.0 ** (gain_db / 20.0)
-    return frequency_sampling_fir(hz / nyquist, gains, np.kaiser(taps, 4.0))
+    return frequency_sampling_fir(taps, hz / nyquist, gains, ("kaiser", 4.0))
 
 
 def lowpass_filter() -> NDArray[np.float64]:
@@ -71,4 +72,4 @@ def lowpass_filter() -> NDArray[np.float64]:
     >>> lowpass_filter().shape
     (133,)
     """
-    return windowed_sinc_fir(0.0, 18000.0 / (MSBG_RATE / 2.0), np.kaiser(133, 8.0))
+    return scipy.signal.firwin(133, 18000.0, window=("kaiser", 8.0), fs=MSBG_RATE)

