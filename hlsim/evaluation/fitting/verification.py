@@ -19,6 +19,7 @@ from compensators.filter_bank import SPEECH_SPECTRUM
 from hlsim.audiogram import FREQUENCIES, Audiogram, as_audiogram
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
+from hlsim.evaluation.measures import find_lag
 from hlsim.metrics.band_levels import normal_threshold
 from hlsim.metrics.pair import check_finite
 from hlsim.metrics.sii import SII_BANDS, sii
@@ -109,12 +110,14 @@ def verify(
 ) -> Verification:
     """Measure the gains of an aid from its input and output, beside the targets for an ear.
 
-    Percentiles do not depend on the delay of the aid. The input should be at least 15 s of speech
+    Both are cut to the sound that they share, so that results do not depend on a delay of the output
+    and on silence before or after the sound of one recording. The input should be at least 15 s of speech
     without noise; with shorter ones, valleys and peaks are less certain.
 
     Args:
         input_: Input of the aid, (time,).
-        output: Output at the same scale, of the same length or up to 1 s longer or shorter.
+        output: Output at the same scale, of the same length or up to 1 s longer or shorter, and up
+            to 1 s later or earlier.
         ear: Audiogram of the ear.
         sample_rate: Sample rate of both in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
@@ -148,6 +151,7 @@ def verify(
             f"input and output differ in length by more than 1 s, {len(input_)} and "
             f"{len(output)} samples; expected recordings of the same sound"
         )
+    input_, output = _cut_to_common_sound(input_, output, rate)
     hertz = np.array(SII_BANDS, dtype=float)
     gain = gain_to_pascals(full_scale_spl)
     powers = [section_powers(gain * signal, rate) for signal in (input_, output)]
@@ -170,6 +174,30 @@ def verify(
         unaided_sii=unaided_sii,
         aided_sii=aided_sii,
     )
+
+
+def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Tensor, Tensor]:
+    """Cut two recordings to the sound that both have, in CPU memory and without a gradient.
+
+    If they are not similar enough to find the lag of the output, it is taken as 0.
+
+    Raises:
+        ValueError: The output is later or earlier by more than 1 s, or less than 1 s is common.
+    """
+    input_, output = input_.detach().cpu(), output.detach().cpu()
+    lag = find_lag(output, input_) or 0
+    if abs(lag) > rate:
+        raise ValueError(
+            f"the output is {lag / rate:.1f} s later than the input (earlier, if negative); cut the "
+            "recordings so that they begin together"
+        )
+    input_, output = input_[max(0, -lag) :], output[max(0, lag) :]
+    samples = min(len(input_), len(output))
+    if samples < MIN_SECONDS * rate:
+        raise ValueError(
+            f"input and output have only {samples / rate:.1f} s in common; expected 1 s or more"
+        )
+    return input_[:samples], output[:samples]
 
 
 def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Array:
