@@ -110,8 +110,8 @@ def verify(
 ) -> Verification:
     """Measure the gains of an aid from its input and output, beside the targets for an ear.
 
-    Both are cut to the sound that they share, so that results do not depend on a delay of the output
-    and on silence before or after the sound of one recording. The input should be at least 15 s of speech
+    Both are cut to the sound that they share, so that results do not depend on a delay, or on
+    silence before or after the sound of one recording. The input should be at least 15 s of speech
     without noise; with shorter ones, valleys and peaks are less certain.
 
     Args:
@@ -188,8 +188,8 @@ def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Ten
     lag = find_lag(output, input_) or 0
     if abs(lag) > rate:
         raise ValueError(
-            f"the output is {lag / rate:.1f} s later than the input (earlier, if negative); cut the "
-            "recordings so that they begin together"
+            f"the output is {lag / rate:.1f} s later than the input (earlier, if negative); cut "
+            "the recordings so that they begin together"
         )
     input_, output = input_[max(0, -lag) :], output[max(0, lag) :]
     samples = min(len(input_), len(output))
