@@ -32,7 +32,7 @@ CACHE = ROOT / "build" / "listening-page"
 
 RUNTIME = "onnxruntime-web@1.30.0"
 RUNTIME_FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm")
-SIMULATOR = "neuro-msbg-light"
+SIMULATOR = "neuro-msbg"
 AID = "hearing-aid"
 SPEECH = (
     "valid/flite-rms-01",

@@ -46,7 +46,7 @@ SIMULATORS: dict[str, Callable[[], nn.Module]] = {
     "MSBG": MSBG,
     "MSBG without smearing": lambda: MSBG(smearing=False),
     "linear ear": Attenuation,
-    "neuro-msbg": lambda: load_pretrained("neuro-msbg"),
+    "neuro-msbg-cnn-narrow": lambda: load_pretrained("neuro-msbg-cnn-narrow"),
 }
 
 THREE_EARS = ("MSBG", "MSBG without smearing", "linear ear")

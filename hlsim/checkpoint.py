@@ -38,6 +38,9 @@ _WITHOUT_CHECKPOINT = ("msbg", "msbg-unsmeared", "attenuation", "nalr", "wdrc")
 """Names of simulators and aids that have no checkpoint."""
 CARD = "README.md"
 
+_REPLACED = {"neuro-msbg-light": "; neuro-msbg replaced it, which has its structure"}
+"""Reason why a name of an earlier version has no checkpoint."""
+
 SIMULATOR = "neuro-msbg"
 """Kind of the checkpoints of simulators."""
 
@@ -90,7 +93,7 @@ def read_checkpoint(
 
     >>> from hlsim.neuro import NeuroConfig, NeuroMSBG
     >>> kinds = {SIMULATOR: NeuroConfig.from_dict}
-    >>> read_checkpoint("neuro-msbg-light", kinds, NeuroMSBG).config.blocks
+    >>> read_checkpoint("neuro-msbg", kinds, NeuroMSBG).config.blocks
     2
     """
     folder = _find_folder(name)
@@ -187,7 +190,9 @@ def _find_folder(name: str | Path) -> Path:
     for folder in (path, path / "checkpoint", checkpoints_folder() / path):
         if (folder / CONFIG).is_file():
             return folder
-    suggestion = suggest(str(name), [*list_pretrained(), *_WITHOUT_CHECKPOINT])
+    suggestion = _REPLACED.get(str(name)) or suggest(
+        str(name), [*list_pretrained(), *_WITHOUT_CHECKPOINT]
+    )
     raise ValueError(
         f"no checkpoint {str(name)!r}{suggestion}; expected {', '.join(list_pretrained())}, or a "
         f"folder with {CONFIG}; models without a checkpoint are {', '.join(_WITHOUT_CHECKPOINT)}"

@@ -91,7 +91,7 @@ def export_program(
         ValueError: The simulator is no Neuro-MSBG at 16 kHz.
 
     >>> import hlsim
-    >>> program = export_program(hlsim.load_pretrained("neuro-msbg-light"), seconds=0.1)
+    >>> program = export_program(hlsim.load_pretrained("neuro-msbg"), seconds=0.1)
     >>> inputs = {"waveform": torch.zeros(1, 1600), "thresholds": torch.full((1, 8), 40.0)}
     >>> perceived = program.module()(**inputs)["perceived"]
     """
@@ -133,7 +133,7 @@ def export_onnx(
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> import hlsim
-    >>> simulator = hlsim.load_pretrained("neuro-msbg-light")
+    >>> simulator = hlsim.load_pretrained("neuro-msbg")
     >>> export_onnx(simulator, "simulator.onnx")  # doctest: +SKIP
     """
     program = export_program(simulator, seconds=seconds, items=items)

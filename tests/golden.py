@@ -497,7 +497,7 @@ def msbg_cases() -> dict[str, Case]:
 def network_cases() -> dict[str, Case]:
     resampled_case = partial(Case, tolerance=RESAMPLED_NETWORK, gradient_tolerance=GRADIENT)
     cases = {}
-    for kind in ("", "-cnn", "-light", "-lstm", "-mamba", "-transformer"):
+    for kind in ("", "-cnn", "-cnn-narrow", "-lstm", "-mamba", "-transformer"):
         name = f"neuro-msbg{kind}"
         cases[f"checkpoint {name}"] = Case(partial(network, load_pretrained, name))
     for rate in (22050, 44100, 48000):
@@ -510,7 +510,7 @@ def network_cases() -> dict[str, Case]:
     for name, load in (
         ("compensator-general", load_compensator),
         ("hearing-aid", load_compensator),
-        ("neuro-msbg-light", load_pretrained),
+        ("neuro-msbg", load_pretrained),
     ):
         cases[f"parameters of {name} in training"] = Case(partial(network_training, load, name))
     for kind in ("MappingCompensator", "HearingAid"):

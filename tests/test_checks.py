@@ -64,8 +64,8 @@ def test_samples_up_to_the_highest_and_nan_pass() -> None:
 
 ENTRANCES: dict[str, Callable[[Tensor], object]] = {
     "MSBG": hlsim.MSBG("N3"),
-    "NeuroMSBG": lambda wave: hlsim.load_pretrained("neuro-msbg-light")(wave, "N3"),
-    "loss": lambda wave: hlsim.HearingLossLoss("N3", simulator="neuro-msbg-light")(wave, wave),
+    "NeuroMSBG": lambda wave: hlsim.load_pretrained("neuro-msbg")(wave, "N3"),
+    "loss": lambda wave: hlsim.HearingLossLoss("N3", simulator="neuro-msbg")(wave, wave),
     "NAL-R": NALR("N3"),
     "WDRC": lambda wave: WDRC()(wave, "N3"),
     "mapping": lambda wave: hlsim.load_compensator("compensator-general")(wave, "N3"),

@@ -184,8 +184,8 @@ def test_benchmark_prints_a_table_of_each_kind(
 ) -> None:
     pytest.importorskip("clarity")
     example = load_figure("benchmark.py")
-    monkeypatch.setattr(example, "LOSS_SIMULATORS", ("neuro-msbg-light",))
-    tables, simulators = ["simulators", "loss", "step"], ["--simulators", "neuro-msbg-light"]
+    monkeypatch.setattr(example, "LOSS_SIMULATORS", ("neuro-msbg",))
+    tables, simulators = ["simulators", "loss", "step"], ["--simulators", "neuro-msbg"]
     example.main(["--repeats", "1", "--seconds", "0.2", "--what", *tables, *simulators])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines if "forward (ms)" in line] == tables

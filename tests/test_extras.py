@@ -32,7 +32,7 @@ def test_export_without_onnx_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
-    simulator = hlsim.load_pretrained("neuro-msbg-light")
+    simulator = hlsim.load_pretrained("neuro-msbg")
     with pytest.raises(MissingExtraError, match=r"pip install 'hlsim\[onnx\]'"):
         hlsim.export.export_onnx(simulator, tmp_path / "ear.onnx", seconds=0.1)
 

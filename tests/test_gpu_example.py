@@ -26,8 +26,8 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
 def test_gpu_measurement_on_a_cpu(
     example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    paper = {"cnn": {"channels": 8, "blocks": 1}}
-    monkeypatch.setattr(example, "simulator_names", lambda: ["neuro-msbg-light"])
+    paper = {"cnn": {"structure": "dual-path", "channels": 8, "blocks": 1}}
+    monkeypatch.setattr(example, "simulator_names", lambda: ["neuro-msbg"])
     monkeypatch.setattr(example, "CRITERIA", ["interaural"])
     timed = example.speed_subjects()[::12]
     monkeypatch.setattr(example, "speed_subjects", lambda: timed)

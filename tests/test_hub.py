@@ -14,7 +14,7 @@ import hlsim
 from hlsim.extras import MissingExtraError
 
 CLASSES = {
-    "neuro-msbg-light": hlsim.NeuroMSBG,
+    "neuro-msbg": hlsim.NeuroMSBG,
     "hearing-aid": hlsim.HearingAid,
     "compensator-general": hlsim.MappingCompensator,
 }
@@ -123,7 +123,7 @@ def test_names_that_are_no_repository_and_other_kinds_are_refused(hub: Hub) -> N
     with pytest.raises(ValueError, match="no checkpoint 'hearing-ais'"):
         hlsim.HearingAid.from_pretrained("hearing-ais")
     with pytest.raises(ValueError, match="expected a checkpoint of kind hearing-aid"):
-        hlsim.HearingAid.from_pretrained("neuro-msbg-light")
+        hlsim.HearingAid.from_pretrained("neuro-msbg")
     with pytest.raises(ValueError, match="no checkpoint 'me/aid'"):
         hlsim.load_compensator("me/aid")  # which never downloads
     assert hub.requests == []

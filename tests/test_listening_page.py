@@ -117,7 +117,7 @@ def error_db(output: Tensor, expected: Tensor) -> float:
 
 def expected_results(signal: Tensor, ear: str) -> dict[str, Tensor]:
     """Compute the three versions of the page in Python. In the page, silence follows a sound."""
-    simulator = hlsim.load_pretrained("neuro-msbg-light")
+    simulator = hlsim.load_pretrained("neuro-msbg")
     silence = torch.zeros(16000)
     clean = torch.cat((set_level(signal, 65.0), silence))
     with torch.no_grad():

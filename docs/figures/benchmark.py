@@ -28,7 +28,7 @@ from hlsim.metrics import haspi, hasqi, mbstoi
 EAR = Audiogram.standard("N2")
 FULL_SCALE_SPL = 94.0
 SHIPPED = [name for name in list_pretrained() if name.startswith("neuro-")]
-LOSS_SIMULATORS = ("neuro-msbg", "neuro-msbg-light", "msbg")
+LOSS_SIMULATORS = ("neuro-msbg", "msbg")
 PYCLARITY_RATE = 44100  # Hz, the only rate of pyclarity's MSBG
 
 

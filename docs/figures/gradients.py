@@ -63,10 +63,10 @@ def main() -> None:
     for criterion in ("coherent-bands", "bands"):
         losses = {
             name: HearingLossLoss(simulator=name, criterion=criterion, reduction="none")
-            for name in ("msbg", "neuro-msbg", "neuro-msbg-light")
+            for name in ("msbg", "neuro-msbg", "neuro-msbg-cnn-narrow")
         }
         exact = [compute_gradients(losses["msbg"], scene, clean, ears) for scene in scenes]
-        for name, shift in (("neuro-msbg", 0), ("neuro-msbg-light", 0), ("msbg", HALF_HOP)):
+        for name, shift in (("neuro-msbg", 0), ("neuro-msbg-cnn-narrow", 0), ("msbg", HALF_HOP)):
             cells = []
             for scene, expected in zip(scenes, exact, strict=True):
                 gradients = compute_gradients(losses[name], scene, clean, ears, shift)

@@ -22,7 +22,7 @@ from torch import Tensor
 from hlsim import HearingLossLoss
 from hlsim.calibration import set_level
 
-SIMULATORS = ("msbg", "neuro-msbg", "neuro-msbg-light")
+SIMULATORS = ("msbg", "neuro-msbg")
 CRITERIA = ("coherent-bands", "bands", "paper")
 RATES = (16000, 44100)
 

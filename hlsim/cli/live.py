@@ -25,8 +25,8 @@ def live(parser: Parser) -> None:
     text = "a streaming aid: wdrc (compression in bands), or a hearing aid's name or folder"
     option("--compensator", str, text, "hearing-aid", group=models)
     text = (
-        "simulate the hearing loss with neuro-msbg instead, in blocks of 96 ms and with a "
-        "delay of 200 ms"
+        "simulate the hearing loss with neuro-msbg instead, in blocks of 36 ms and with a "
+        "delay of 126 ms"
     )
     parser.flag("--simulate", text, group=models)
     parser.sliders()

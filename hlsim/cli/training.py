@@ -17,8 +17,8 @@ def train_simulator(parser: Parser) -> None:
     parser.set_command(
         _train_simulator,
         "--speech speech/train --valid-speech speech/valid --out runs/simulator",
-        "--recipe examples/neuro-msbg-light.yaml --recipe.batch 4 --manifest "
-        "VoiceBank/manifest.csv --out runs/light",
+        "--recipe examples/neuro-msbg-lstm.yaml --recipe.batch 4 --manifest "
+        "VoiceBank/manifest.csv --out runs/lstm",
     )
     parser.teacher("simulator whose output the network learns")
     _declare_common(parser)

@@ -45,11 +45,12 @@ def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return draw_uniform(low, high, (items, *shape), generator)
 
-    hertz = uniform(math.log(_LOWEST_TONE), math.log(_HIGHEST_TONE), _MAX_TONES).exp()
+    # Square roots of frequencies are equally likely, which makes high tones frequent.
+    hertz = uniform(math.sqrt(_LOWEST_TONE), math.sqrt(_HIGHEST_TONE), _MAX_TONES).square()
     is_multiple = uniform(0.0, 1.0, _MAX_TONES) < 0.5
     hertz = torch.where(is_multiple, 250.0 * (hertz / 250.0).ceil(), hertz)
     levels_db = uniform(-40.0, 0.0, _MAX_TONES)
-    is_absent = uniform(0.0, 1.0, _MAX_TONES - 1) < 0.5
+    is_absent = uniform(0.0, 1.0, _MAX_TONES - 1) < 0.75
     levels_db[:, 1:][is_absent] = -math.inf
     amplitudes = 10.0 ** (levels_db / 20.0)
     time = torch.arange(samples)

@@ -6,8 +6,10 @@ The estimate is the output of a network, the target that of the simulator from w
 import torch
 from torch import Tensor
 
+from hlsim.calibration import NEURO_RATE
 from hlsim.dsp.fft import power
 from hlsim.losses.paper import PAPER_STFT
+from hlsim.metrics.band_levels import audibility_threshold, audibility_weights, band_levels
 
 POWER_FLOOR = 1e-20
 RELATIVE_FLOOR = 1e-6
@@ -52,3 +54,25 @@ def log_spectral_distance_db(estimate: Tensor, target: Tensor) -> Tensor:
     estimate_db = 10.0 * torch.log10(estimate_power + floor)
     target_db = 10.0 * torch.log10(target_power + floor)
     return (estimate_db - target_db).abs().mean((-2, -1))
+
+
+def band_level_distance_db(estimate: Tensor, target: Tensor, signal: Tensor) -> Tensor:
+    """Compute the mean absolute difference of band levels in dB, where the input is audible.
+
+    All audible bands and frames count the same, however softly they are perceived.
+
+    Shape: (items, time) three times, in pascals at 16 kHz -> (items,).
+
+    Args:
+        estimate: Output of the network.
+        target: Output of the simulator.
+        signal: Input of both.
+
+    >>> speech = torch.randn(1, 16000)
+    >>> band_level_distance_db(2.0 * speech, speech, speech).round(decimals=1)
+    tensor([6.])
+    """
+    levels = band_levels(signal, NEURO_RATE)
+    weights = audibility_weights(levels, audibility_threshold(levels))
+    errors = (band_levels(estimate, NEURO_RATE) - band_levels(target, NEURO_RATE)).abs()
+    return (weights * errors).sum((-2, -1)) / weights.sum((-2, -1)).clamp_min(1.0)

@@ -19,7 +19,7 @@ from torch.nn import functional
 from hlsim.dsp.erb import ERB_AT_0_HZ, erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.torchtools import constant, differentiable_once
+from hlsim.torchtools import constant
 
 FRAME = 256
 """Length of a frame in samples at 44.1 kHz."""
@@ -175,52 +175,29 @@ def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
     count = math.ceil(waveform.shape[-1] / hop)
     window = _window(rate_divisor, like=waveform)
     frames = _cut_frames(waveform, count, hop, window)
-    spectrum, _ = smear_spectrum(rfft(frames)[..., : len(matrix)], matrix)
+    spectrum, *_ = _SmearSpectrum.apply(rfft(frames)[..., : len(matrix)], matrix)
     half = len(window) // 2
     smeared_frames = torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
     return _overlap_add(smeared_frames, hop)
 
 
-def smear_spectrum(
-    spectrum: Tensor, matrix: Tensor, gradient_floor: float = 0.0
-) -> tuple[Tensor, Tensor]:
+def _smear_spectrum(
+    spectrum: Tensor, matrix: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Spread the power of spectra over neighbouring frequencies, and keep their phase.
 
     Smearing can give a negative power. Its square root is imaginary, so that the phase turns by 90
     degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is.
 
-    Shape: complex (..., bins), (bins, bins) or (items, bins, bins) -> complex (..., bins),
-        (..., bins).
+    Shape: complex (..., bins), (bins, bins) -> complex (..., bins), then (..., bins) each.
 
     Args:
         spectrum: Spectra of pressures in Pa.
-        matrix: Matrix by which power spectra are multiplied: one for all items, or one per item.
-        gradient_floor: Bound of the gradients, which are computed as if smearing multiplied each
-            power by this factor at least and by its reciprocal at most. A bounded gradient has no
-            second derivative. With 0, gradients have no bound where smearing changes the sign of a
-            power or fills an empty frequency.
-
-    Returns:
-        The smeared spectrum and its power.
-
-    >>> spectrum = torch.tensor([3.0 + 4.0j, 0.0])
-    >>> mixing = torch.tensor([[0.5, 0.5], [0.0, 1.0]])
-    >>> smear_spectrum(spectrum, mixing)[1]
-    tensor([1.2500e+01, 1.0000e-24])
-    """
-    smeared, smeared_power, *_ = _SmearSpectrum.apply(spectrum, matrix, gradient_floor)
-    return smeared, smeared_power
-
-
-def _smear_spectrum(
-    spectrum: Tensor, matrix: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Compute the results of ``smear_spectrum`` and the intermediate results for its gradient.
+        matrix: Matrix by which power spectra are multiplied.
 
     Returns:
         The smeared spectrum; its power in Pa^2; the real and the imaginary part of the complex
-        factor on the spectrum, of which one is nearly 0; and the power of the spectrum in Pa^2. All
-        have the shape of the spectrum, (..., bins).
+        factor on the spectrum, of which one is nearly 0; and the power of the spectrum in Pa^2.
     """
     spectrum_power = power(spectrum)
     smeared_power = (spectrum_power @ matrix.mT).add_(_POWER_FLOOR)
@@ -238,79 +215,43 @@ class _SmearSpectrum(torch.autograd.Function):
 
     Let x be the spectrum, p = |x|^2 its power, A the matrix, s = A p the smeared power, f the
     complex factor with f^2 = s / p, which is imaginary where s < 0, and z = f x the smeared
-    spectrum. The outputs are z and s. Let h be the gradient with respect to s, and g the gradient
-    with respect to z times the conjugate of f. Then, with e = Re(conj(x) g) and t = e / s + 2 h,
-
-    - the gradient with respect to x is g + x (A^T t - e / p), because the power of one frequency
-      changes the factors of others;
-    - the gradient with respect to A is t p^T / 2.
-
-    Both gradients grow without limit where s is near 0 or f is large. With a ``gradient_floor`` c,
-    |s| counts as c p at least in the division e / s, and |f|^2 as 1 / c at most.
+    spectrum. Let g be the gradient with respect to z times the conjugate of f. Then, with
+    e = Re(conj(x) g), the gradient with respect to x is g + x (A^T (e / s) - e / p), because the
+    power of one frequency changes the factors of others. It grows without limit where s is near 0
+    or f is large. The matrix is a constant and has no gradient.
     """
 
     @staticmethod
-    def forward(spectrum: Tensor, matrix: Tensor, gradient_floor: float) -> tuple[Tensor, ...]:
+    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, ...]:
         return _smear_spectrum(spectrum, matrix)
 
     @staticmethod
-    def setup_context(
-        ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, ...]
-    ) -> None:
-        spectrum, matrix, ctx.gradient_floor = inputs
-        ctx.mark_non_differentiable(*output[2:])
-        ctx.save_for_backward(spectrum, matrix, *output[1:])
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(
-        ctx: Any, gradient: Tensor, power_gradient: Tensor, *_: Tensor
-    ) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
         spectrum, matrix, *outputs = ctx.saved_tensors
         if torch.is_grad_enabled():
             # This gradient is itself differentiated, so it must depend on the spectrum.
             outputs = list(_smear_spectrum(spectrum, matrix)[1:])
         smeared_power, real, imaginary, spectrum_power = outputs
-        floor = ctx.gradient_floor
-        if floor:
-            magnitude = smeared_power.abs()
-            bounded = torch.maximum(magnitude, floor * spectrum_power)
-            divisor = torch.copysign(bounded, smeared_power)
-            # Where smearing amplifies the power by more than 1 / floor, it counts as 1 / floor.
-            limit = spectrum_power / (floor * magnitude + _DIVISION_EPS)
-            limit = limit.clamp_max(1.0).sqrt()
-            divisor = divisor * limit
-            real = real * limit
-            imaginary = imaginary * limit
-        else:
-            eps = smeared_power.new_full((), _DIVISION_EPS)
-            divisor = smeared_power + torch.copysign(eps, smeared_power)
+        eps = smeared_power.new_full((), _DIVISION_EPS)
+        divisor = smeared_power + torch.copysign(eps, smeared_power)
 
-        # g = gradient * conj(f), e = Re(conj(x) g), t = e / s + 2 h, then both gradients. Real and
-        # imaginary parts are computed separately, because torch would first convert the real
-        # factors of a complex product to complex numbers.
+        # g = gradient * conj(f), e = Re(conj(x) g), then the gradient. Real and imaginary parts are
+        # computed separately, because torch would first convert the real factors of a complex
+        # product to complex numbers.
         g_real = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
         g_imag = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
         e = torch.addcmul(spectrum.real * g_real, spectrum.imag, g_imag)
-        t = e / divisor + 2.0 * power_gradient
-        weight = t @ matrix - e / spectrum_power
-        matrix_gradient = None
-        if ctx.needs_input_grad[1]:
-            gradient_per_item = 0.5 * t.mT @ spectrum_power
-            matrix_gradient = gradient_per_item.sum_to_size(matrix.shape)
+        weight = (e / divisor) @ matrix - e / spectrum_power
         spectrum_gradient = torch.complex(
             torch.addcmul(g_real, spectrum.real, weight),
             torch.addcmul(g_imag, spectrum.imag, weight),
         )
-        if floor:
-            # A bounded gradient is no exact derivative, and its own derivative would be wrong.
-            message = (
-                "the gradient of a network with structure='bands', such as neuro-msbg-light, is "
-                "bounded and has no second derivative; use neuro-msbg or msbg"
-            )
-            spectrum_gradient = differentiable_once(spectrum_gradient, message)
-            if matrix_gradient is not None:
-                matrix_gradient = differentiable_once(matrix_gradient, message)
-        return spectrum_gradient, matrix_gradient, None
+        return spectrum_gradient, None
 
 
 @constant

@@ -38,7 +38,7 @@ class BandCorrection(nn.Module):
 
     >>> import torch
     >>> from hlsim.audiogram import severity_index
-    >>> config = NeuroConfig(structure="bands", channels=8)
+    >>> config = NeuroConfig(channels=8)
     >>> network = BandCorrection(config)
     >>> spectrum = torch.randn(2, 50, 65, dtype=torch.complex64)
     >>> ears = torch.full((2, 8), 40.0)
@@ -78,7 +78,7 @@ class BandCorrection(nn.Module):
         features = self.enter[severity] @ features
         features = features + self.bias[severity]
         for block in self.blocks:
-            features = block(features)
+            features = block(features, severity)
 
         outputs = self.leave[severity] @ features
         envelope_correction, gain_correction, phase = outputs.split(CHANNELS, 1)
@@ -111,25 +111,40 @@ class _Block(nn.Module):
     """A depthwise convolution over time and a two-layer network over features, each with a skip.
 
     Features are those of the network, not the channels of MSBG's filter bank. The convolution sees
-    as much of the future as of the past.
+    as much of the future as of the past. Each severity has its own weights.
 
-    Shape: (items, features, steps) -> (items, features, steps).
+    Shape: (items, features, steps), (items,) -> (items, features, steps).
     """
 
     def __init__(self, config: NeuroConfig) -> None:
         super().__init__()
+        severities = len(SEVERITIES)
         width = config.channels
         inner = config.channels * config.expansion
         length = config.kernel[0]
-        self.time = nn.Conv1d(width, width, length, padding=length // 2, groups=width)
+        self.time = nn.Parameter(
+            (2.0 * torch.rand(severities, width, length) - 1.0) / math.sqrt(length)
+        )
+        self.time_bias = nn.Parameter(torch.zeros(severities, width))
         # These are matrix products, because convolutions of length 1 take twice as long.
-        self.widen = nn.Parameter(torch.randn(inner, width) / math.sqrt(width))
-        self.narrow = nn.Parameter(torch.randn(width, inner) / (2.0 * math.sqrt(inner)))
-        self.bias = nn.Parameter(torch.zeros(inner, 1))
+        self.widen = nn.Parameter(torch.randn(severities, inner, width) / math.sqrt(width))
+        self.narrow = nn.Parameter(torch.randn(severities, width, inner) / (2.0 * math.sqrt(inner)))
+        self.bias = nn.Parameter(torch.zeros(severities, inner, 1))
 
-    def forward(self, features: Tensor) -> Tensor:
-        features = features + functional.silu(self.time(features))
-        return features + self.narrow @ functional.silu(self.widen @ features + self.bias)
+    def forward(self, features: Tensor, severity: Tensor) -> Tensor:
+        items, width, _ = features.shape
+        kernels = self.time[severity].flatten(0, 1).unsqueeze(1)
+        rows = features.reshape(1, items * width, -1)
+        smoothed = functional.conv1d(
+            rows,
+            kernels,
+            self.time_bias[severity].flatten(),
+            padding=kernels.shape[-1] // 2,
+            groups=items * width,
+        )
+        features = features + functional.silu(smoothed.reshape(features.shape))
+        hidden = functional.silu(self.widen[severity] @ features + self.bias[severity])
+        return features + self.narrow[severity] @ hidden
 
 
 def _interpolate_steps(values: Tensor, step: int) -> Tensor:

@@ -56,7 +56,8 @@ class DualPathBlock(nn.Sequential):
 
     >>> from hlsim.neuro.config import NeuroConfig
     >>> import torch
-    >>> DualPathBlock(NeuroConfig(channels=8))(torch.randn(1, 20, 5, 8)).shape
+    >>> config = NeuroConfig(structure="dual-path", channels=8)
+    >>> DualPathBlock(config)(torch.randn(1, 20, 5, 8)).shape
     torch.Size([1, 20, 5, 8])
     """
 

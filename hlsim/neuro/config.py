@@ -154,13 +154,14 @@ class NetworkConfig(ModelConfig):
 
 @dataclass(frozen=True)
 class NeuroConfig(NetworkConfig):
-    """Sizes and choices of a Neuro-MSBG.
+    """Sizes and choices of a Neuro-MSBG, by default those of ``neuro-msbg``.
 
     Attributes:
-        structure: ``dual-path``, ``monolithic`` or ``bands``. The monolithic baselines of the paper
+        structure: ``bands``, ``dual-path`` or ``monolithic``. ``bands`` is a network along time
+            that corrects the gains in MSBG's frequency channels (``hlsim.neuro.bands``), at a third
+            of the cost of the paper's ``dual-path`` networks. The monolithic baselines of the paper
             have no encoder and no frequency axis: each frame is a vector of ``channels`` values,
-            and the blocks run along time only. ``bands`` is a network along time that corrects the
-            gains in MSBG's frequency channels (``hlsim.neuro.bands``) at a third of the cost.
+            and the blocks run along time only.
         audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation
             1), or ``concatenated`` for eight thresholds next to magnitude and phase along frequency
             (its Table IV).
@@ -176,17 +177,17 @@ class NeuroConfig(NetworkConfig):
     Raises:
         ValueError: A value is out of range, or values do not fit together.
 
-    >>> NeuroConfig(block="lstm").hop
-    32
+    >>> NeuroConfig(structure="dual-path", block="lstm").hop
+    24
     """
 
     fft: int = 128
-    window: int = 128
-    hop: int = 32
-    channels: int = 24
-    stride: tuple[int, int] = (4, 3)
-    blocks: int = 3
-    structure: Structure = "dual-path"
+    window: int = 96
+    hop: int = 24
+    channels: int = 48
+    stride: tuple[int, int] = (2, 1)
+    kernel: tuple[int, int] = (7, 1)
+    structure: Structure = "bands"
     audiogram: AudiogramInput = "channel"
     phase: Phase = "predicted"
     prior: bool = True
@@ -197,8 +198,9 @@ class NeuroConfig(NetworkConfig):
         supports_bands = self.prior and self.level_aware and self.phase == "predicted"
         if self.structure == "bands" and not (supports_bands and self.block == "cnn"):
             raise ValueError(
-                "expected structure='bands' with block='cnn', phase='predicted', prior=True and "
-                f"level_aware=True, got {self}"
+                "expected structure='dual-path' or 'monolithic', or block='cnn', "
+                "phase='predicted', prior=True and level_aware=True with structure='bands', "
+                f"got {self}"
             )
 
     @property

@@ -43,18 +43,18 @@ class NeuroMSBG(EarNetwork, HubModel):
 
     MSBG is the simulation of hearing loss by Moore, Stone, Baer and Glasberg. The output is the
     sound that the ear perceives, time-aligned with the input. The network multiplies the
-    spectrogram of the input by a complex factor at each point. Its input channels are magnitude,
-    phase and the encoded audiogram. An encoder and dual-path blocks (layers along time, then along
-    frequency) follow, and two decoders predict the magnitude and the phase of the factor.
+    spectrogram of the input by a complex factor at each point.
 
-    With ``config.prior``, the spectrogram is first multiplied by an estimate of MSBG's gains by its
-    own formulae, which is also the fourth input channel, and the network corrects it. With the
-    structure ``bands``, a smaller network corrects the gains in MSBG's frequency channels. The
-    gradient of this structure is bounded where smearing nearly empties a frequency, so that it may
-    differ from the derivative by a few percent, and it has no second derivative.
+    With the default structure, ``bands``, MSBG's own formulae estimate the gains in its frequency
+    channels, and a small network corrects them. With the structures of the paper, the input
+    channels are magnitude, phase and the encoded audiogram. An encoder and dual-path blocks (layers
+    along time, then along frequency) follow, and two decoders predict the magnitude and the phase
+    of the factor. With ``config.prior``, the spectrogram is first multiplied by the estimate of
+    MSBG's gains, which is also the fourth input channel, and the network corrects it.
 
-    ``torch.func.grad`` works with all kinds of blocks. On a CPU, second derivatives work with
-    ``cnn`` and ``lstm`` blocks of the other structures. Those that do not exist raise RuntimeError.
+    ``torch.func.grad`` works with all networks. First derivatives are exact, and so are second
+    derivatives with ``cnn`` blocks and, on a CPU, with ``lstm`` blocks. Those that do not exist
+    raise RuntimeError.
 
     Source: the Neuro-MSBG paper, Section III and Equation 1.
 
@@ -92,7 +92,7 @@ class NeuroMSBG(EarNetwork, HubModel):
         # ``NeuroMSBG(config)`` is an object of the subclass for the structure of the configuration.
         kind: type = cls
         if cls is NeuroMSBG:
-            is_bands = config is not None and config.structure == "bands"
+            is_bands = config is None or config.structure == "bands"
             kind = BandNeuroMSBG if is_bands else DualPathNeuroMSBG
         return super().__new__(kind)
 
@@ -118,10 +118,10 @@ class BandNeuroMSBG(NeuroMSBG):
     """Neuro-MSBG of the structure ``bands``, which corrects the gains in MSBG's channels.
 
     Args:
-        config: Sizes and choices, with ``structure="bands"``.
+        config: Sizes and choices, by default ``NeuroConfig()``.
         options: Keyword arguments of ``NeuroMSBG``.
 
-    >>> BandNeuroMSBG(NeuroConfig(structure="bands"))(torch.randn(1600), "N3").shape
+    >>> BandNeuroMSBG(NeuroConfig(channels=8))(torch.randn(1600), "N3").shape
     torch.Size([1600])
     """
 
@@ -143,10 +143,11 @@ class DualPathNeuroMSBG(NeuroMSBG):
     """Neuro-MSBG of the structures ``dual-path`` and ``monolithic``: encoder, blocks and decoders.
 
     Args:
-        config: Sizes and choices, by default ``NeuroConfig()``.
+        config: Sizes and choices, with one of these structures.
         options: Keyword arguments of ``NeuroMSBG``.
 
-    >>> DualPathNeuroMSBG(NeuroConfig(channels=8))(torch.randn(1600), "N3").shape
+    >>> config = NeuroConfig(structure="dual-path", channels=8)
+    >>> DualPathNeuroMSBG(config)(torch.randn(1600), "N3").shape
     torch.Size([1600])
     """
 
@@ -275,7 +276,7 @@ def load_pretrained(
         ValueError: There is no such checkpoint, it is damaged, or it is no simulator.
 
     >>> import torch
-    >>> load_pretrained("neuro-msbg-light")(torch.randn(2, 16000), "N3").shape
+    >>> load_pretrained("neuro-msbg")(torch.randn(2, 16000), "N3").shape
     torch.Size([2, 16000])
     """
     build = partial(

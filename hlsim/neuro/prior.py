@@ -35,7 +35,8 @@ from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
-from hlsim.msbg.smearing import BROADENING, roex_filters, smear_spectrum, smearing_from_filters
+from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
+from hlsim.neuro.smearing import SmoothSmearing
 from hlsim.torchtools import constant
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
@@ -55,9 +56,6 @@ POWER_FLOOR = 1e-14
 
 MIN_ENVELOPE = 1e-7
 """Smallest value of an envelope in Pa."""
-
-SMEARING_GRADIENT_FLOOR = 1e-4
-"""Smallest factor of smearing on a power, -40 dB, that gradients take into account."""
 
 MAX_POWER_RATIO = 1e16
 """Largest factor of smearing on a power."""
@@ -180,7 +178,8 @@ class Prior(nn.Module):
 
         Returns: The smeared spectrogram and its power in Pa^2, which may be negative.
         """
-        return smear_spectrum(spectrum, self._smearing()[severity], SMEARING_GRADIENT_FLOOR)
+        smeared, smeared_power, *_ = SmoothSmearing.apply(spectrum, self._smearing()[severity])
+        return smeared, smeared_power
 
     def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
         """Compute the RMS pressure of each channel of MSBG's filter bank in each frame.

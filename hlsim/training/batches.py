@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
-from hlsim.calibration import NEURO_RATE, set_level
+from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.data.augment import (
     augment_speech,
     draw_uniform,
@@ -36,7 +36,7 @@ Batch = dict[str, Tensor]
 
 - ``signal``: input of the network in pascals with shape (items, time)
 - ``thresholds``: ears in dB HL with shape (items, 8)
-- ``clean`` (compensators): clean speech in pascals with shape (items, time)
+- ``clean``: clean speech in pascals with shape (items, time)
 - ``noise_reduction`` (hearing aids): strength of noise reduction, 0 or 1, with shape (items,)
 """
 
@@ -48,6 +48,9 @@ _VALIDATION_SECONDS = 2.0
 
 _VALIDATION_BATCH = 4
 """Number of items in a batch for validation."""
+
+_HIGHEST_CLEAN_LEVEL = 80.0
+"""Highest level in dB SPL of the clean speech that belongs to the input of a simulator."""
 
 _MEASURED_SHARE = 0.5
 """Share of measured ears, if there are any. The others are random."""
@@ -215,7 +218,8 @@ class _SimulatorBatches(_RandomBatches):
         clips = self.replace_by_sounds(self.speech.draw(count, generator), generator)
         levels, treated = self.recipe.levels, self.recipe.treated
         signal = augment_speech(clips, noise, ears, generator, levels=levels, treated=treated)
-        return {"signal": signal, "thresholds": ears}
+        clean = set_level(clips, level_spl(signal).clamp_max(_HIGHEST_CLEAN_LEVEL))
+        return {"signal": signal, "clean": clean, "thresholds": ears}
 
 
 class _CompensatorBatches(_RandomBatches):

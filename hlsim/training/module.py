@@ -163,10 +163,11 @@ def initial_network(
     if not recipe.start:
         return network
     start: Any = load(recipe.start)
-    if type(start) is not type(network) or (recipe.model and start.config != network.config):
+    is_kind = getattr(start, "kind", None) == network.kind
+    if not is_kind or (recipe.model and start.config != network.config):
         raise ValueError(
-            f"the start {recipe.start!r} is not a {type(network).__name__} with the settings "
-            "'model' of the recipe; choose another start, or leave 'model' out"
+            f"the start {recipe.start!r} is not a {network.kind} with the settings 'model' of the "
+            "recipe; choose another start, or leave 'model' out"
         )
     return start.train().requires_grad_(True)
 

@@ -48,14 +48,14 @@ class TrainingRecipe:
 
     model: dict[str, Any] = field(default_factory=dict)
     start: str = ""
-    steps: int = 19_400
-    batch: int = 6
+    steps: int = 10_800
+    batch: int = 8
     seconds: float = 1.3
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     weights: dict[str, float]
     levels: tuple[float, float] = (40.0, 95.0)
-    sounds: float = 0.0
-    validate_every: int = 200
+    sounds: float = 0.2
+    validate_every: int = 300
     validation_items: int = 48
     seed: int = 0
 
@@ -90,8 +90,11 @@ class SimulatorRecipe(TrainingRecipe):
 
     Attributes:
         model: Settings of ``NeuroConfig``.
-        weights: Weights of ``snr`` and ``log_spectrum``, both in dB / 10, and of the paper's
-            ``magnitude``, ``phase``, ``complex`` and ``time``.
+        weights: Weights of ``snr``, ``log_spectrum`` and ``levels`` (of bands, where the input is
+            audible), all in dB / 10; of ``gradient``, 1 minus the cosine of the gradients through
+            the network and through the teacher; and of the paper's ``magnitude``, ``phase``,
+            ``complex`` and ``time``. Gradients are compared in every third step, which takes three
+            times as long.
         unit_power: Signal by whose power all signals are divided before the criteria, ``truth`` or
             ``input``. ``truth`` is the target, with which soft items count as much as loud ones.
             ``input`` is the choice of MP-SENet. The paper's criteria require ``input`` for networks
@@ -102,15 +105,18 @@ class SimulatorRecipe(TrainingRecipe):
             of compensators.
         precision: Number format of the network's layers, ``float32`` or ``bfloat16``. ``bfloat16``
             is several times faster on hardware that supports it, and several times slower on other
-            hardware. Transforms, prior, scans and criteria remain in float32.
+            hardware. Transforms, prior, scans and criteria remain in float32, and so does a network
+            of the structure ``bands``.
         average: Weight of the past in the moving average of the weights; 0 for none. The average is
             validated and saved.
 
     >>> SimulatorRecipe(steps=1000).learning_rate
-    0.001
+    0.003
     """
 
-    weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
+    weights: dict[str, float] = field(
+        default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5, "levels": 2.0, "gradient": 2.0}
+    )
     unit_power: Literal["truth", "input"] = "truth"
     treated: bool = True
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -118,7 +124,8 @@ class SimulatorRecipe(TrainingRecipe):
 
     @classmethod
     def criteria(cls) -> tuple[str, ...]:
-        return ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
+        paper = ("complex", "magnitude", "phase", "time")
+        return ("gradient", "levels", "log_spectrum", "snr", *paper)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -159,9 +166,7 @@ class CompensatorRecipe(TrainingRecipe):
     steps: int = 3_000
     batch: int = 2
     seconds: float = 0.6
-    learning_rate: float = 3e-3
     weights: dict[str, float] = field(default_factory=lambda: {"coherent-bands": 1.0})
-    sounds: float = 0.2
     levels: tuple[float, float] = (50.0, 80.0)
     equalised: float = 0.7
     noisy: float = 0.5

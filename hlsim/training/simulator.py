@@ -13,16 +13,24 @@ from torch import Tensor, nn
 from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
-from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
+from hlsim.losses.waveform import (
+    band_level_distance_db,
+    log_spectral_distance_db,
+    noise_to_signal_db,
+)
 from hlsim.neuro import NeuroConfig, NeuroMSBG, load_pretrained
 from hlsim.simulators import load_simulator
 from hlsim.training.batches import Batch, TrainingData, make_data
+from hlsim.training.gradients import gradient_error
 from hlsim.training.module import TrainingModule, describe_simulator, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.trainer import train_network
 
 _POWER_FLOOR = 1e-18
 """Power in Pa^2 that is added to the power of a signal before dividing by it."""
+
+_GRADIENT_INTERVAL = 3
+"""Number of steps from one comparison of gradients to the next."""
 
 
 class SimulatorTraining(TrainingModule):
@@ -54,27 +62,37 @@ class SimulatorTraining(TrainingModule):
 
     def compute_loss(self, batch: Batch) -> Tensor:
         """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria."""
-        target, perceived = self._simulate(batch)
+        weights = {name: weight for name, weight in self.recipe.weights.items() if weight}
+        if self.global_step % _GRADIENT_INTERVAL:
+            weights.pop("gradient", None)
+        compares_gradients = "gradient" in weights
+        signal = batch["signal"].detach().requires_grad_(compares_gradients)
+        target, perceived = self._simulate(signal, batch["thresholds"])
+        parts = {}
+        if compares_gradients:
+            parts["gradient"] = gradient_error(
+                perceived, signal, batch["clean"], batch["thresholds"], *self._teacher
+            )
+        if "levels" in weights:
+            parts["levels"] = band_level_distance_db(perceived, target, batch["signal"]) / 10.0
         unit = target if self.recipe.unit_power == "truth" else batch["signal"]
         scale = unit.square().mean(-1, keepdim=True).add(_POWER_FLOOR).rsqrt()
         target = target * scale
         perceived = perceived * scale
-        weights = self.recipe.weights
-        parts = {"snr": noise_to_signal_db(perceived, target) / 10.0}
-        if weights.get("log_spectrum"):
+        parts["snr"] = noise_to_signal_db(perceived, target) / 10.0
+        if "log_spectrum" in weights:
             parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
-        if set(weights) - {"snr", "log_spectrum"}:
+        if weights.keys() - parts.keys():
             parts |= paper_parts(perceived, target)
         return weighted_sum(parts, weights).mean()
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         # ratio of the teacher's output to the network's error in dB
-        target, perceived = self._simulate(batch)
+        target, perceived = self._simulate(batch["signal"], batch["thresholds"])
         self.measured_values.append(-noise_to_signal_db(perceived, target))
 
-    def _simulate(self, batch: Batch) -> tuple[Tensor, Tensor]:
+    def _simulate(self, signal: Tensor, ears: Tensor) -> tuple[Tensor, Tensor]:
         """Return the outputs of the teacher and of the network in pascals, (items, time) each."""
-        signal, ears = batch["signal"], batch["thresholds"]
         (teacher,) = self._teacher
         with torch.no_grad():
             target = teacher.to(signal.device)(signal, ears)

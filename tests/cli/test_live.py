@@ -80,8 +80,8 @@ class OpenStream:
 
 @pytest.fixture
 def recording() -> Tensor:
-    """Noise of 65 dB SPL where RMS 1.0 is 100 dB SPL. Shape: (6400,)."""
-    return set_level(torch.randn(6400), 65.0, 100.0)
+    """Noise of 65 dB SPL where RMS 1.0 is 100 dB SPL. Shape: (5760,), whole blocks."""
+    return set_level(torch.randn(5760), 65.0, 100.0)
 
 
 def assert_played(devices: Devices, expected: Tensor, tolerance: float) -> None:
@@ -140,7 +140,7 @@ def test_each_ear_gets_the_signal_of_its_microphone_or_of_the_only_one(
     devices.played = devices.played[:0]
     assert main([*command, "--simulate"]) == 0
     simulated = SimulatedStream(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
-    perceived = torch.cat([simulated(chunk) for chunk in both.split(1536, -1)], -1)
+    perceived = torch.cat([simulated(chunk) for chunk in both.split(576, -1)], -1)
     assert perceived.any()
     assert_played(devices, perceived, 1e-4)
 

@@ -24,7 +24,7 @@ BLOCKS = ("hlsim.cli.long_recordings", "compensators.long_signals", "hlsim.msbg.
     [
         ("msbg", 16000),
         ("neuro-msbg", 16000),
-        ("neuro-msbg-light", 44100),
+        ("neuro-msbg", 44100),
         ("attenuation", 44100),
         ("nalr", 16000),
         ("wdrc", 44100),

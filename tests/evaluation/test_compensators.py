@@ -59,7 +59,7 @@ def test_perception_is_that_of_the_exact_model_and_of_the_loss(
     noisy = clean + set_level(torch.randn(12800), 65.0)
     item, output = Item("", clean, noisy, N3), 3.0 * noisy
     values = PERCEPTION.compute(item, output)
-    network = load_pretrained("neuro-msbg-light")
+    network = load_pretrained("neuro-msbg")
     losses = {"msbg": values["loss_msbg"]}
     losses[network] = network_loss(network).compute(item, output)["loss_neuro"]
     with torch.no_grad():

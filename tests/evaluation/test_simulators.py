@@ -48,7 +48,7 @@ def test_a_simulator_for_other_signals_is_rejected(
 
 
 def test_values_failures_and_page(options: dict[str, Any]) -> None:
-    simulators = {"light": load_pretrained("neuro-msbg-light"), "none": Unimpaired(60.0)}
+    simulators = {"light": load_pretrained("neuro-msbg"), "none": Unimpaired(60.0)}
     study = evaluate_simulators(simulators, **options, inputs=("as-is", "louder"), listen=1)
     table = study.table
     row, item = table[table.condition == "light"].iloc[0], study.items[0].load()
@@ -102,7 +102,7 @@ def test_each_teacher_has_its_own_values(
 def test_command(
     options: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, light = tmp_path / "out", "neuro-msbg-light"
+    out, light = tmp_path / "out", "neuro-msbg"
     command = ["evaluate-simulator", "exact=msbg", light, "--speech", options["speech"]]
     command += ["--audiograms", options["audiograms"], "--items", 2, "--seconds", 1, "--jobs", 1]
     assert main([str(part) for part in (*command, "--out", out)]) == 0

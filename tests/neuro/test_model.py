@@ -48,13 +48,14 @@ def output_and_gradient(model: nn.Module, waveform: Tensor, ears: Any) -> tuple[
     return output.detach(), gradient
 
 
+DUAL_PATH = {"structure": "dual-path", "channels": 4, "blocks": 1}
 PAPER = {"fft": 400, "window": 400, "hop": 100, "stride": (3, 2), "prior": False}
 LIMITED_FIELD: dict[str, Any] = {
     "default": {"channels": 8},
-    "dense": {"channels": 4, "dense_depth": 3, "stride": (2, 3), "blocks": 1, "kernel": (3, 5)},
-    "paper's transform": {"channels": 4, "blocks": 1, "kernel": (11, 3), **PAPER},
+    "narrow": {**DUAL_PATH, "blocks": 3, "stride": (4, 3), "kernel": (7, 7)},
+    "dense": {**DUAL_PATH, "dense_depth": 3, "stride": (2, 3), "kernel": (3, 5)},
+    "paper's transform": {**DUAL_PATH, "kernel": (11, 3), **PAPER},
     "monolithic": {"fft": 256, "window": 96, "hop": 24, "channels": 8, "structure": "monolithic"},
-    "bands": {"channels": 8, "blocks": 1, "structure": "bands", "stride": (2, 1)},
     "compensator": None,
 }
 
@@ -90,7 +91,7 @@ def test_items_and_blocks_one_by_one_equal_processing_at_once(
 def test_some_networks_depend_on_the_whole_signal() -> None:
     blocks = [{"block": block} for block in ("lstm", "mamba", "transformer")]
     for change in (*blocks, {"level_aware": False}):
-        assert NeuroConfig.from_dict(change).receptive_field is None
+        assert NeuroConfig.from_dict(DUAL_PATH | change).receptive_field is None
 
 
 BAD_CONFIGURATIONS: list[Any] = [
@@ -100,7 +101,7 @@ BAD_CONFIGURATIONS: list[Any] = [
     *[{"prior": "no"}, {"level_aware": 0}, {"block": "gru"}, {"structure": "cascade"}],
     *[{"audiogram": "none"}, {"phase": "random"}],
     {"block": "transformer", "channels": 10, "heads": 4},
-    *[{"structure": "bands", **o} for o in ({"prior": False}, {"block": "lstm"})],
+    *[{"prior": False}, {"block": "lstm"}, {"level_aware": False}, {"phase": "input"}],
 ]
 BAD_CALLS: list[tuple[Tensor, Any]] = [
     (torch.zeros(10, dtype=torch.int16), torch.zeros(8)),
@@ -129,7 +130,7 @@ def test_an_impaired_ear_expands_levels(trained: NeuroMSBG, clips: Tensor) -> No
         assert lowest < float(growth.mean()) < highest
 
 
-@pytest.mark.parametrize("checkpoint", ["neuro-msbg", "neuro-msbg-light", "before training"])
+@pytest.mark.parametrize("checkpoint", ["neuro-msbg", "neuro-msbg-cnn-narrow", "before training"])
 @pytest.mark.parametrize(
     ("name", "trained_snr", "first_snr"),
     [("NH", 30, 15), ("N1", 26, 15), ("N2", 22, 15), ("S1", 22, 15), ("N3", 16, 11)],

@@ -14,13 +14,16 @@ from hlsim.checkpoint import read_record
 from hlsim.neuro import NeuroMSBG, load_pretrained
 from hlsim.simulators import Attenuation
 from hlsim.training.batches import Batch, TrainingData, make_data
+from hlsim.training.gradients import gradient_error
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
 from tests.helpers import write_ears
 from tests.training.gradients import check_gradients
 
 SMALL = SimulatorRecipe(
-    model={"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
+    model={"structure": "dual-path", "channels": 4, "blocks": 1, "stride": [4, 3]},
+    weights={"snr": 1.0, "log_spectrum": 0.5},
+    sounds=0.0,
     steps=8,
     batch=2,
     seconds=0.25,
@@ -87,6 +90,35 @@ def test_all_criteria_train_with_noise_and_measured_ears(
     ears = write_ears(tmp_path / "ears.csv", "N5")
     sources = replace(data, noise=data.speech, audiograms=ears)
     check_gradients(SimulatorTraining(recipe, MSBG()), training_batch(sources, recipe))
+
+
+def test_the_cosine_of_gradients_is_one_for_the_teacher_and_trains_a_network(
+    data: TrainingData,
+) -> None:
+    recipe = replace(SMALL, model={"channels": 4}, weights=SimulatorRecipe().weights)
+    batch = training_batch(data, recipe)
+    signal = batch["signal"].clone().requires_grad_()
+    ears = batch["thresholds"]
+    perceived = MSBG()(signal, ears)
+    for sign, expected in ((1.0, 0.0), (-1.0, 2.0)):
+        errors = gradient_error(sign * perceived, signal, batch["clean"], ears, MSBG())
+        torch.testing.assert_close(errors, torch.full((2,), expected), atol=1e-4, rtol=0.0)
+    check_gradients(SimulatorTraining(recipe, MSBG()), batch)
+
+
+class Fixed(torch.nn.Module):
+    """Teacher without a gradient."""
+
+    def forward(self, waveform: torch.Tensor, ears: torch.Tensor) -> torch.Tensor:
+        return 0.5 * waveform.detach()
+
+
+def test_a_teacher_without_a_gradient_needs_a_recipe_without_the_criterion(
+    data: TrainingData,
+) -> None:
+    recipe = replace(SMALL, model={"channels": 4}, weights={"gradient": 1.0})
+    with pytest.raises(ValueError, match=r"differentiable teacher.*set the weight"):
+        SimulatorTraining(recipe, Fixed()).compute_loss(training_batch(data, recipe))
 
 
 def test_another_teacher_is_recorded_and_needs_another_folder(

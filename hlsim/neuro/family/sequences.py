@@ -137,9 +137,9 @@ def build_sequence_path(config: NetworkConfig, axis: int) -> SequencePath:
         axis: 0 for a layer along time, 1 for one along frequency.
 
     >>> from hlsim.neuro.config import NeuroConfig
-    >>> build_sequence_path(NeuroConfig(block="lstm"), axis=0).core
+    >>> build_sequence_path(NeuroConfig(structure="dual-path", block="lstm"), axis=0).core
     BidirectionalLSTM(
-      (lstm): LSTM(24, 48, batch_first=True, bidirectional=True)
+      (lstm): LSTM(48, 96, batch_first=True, bidirectional=True)
     )
     """
     channels = config.channels
