@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 from collections.abc import Callable
 from functools import partial
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.checkpoint import read_record
+from hlsim.files import sha256
 from hlsim.simulators import BUILT_IN, PluginSimulator, load_simulator
 from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
@@ -182,7 +184,8 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     Returns:
         The name of the simulator, or its class with its settings, under ``role``. For a network, a
         hash of its weights follows under ``role`` with ``_sha256``, because a folder may contain
-        another network when the training resumes.
+        another network when the training resumes. For your own code without an attribute
+        ``fingerprint``, a hash of its file follows under ``role`` with ``_code_sha256``.
 
     Raises:
         ValueError: There is no such simulator.
@@ -192,12 +195,27 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     """
     loaded = load_simulator(simulator)
     if isinstance(loaded, PluginSimulator):
-        return {role: str(loaded)}
+        return {role: str(loaded), **_hash_code(role, loaded.plugin.function)}
     if isinstance(simulator, nn.Module):
         state = {name: tensor.cpu().contiguous() for name, tensor in loaded.state_dict().items()}
         digest = hashlib.sha256(safetensors.torch.save(state)).hexdigest()
         name = f"{type(simulator).__name__}({simulator.extra_repr()})"
-        return {role: name, f"{role}_sha256": digest}
+        return {role: name, f"{role}_sha256": digest, **_hash_code(role, simulator)}
     if str(simulator) in BUILT_IN:
         return {role: str(simulator)}
     return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}
+
+
+def _hash_code(role: str, code: Any) -> dict[str, str]:
+    """Return the hash of the file with the source code of a function or module of your own.
+
+    It is empty for code of hlsim and torch, with an attribute ``fingerprint``, or without a file.
+    """
+    owner = code if inspect.isroutine(code) else type(code)
+    package = str(getattr(owner, "__module__", "")).partition(".")[0]
+    if package in ("hlsim", "torch") or hasattr(code, "fingerprint"):
+        return {}
+    try:
+        return {f"{role}_code_sha256": sha256(Path(inspect.getfile(owner)))}
+    except (TypeError, OSError):
+        return {}

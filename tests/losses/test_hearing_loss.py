@@ -504,7 +504,8 @@ def test_pauses_do_not_dominate_the_gradient(
     loss = HearingLossLoss([N3, S2], **options)
     _, slope = compute(loss, 5.0 * signal, signal)
     speech, pause = slope[:, :4800].norm(), slope[:, 6400:].norm()
-    # With the gain, this pause has 24 dB SPL and is audible. The network's frames leak more there.
+    # With the gain, a pause of 10 dB SPL is audible. In four draws it had up to 0.18 through
+    # neuro-msbg, 0.14 through neuro-msbg-cnn-narrow and 0.08 through the exact model.
     is_audible = pause_spl == 10.0 and options["simulator"] == "neuro-msbg"
     limit = 0.25 if is_audible else 0.1
     assert float(speech) > 0.0 and float(pause) < limit * float(speech)

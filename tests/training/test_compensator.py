@@ -97,6 +97,20 @@ def test_a_simulator_of_your_own_is_named_in_the_record(data: TrainingData, tmp_
     assert about["simulator"] == "hlsim:MSBG"
 
 
+def test_a_training_does_not_continue_with_an_edited_simulator(
+    data: TrainingData, tmp_path: Path
+) -> None:
+    code = tmp_path / "half.py"
+    code.write_text("def half(waveform, audiogram):\n    return 0.5 * waveform\n")
+    train(data, SMALL, tmp_path / "out", simulator=f"{code}:half")
+    code.write_text(code.read_text().replace("0.5", "0.1"))
+    with pytest.raises(ValueError, match="differs in simulator_code_sha256;"):
+        train(data, SMALL, tmp_path / "out", simulator=f"{code}:half")
+    code.write_text(code.read_text() + "half.fingerprint = 'version 1'\n")
+    record = describe_simulator("simulator", f"{code}:half")
+    assert record == {"simulator": f"{code}:half (version 1)"}
+
+
 @pytest.mark.parametrize("simulator", ["attenuation", "hlsim:MSBG"])
 def test_a_simulator_without_a_checkpoint_trains(
     simulator: str, data: TrainingData, tmp_path: Path
