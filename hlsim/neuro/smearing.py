@@ -65,6 +65,19 @@ class SmoothSmearing(torch.autograd.Function):
 
     - the gradient with respect to x is G conj(f) + 2 x (A^T t - u s / d^2);
     - the gradient with respect to A is t p^T.
+
+    Args:
+        spectrum: Spectrum of each frame, complex (frames, frequencies).
+        matrix: Smearing of powers, (frequencies, frequencies).
+
+    Returns:
+        The smeared spectrum, the smeared power, and the real and the imaginary part of the factor,
+        (frames, frequencies) each.
+
+    >>> spectrum = torch.ones(1, 2, dtype=torch.complex64)
+    >>> smeared, *_ = SmoothSmearing.apply(spectrum, torch.tensor([[4.0, 0.0], [0.0, 1.0]]))
+    >>> smeared.abs().round(decimals=2)
+    tensor([[2., 1.]])
     """
 
     @staticmethod

@@ -28,7 +28,7 @@ def test_thresholds_for_a_simulator() -> None:
     assert as_thresholds(levels.requires_grad_()).requires_grad
 
 
-A_DICTIONARY = r"pass a dictionary .* such as \{500: 20, 4000: 50\}"
+A_DICTIONARY = r"for other frequencies .*\{500: 20, 4000: 50\}"
 NO_EARS: list[tuple[Any, str]] = [
     (torch.tensor([0.0] * 6 + [torch.nan, 0.0]), "got nan at 6000 Hz"),
     ({500: 20.0, 4000: 130.0}, "got 130 at 4000 Hz"),
