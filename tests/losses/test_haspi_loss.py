@@ -10,12 +10,12 @@ from hlsim.calibration import set_level
 from hlsim.metrics import haspi, hasqi
 from tests.losses.signals import add_noise, excerpt, gain_slope
 
-TIME = 11600
+TIME = 12000
 
 
 @pytest.fixture
 def clean(speech: list[tuple[Tensor, int]]) -> Tensor:
-    """0.73 s of two voices at 65 dB SPL. Shape: (2, TIME)."""
+    """0.75 s of two voices at 65 dB SPL. Shape: (2, TIME)."""
     return excerpt(speech, 10000, 10000 + TIME)
 
 
