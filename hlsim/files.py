@@ -6,6 +6,7 @@ import codecs
 import csv
 import errno
 import hashlib
+import inspect
 import io
 import os
 import sys
@@ -166,6 +167,20 @@ def sha256(path: Path) -> str:
     """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def source_hash(code: Any) -> str | None:
+    """Compute the SHA-256 of the file with the source code of a class or function.
+
+    It is None if there is no such file, as for code in a notebook.
+
+    >>> source_hash(len) is None
+    True
+    """
+    try:
+        return sha256(Path(inspect.getfile(code)))
+    except (OSError, TypeError):
+        return None
 
 
 def read_table(

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.checkpoint import read_record
-from hlsim.files import sha256
+from hlsim.files import source_hash
 from hlsim.simulators import BUILT_IN, PluginSimulator, load_simulator
 from hlsim.training.batches import Batch
 from hlsim.training.recipes import TrainingRecipe
@@ -215,7 +215,5 @@ def _hash_code(role: str, code: Any) -> dict[str, str]:
     package = str(getattr(owner, "__module__", "")).partition(".")[0]
     if package in ("hlsim", "torch") or hasattr(code, "fingerprint"):
         return {}
-    try:
-        return {f"{role}_code_sha256": sha256(Path(inspect.getfile(owner)))}
-    except (TypeError, OSError):
-        return {}
+    digest = source_hash(owner)
+    return {} if digest is None else {f"{role}_code_sha256": digest}

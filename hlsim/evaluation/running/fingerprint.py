@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import inspect
 import json
 from functools import cache
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from torch import Tensor, nn
 
 import compensators
-from hlsim.files import sha256
+from hlsim.files import source_hash
 from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
 
@@ -141,13 +140,7 @@ def _is_known(kind: type) -> bool:
     return kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "builtins")
 
 
-@cache
-def _hash_source(kind: type) -> str | None:
-    """Compute the SHA-256 of the file with the source code of a class, or None if it is unknown."""
-    try:
-        return sha256(Path(inspect.getfile(kind)))
-    except (OSError, TypeError):  # of a class in a notebook, for example
-        return None
+_hash_source = cache(source_hash)
 
 
 def _attributes(module: nn.Module) -> dict[str, Any]:
