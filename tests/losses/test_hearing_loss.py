@@ -500,14 +500,17 @@ def test_pauses_do_not_dominate_the_gradient(
     """Logarithm and phase have steep gradients near silence, which is inaudible."""
     signal = torch.cat((clean, torch.zeros(2, 8000)), -1)
     if pause_spl is not None:
-        signal = signal + 10.0 ** ((pause_spl - 94.0) / 20.0) * torch.randn(signal.shape)
+        # torch's normal numbers in single precision depend on the processor.
+        seeded = torch.Generator().manual_seed(0)
+        noise = torch.randn(signal.shape, dtype=torch.float64, generator=seeded).float()
+        signal = signal + 10.0 ** ((pause_spl - 94.0) / 20.0) * noise
     loss = HearingLossLoss([N3, S2], **options)
     _, slope = compute(loss, 5.0 * signal, signal)
     speech, pause = slope[:, :4800].norm(), slope[:, 6400:].norm()
-    # With the gain, a pause of 10 dB SPL is audible. In four draws it had up to 0.18 through
-    # neuro-msbg, 0.14 through neuro-msbg-cnn-narrow and 0.08 through the exact model.
-    is_audible = pause_spl == 10.0 and options["simulator"] == "neuro-msbg"
-    limit = 0.25 if is_audible else 0.1
+    # With the gain, a pause of 10 dB SPL is audible. Through the default network and criterion, its
+    # share is 0.115 (0.068 through the exact model), and up to 0.18 in other draws of the noise.
+    is_default = options == {"simulator": "neuro-msbg", "criterion": "coherent-bands"}
+    limit = 0.12 if is_default and pause_spl == 10.0 else 0.1
     assert float(speech) > 0.0 and float(pause) < limit * float(speech)
 
 
