@@ -1,8 +1,9 @@
-"""Levels in bands about as wide as auditory filters, for the default criterion and ``"bands"``.
+"""Levels in bands about as wide as auditory filters, for two criteria of the hearing-loss loss.
 
-There are 24 bands from 80 Hz to 7.5 kHz. They are equally wide, 1.25 ERB (equivalent rectangular
-bandwidths), on the scale of Glasberg and Moore (1990), rectangular and without gaps, so that their
-powers add up to that of the signal.
+The criteria are the default one, ``"coherent-bands"``, and ``"bands"``. There are 24 bands from
+80 Hz to 7.5 kHz. They are equally wide, 1.25 ERB (equivalent rectangular bandwidths), on the scale
+of Glasberg and Moore (1990), rectangular and without gaps, so that their powers add up to that of
+the signal.
 """
 
 import numpy as np
@@ -17,6 +18,7 @@ from hlsim.dsp.stft import STFT
 from hlsim.torchtools import constant
 
 BANDS = 24
+"""Number of bands."""
 
 LOWEST, HIGHEST = 80.0, 7500.0
 """Lowest edge of the lowest band and highest edge of the highest one in Hz.
@@ -25,9 +27,12 @@ Neuro-MSBG returns nothing above 8 kHz.
 """
 
 FRAME_SECONDS = 0.032
+"""Duration of a frame in seconds. Frames overlap by half."""
 
 _POWER_FLOOR = 1e-18
-"""Power, -86 dB SPL, added before the logarithm, which keeps the gradient near silence finite.
+"""Power in Pa^2, -86 dB SPL, that is added before the logarithm.
+
+It keeps the gradient near silence finite.
 
 It does not limit the perceived level: a band at -40 dB SPL still has its whole gradient.
 """
@@ -43,7 +48,7 @@ _WEIGHT_FLOOR = 1e-3
 
 
 def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
-    """Compute the level in 24 bands from 80 Hz to 7.5 kHz in each frame of 32 ms, every 16 ms.
+    """Compute the level in 24 bands from 80 Hz to 7.5 kHz in frames of 32 ms, every 16 ms.
 
     The bands are about as wide as auditory filters, 1.25 ERB each.
 
@@ -54,7 +59,7 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Levels in dB SPL; -86 for silence.
+        Levels in dB SPL, -86 for silence.
 
     >>> from hlsim.calibration import set_level
     >>> levels = band_levels(set_level(torch.randn(16000), 65.0), sample_rate=16000)
@@ -71,15 +76,15 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
 def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tensor:
     """Compute by how many dB the band levels of perceived speech differ from those of a normal ear.
 
-    This is a weighted mean of absolute differences over frames and bands. A gain of g dB costs
-    ``abs(g)``. Perceived levels are not raised to the threshold of hearing: otherwise, a band that
-    the impaired ear misses altogether would have no gradient, and no compensator would learn to
-    restore it.
+    The result is a weighted mean of absolute differences over frames and bands. A gain of g dB
+    costs ``abs(g)``. Perceived levels are not raised to the threshold of hearing: otherwise, a band
+    that the impaired ear misses altogether would have no gradient, and no compensator would learn
+    to restore it.
 
-    The weight of a band in a frame is its audibility for a normal ear, 0 to 1, or that of the
-    perceived signal if it is higher: noise that fills a pause is an error, too. The level with
-    which such noise is compared is never lower than 40 dB below the threshold of audibility. The
-    weights carry no gradient.
+    The weight of a band in a frame is the audibility, 0 to 1, of clean speech or of perceived
+    speech for a normal ear, whichever is higher: noise that fills a pause is an error, too.
+    Perceived levels are compared with 40 dB below the threshold of audibility where clean speech is
+    softer than that. The weights have no gradient.
 
     Shape: (..., time), (..., time) -> (...).
 
@@ -107,10 +112,10 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
 
 
 def audibility_threshold(levels: Tensor) -> Tensor:
-    """Compute the level in each band from which a normal ear hears something.
+    """Compute the level in each band above which a normal ear hears something.
 
-    It is the threshold in quiet, or 40 dB below the strongest band of the item if that is higher,
-    because loud bands mask soft ones. It carries no gradient.
+    The level is the threshold in quiet, or 40 dB below the strongest band in any frame of the item
+    if that is higher, because loud bands mask soft ones. It has no gradient.
 
     Shape: (..., frames, 24) -> (..., 1, 24).
 
@@ -130,7 +135,7 @@ def audibility_threshold(levels: Tensor) -> Tensor:
 def audibility_weights(levels: Tensor, threshold: Tensor) -> Tensor:
     """Compute the weight of each band: 0 up to the threshold of audibility, 1 from 20 dB above it.
 
-    The weights carry no gradient.
+    The weights have no gradient.
 
     Shape: (..., frames, 24), (..., 1, 24) -> (..., frames, 24).
 
@@ -145,16 +150,16 @@ def audibility_weights(levels: Tensor, threshold: Tensor) -> Tensor:
 
 
 def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor, float]:
-    """Design the computation of band powers: Fourier transform, weights of its bins, and factor.
+    """Design the computation of band powers: short-time Fourier transform, weights and a factor.
 
     Args:
-        like: Tensor with the type and the device of the weights.
+        like: Tensor with the dtype and the device of the weights.
         sample_rate: Sample rate in Hz.
 
     Returns:
-        The short-time Fourier transform; the share of each of its frequencies in each band,
-        (frequencies, 24); and the factor from the squared magnitude of a spectrum, times these
-        shares, to the powers of a signal in bands.
+        The short-time Fourier transform; the share of each of its frequencies that lies in each
+        band, 0 to 1, (frequencies, 24); and the factor by which ``power(spectrum) @ shares`` must
+        be multiplied to be the mean power of a frame in each band.
 
     >>> stft, shares, scale = band_analysis(torch.zeros(1), sample_rate=16000)
     >>> stft.hop, shares.shape, round(scale * 512**2, 3)
@@ -169,7 +174,7 @@ def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor, float]:
 
 
 def band_edges() -> NDArray[np.float64]:
-    """Return the edges of the 24 bands in Hz, (25,).
+    """Compute the edges of the 24 bands in Hz, ascending. Shape: (25,).
 
     >>> print(band_edges()[[0, 24]].round())
     [  80. 7500.]
@@ -179,7 +184,7 @@ def band_edges() -> NDArray[np.float64]:
 
 
 def band_centres() -> NDArray[np.float64]:
-    """Return the geometric centres of the 24 bands in Hz, (24,).
+    """Compute the geometric centres of the 24 bands in Hz. Shape: (24,).
 
     >>> print(band_centres()[12].round())
     1423.0
@@ -190,7 +195,10 @@ def band_centres() -> NDArray[np.float64]:
 
 @constant
 def _band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
-    """Return the share of each frequency of a transform in each band, (fft // 2 + 1, 24)."""
+    """Return the share of the width of each frequency bin that lies in each band, 0 to 1.
+
+    Shape: (fft // 2 + 1, 24).
+    """
     spacing = sample_rate / fft
     frequencies = np.arange(fft // 2 + 1)[:, None] * spacing
     edges = band_edges()
@@ -205,7 +213,8 @@ def threshold_in_quiet() -> NDArray[np.float64]:
 
     The centre is the geometric mean of a band's edges.
 
-    Returns: Levels in dB SPL, (24,).
+    Returns:
+        Levels in dB SPL. Shape: (24,).
 
     >>> print(threshold_in_quiet()[12].round(1))  # at 1423 Hz
     2.0

@@ -1,6 +1,6 @@
 """Errors and scores that compare two signals.
 
-They show how closely a network agrees with the hearing-loss simulator that it has learned.
+They show how closely a network reproduces the hearing-loss simulator from which it learned.
 """
 
 from __future__ import annotations
@@ -20,18 +20,22 @@ Signal = np.ndarray | Tensor
 """Samples of one channel. Shape: (time,)."""
 
 _PESQ_RATE = 16000
+"""Sample rate of wide-band PESQ in Hz."""
 
 _BAND_CENTRES_HZ = 1000.0 * 2.0 ** (np.arange(-9, 9) / 3.0)
 """Centres of one-third-octave bands from 125 to 6350 Hz. The last band ends at 7127 Hz."""
 
 _BAND_RANGE_DB = 50.0
-"""Level of a band below that of the loudest band at which the band is ignored."""
+"""Difference in dB from the loudest band beyond which a softer band is ignored."""
 
 _MIN_BAND_RATIO = 1e-12
-"""Smallest power of a band, relative to the loudest band, that is distinguished: -120 dB."""
+"""Smallest power of a band relative to that of the loudest band, -120 dB."""
 
 _MIN_ERROR_POWER = 1e-20
-"""Smallest relative power of an error, so that the SNR is finite, as JSON requires."""
+"""Smallest power of an error relative to that of the reference.
+
+It keeps the SNR of equal signals finite, because JSON has no infinity.
+"""
 
 
 def snr_db(reference: Signal, estimate: Signal) -> float:
@@ -45,7 +49,8 @@ def snr_db(reference: Signal, estimate: Signal) -> float:
         Ratio in dB, at most 200.
 
     Raises:
-        ValueError: The shapes differ, a sample is not finite, or the reference is silent.
+        ValueError: The signals are empty, not one-dimensional or of different lengths, a sample is
+            not finite, or the reference is silent.
 
     >>> round(snr_db(np.array([1.0, -1.0]), np.array([1.1, -1.1])))
     20
@@ -56,15 +61,16 @@ def snr_db(reference: Signal, estimate: Signal) -> float:
 def raw_mse(reference: Signal, estimate: Signal) -> float:
     """Compute the mean squared error of a waveform, divided by the mean square of the reference.
 
-    Without the division, soft items would not count. The Neuro-MSBG paper does not state how it
-    scales this measure, which it calls RAW MSE.
+    Without the division, soft items would hardly count in a mean over items. The Neuro-MSBG paper
+    does not state how it scales this measure, which it calls RAW MSE.
 
     Args:
         reference: Expected samples. Shape: (time,).
         estimate: Samples to compare. Shape: (time,).
 
     Raises:
-        ValueError: The shapes differ, a sample is not finite, or the reference is silent.
+        ValueError: The signals are empty, not one-dimensional or of different lengths, a sample is
+            not finite, or the reference is silent.
 
     >>> round(raw_mse(np.array([1.0, -1.0]), np.array([1.1, -1.1])), 6)
     0.01
@@ -74,11 +80,11 @@ def raw_mse(reference: Signal, estimate: Signal) -> float:
 
 
 def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int) -> float:
-    """Compute the median over frequency bands of the difference of two signals' levels in dB.
+    """Compute the median over bands of the absolute difference in dB of two signals' levels.
 
-    The bands are one-third octaves from 125 Hz to 7 kHz of the spectrum of the whole signal. Signs
-    do not count. Bands more than 50 dB below the loudest band of the reference are ignored. Levels
-    of the estimate count as at most 120 dB below this band.
+    The bands are one-third octaves from 125 Hz to 7 kHz; their levels are those of the whole
+    signal. Bands more than 50 dB below the loudest band of the reference are ignored. A level of
+    the estimate that is more than 120 dB below this loudest band is replaced by this limit.
 
     Args:
         reference: Expected samples. Shape: (time,).
@@ -86,8 +92,9 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
         sample_rate: Sample rate in Hz, at least 16000.
 
     Raises:
-        ValueError: The shapes differ, a sample is not finite, the reference is silent or has no
-            power in the bands, or the sample rate is too low.
+        ValueError: The signals are empty, not one-dimensional or of different lengths, a sample is
+            not finite, the reference is silent or has no power in the bands, or the sample rate is
+            below 16000.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
     >>> round(third_octave_error_db(noise, 10.0 * noise, 16000))
@@ -113,7 +120,15 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
 
 
 def _third_octave_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarray:
-    """Compute the power in each one-third-octave band. Shape: (time,) -> (bands,)."""
+    """Compute the power in each one-third-octave band, up to a common factor.
+
+    Shape: (time,) -> (18,).
+
+    Args:
+        signal: Samples.
+        points: Length of the Fourier transform.
+        sample_rate: Sample rate in Hz.
+    """
     frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
     lower_edges = _BAND_CENTRES_HZ * 2.0 ** (-1 / 6)
     last_edge = _BAND_CENTRES_HZ[-1] * 2.0 ** (1 / 6)
@@ -134,8 +149,8 @@ def stoi(output: Signal, clean: Signal, sample_rate: int) -> float:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The shapes differ, or STOI is not defined: a signal is silent, has a sample that
-            is not finite, or has less than 0.4 s of speech.
+        ValueError: The lengths differ, or STOI is not defined: a signal is silent, has a sample
+            that is not finite, or has less than 0.4 s of speech.
         MissingExtraError: pystoi is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
@@ -149,9 +164,10 @@ def stoi(output: Signal, clean: Signal, sample_rate: int) -> float:
 def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
     """Compute wide-band PESQ, the quality of speech from about 1 to 4.6, with the package pesq.
 
-    Signals are resampled to 16 kHz. Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts,
-    which ends the process. If you score minutes of speech, use ``run_study`` or an evaluation
-    command with ``jobs`` of 2 or more: only the scores of the item that crashes are then missing.
+    Signals are resampled to 16 kHz. Version 0.0.4 of pesq crashed on 90 s of noise in 90 bursts;
+    such a crash ends the Python process. If you score minutes of speech, use ``run_study`` or an
+    evaluation command with ``jobs`` of 2 or more: then only the scores of the crashing item are
+    missing.
 
     Source: ITU-T P.862.2.
 
@@ -161,8 +177,8 @@ def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The shapes differ, or PESQ is not defined: a signal is silent, has a sample that
-            is not finite, or has no speech that pesq detects.
+        ValueError: The lengths differ, or PESQ is not defined: a signal is silent, has a sample
+            that is not finite, or has no speech that pesq detects.
         MissingExtraError: pesq is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
@@ -185,7 +201,18 @@ def _score(
     clean: Signal,
     output: Signal,
 ) -> float:
-    """Compute a score by an outside package, whose errors become ValueError."""
+    """Compute a score by an outside package, and convert its errors to ValueError.
+
+    Args:
+        name: Name of the score, for messages.
+        compute: Function of the clean signal and the output, float64 arrays of shape (time,).
+        clean: Clean speech. Shape: (time,).
+        output: Speech to score. Shape: (time,).
+
+    Raises:
+        ValueError: The signals are not what ``_check_signals`` accepts, the output is silent, or
+            the package raises an error or returns a value that is not finite.
+    """
     x, y = _check_signals(clean, output)
     if not y.any():
         raise ValueError(f"{name} is not defined: the output is silent")
@@ -204,11 +231,11 @@ def _score(
 
 
 def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
-    """Convert two signals whose relative error is defined to float64 arrays, (time,).
+    """Validate two signals to compare, and convert them to float64 arrays of shape (time,).
 
     Raises:
-        ValueError: A signal is empty or has several dimensions, the lengths differ, a
-            sample is not finite, or the reference is silent.
+        ValueError: A signal is empty or not one-dimensional, the lengths differ, a sample is not
+            finite, or the reference is silent.
     """
     x, y = (
         np.asarray(signal.detach().cpu() if isinstance(signal, Tensor) else signal, np.float64)

@@ -4,7 +4,6 @@ The score is that of ``haaqi_v1`` of pyclarity 0.9.0, which the Cadenza challeng
 gradient. It differs from ``compute_haaqi`` in these points:
 
 - ``full_scale_spl`` is 94 dB SPL by default, where ``level1`` is 65.
-- Clean music is always amplified by NAL-R (``equalisation=1``).
 - The noise at the threshold of hearing is fixed instead of drawn, and a rate of 44.1 kHz is not
   rounded to 44. ``noise="seeded", seed=..., whole_khz=True`` gives the digits of pyclarity.
 - Both signals have one sample rate. Thresholds at other frequencies than the audiometric ones are
@@ -41,10 +40,10 @@ from hlsim.metrics.quality_reference import QualityParts, QualityReference
 from hlsim.torchtools import Audio, Samples, as_type_of, constant, not_compiled
 
 ENVELOPE_SEGMENT = 192
-"""Samples of a segment of the smoothed envelopes, 8 ms at 24 kHz."""
+"""Number of samples of a segment over which envelopes are smoothed, 8 ms at 24 kHz."""
 
 ENVELOPE_RATE = 2 * RATE // ENVELOPE_SEGMENT
-"""Segments per second, 250, for they overlap by half."""
+"""Number of segments per second, 250, because segments overlap by half."""
 
 MODULATION_EDGES = (20.0, 32.0, 50.0, 80.0)
 """Lower edges in Hz of four bands of modulation: rates at which envelopes fluctuate.
@@ -72,13 +71,14 @@ def haaqi(
 ) -> Audio:
     """Compute HAAQI version 1 of each item: how good the output of an aid sounds, from 0 to 1.
 
-    The score compares the output with clean music that NAL-R has amplified for the same
-    impaired ear, and is differentiable in ``output``. Stereo signals have one score per ear:
-    take the better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
+    The score compares the output with clean music that NAL-R has amplified for the same impaired
+    ear, and is differentiable in ``output``. A delay of the output has no effect. Stereo signals
+    have one score per channel: take the better one by ``.amax(-1)`` or the mean by ``.mean(-1)``.
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
-        clean: Clean music, not amplified unless ``equalisation`` is 2. Shape: (..., time).
+        clean: Clean music, not amplified unless ``equalisation`` is 2. Shape: (..., time). Lengths
+            of both that differ by 0.1 s at most are cut to the shorter one, with a warning.
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
@@ -92,11 +92,12 @@ def haaqi(
             NAL-R or another prescription has amplified.
 
     Returns:
-        Scores, an array if ``output`` is one. Shape: (...,).
+        Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of other shapes, too short, or not finite; clean music that is silent or
-            below 20 dB SPL; a rate, level, audiogram, length or seed out of range.
+        ValueError: Signals of different shapes or on different devices, too short, or not finite;
+            clean music that is silent or below 20 dB SPL; a rate, level, audiogram, length, seed or
+            equalisation out of range; an unknown noise.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> chord = sum(torch.sin(2 * torch.pi * hz * seconds) for hz in (220.0, 277.2, 329.6))
@@ -122,7 +123,7 @@ def haaqi(
 
 
 def _split_by_rate(waves: Tensor) -> Tensor:
-    """Divide the fluctuations of cepstral coefficients into bands of modulation from 20 to 125 Hz.
+    """Divide the fluctuations of cepstral coefficients into four bands of modulation, 20 to 125 Hz.
 
     Shape: (items, 5, time) -> (items, 4 bands, 5, time or more).
     """
@@ -135,7 +136,7 @@ def _split_by_rate(waves: Tensor) -> Tensor:
 
 @constant
 def _modulation_responses(points: int) -> NDArray[np.float64]:
-    """Return the frequency responses of the bands of modulation: (4, points // 2 + 1)."""
+    """Return the frequency responses of the bands of modulation. Shape: (4, points // 2 + 1)."""
     filters = []
     for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
         edges = [low] if high is None else [low, high]
@@ -159,11 +160,11 @@ class HaaqiReference(QualityReference):
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity, 1 or 2, see ``haaqi``.
         keep: Store the clean music's features, about 18 MB per second in float32; otherwise they
-            are computed for each score.
+            are computed, and the level is validated, for each score.
 
     Raises:
         ValueError: Clean music that lasts less than 0.7 s, is not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram or length out of range.
+            SPL; a rate, level, audiogram, length or equalisation out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

@@ -6,8 +6,8 @@ The score is that of pyclarity 0.9.0, with a gradient. Please note:
 - White noise in place of the output should score 0. It does to within 0.05 on utterances
   of 3 s and more, but scores up to 0.3 on 1.2 s, 0.45 on 0.7 s and 0.99 on 0.2 s. Signals shorter
   than 0.7 s are rejected.
-- If the reference is below the threshold of hearing, every signal has the same score. References
-  below 20 dB SPL are rejected. A constant offset does not count as level.
+- If clean speech is below the threshold of hearing, every output has the same score. Clean speech
+  below 20 dB SPL is rejected. A constant offset does not count as level.
 - The ear spans 80 to 8000 Hz. Between 16 and 48 kHz, scores differ by up to 0.008. Compare scores
   of one rate.
 - Signals and channels are aligned by whole samples. One sample in one channel changes a score by up
@@ -66,8 +66,9 @@ def haspi(
     the gradient, and bands that are inaudible have no gradient.
 
     The result is float64 if one of the signals is, and float32 otherwise. On CUDA, leave
-    ``torch.backends.cuda.matmul.allow_tf32`` off, as it is by default. The thresholds of an ear on
-    a GPU are not read by the host: if they are out of range, the score is NaN.
+    ``torch.backends.cuda.matmul.allow_tf32`` off, as it is by default. Thresholds in a tensor on a
+    GPU are not validated, because that would synchronise with the GPU: if they are out of range,
+    the score is NaN.
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
@@ -87,11 +88,12 @@ def haspi(
             change by up to 0.005.
 
     Returns:
-        Scores, an array if ``output`` is one. Shape: (...,).
+        Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
-            or below 20 dB SPL; a rate, level, audiogram, length or seed out of range.
+        ValueError: Signals of different shapes or on different devices, too short, or not finite;
+            clean speech that is silent or below 20 dB SPL; a rate, level, audiogram, length or seed
+            out of range; an unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -113,8 +115,8 @@ def haspi(
 class HaspiReference(Reference):
     """Clean speech that is prepared once for the HASPI of many outputs of aids.
 
-    Clean speech reaches a normal ear, so that the impaired ear is an argument of ``score`` only. In
-    float32 the features of clean speech take about 4 MB per second.
+    HASPI compares with clean speech in a normal ear, so the impaired ear is an argument of
+    ``score``. In float32 the features of clean speech take about 4 MB per second.
 
     Args:
         clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
@@ -123,8 +125,8 @@ class HaspiReference(Reference):
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
-        keep: Store the clean speech's features; otherwise they are computed for each score, which
-            takes less memory.
+        keep: Store the clean speech's features; otherwise they are computed, and the level is
+            validated, for each score, which takes less memory.
 
     Raises:
         ValueError: Clean speech that lasts less than 0.7 s, is not finite, silent or below 20 dB
@@ -184,7 +186,7 @@ class HaspiReference(Reference):
     def _compare(
         self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
-        """Compute the ten features of HASPI for each item. Shape: -> (items, 10)."""
+        """Compute the ten features of HASPI, correlations, for each item. Shape: -> (items, 10)."""
         extent, ear = batch.clean.audible, ears[0][batch.clean.items]
         contributions = [
             (clean.amplitude, clean.cepstrum, _cepstrum(clean, output, ear, extent))
@@ -211,18 +213,18 @@ class HaspiReference(Reference):
         """Return the HASPI of each output of an aid.
 
         Args:
-            output: Outputs of the shape, rate and scale of the clean speech. Shape: (..., time).
+            output: Outputs with the shape, rate and scale of the clean speech. Shape: (..., time).
             audiogram: The impaired ear, or one for each item, as in ``haspi``.
             noise: Internal noise of the ear: ``"expected"``, its mean effect; ``"seeded"``, the
                 noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise of each item.
 
         Returns:
-            Scores, 0 to 1, an array if ``output`` is one. Shape: (...,).
+            Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device; an audiogram or
-                seed out of range.
+                seed out of range; an unknown noise.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
         return as_type_of(output, _intelligibility(self._compare_all(output, noise, seed, ears)))
@@ -233,11 +235,14 @@ class _Channels(NamedTuple):
 
     Attributes:
         channels: The channels.
-        spectrum: ``lag_spectrum`` of the envelopes, for the alignment of the channels of outputs.
-            Shape: (items, channels, frequencies).
-        delays: Delays in samples that make up for different group delays. Shape: (items, channels).
-        amplitude: Contribution to the mean amplitude of each frame. Shape: (items, frames).
-        cepstrum: Contribution to the cepstrum of each frame. Shape: (items, 5, frames).
+        spectrum: Result of ``lag_spectrum`` for the envelopes, with which the channels of outputs
+            are aligned. Shape: (items, channels, frequencies).
+        delays: Delays in samples that compensate for different group delays. Shape: (items,
+            channels).
+        amplitude: Contribution of these channels to the mean amplitude of each frame, see
+            ``mean_amplitude``. Shape: (items, frames).
+        cepstrum: Contribution of these channels to the cepstrum of each frame. Shape: (items, 5,
+            frames).
     """
 
     channels: slice
@@ -248,16 +253,16 @@ class _Channels(NamedTuple):
 
 
 def _cepstrum(clean: _Channels, output: Tensor, ear: HairCells, extent: Extent) -> Tensor:
-    """Return the contribution of some channels to the cepstrum of the output's frames.
+    """Compute the contribution of some channels to the cepstrum of the output's frames.
 
     Args:
         clean: Features of clean speech in these channels.
-        output: Aligned outputs behind the middle ear. Shape: (items, padded).
+        output: Aligned outputs behind the middle ear at 24 kHz. Shape: (items, padded).
         ear: Hair cells of the impaired ears. Shape: (items, 32).
         extent: Number of samples of each item before padding.
 
     Returns:
-        Contributions in dB over threshold. Shape: (items, 5, frames).
+        Contributions in dB. Shape: (items, 5, frames).
     """
     channels = clean.channels
     power = ear_model.simulate_cochlea(output, ear, channels, extent).power
@@ -272,13 +277,14 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
     """Draw the internal noise of the ear for clean speech and for the output, as pyclarity does.
 
     Args:
-        seed: Seed of each item.
-        extent: Number of samples of each item.
+        seed: Seed, the same for each item, so that its score does not depend on the batch.
+        extent: Number of samples at 24 kHz of each item.
         audible: Number of audible frames of each item.
-        like: Cepstrum of the signals. Shape: (items, 5, audible).
+        like: Cepstrum of the audible frames, which has the shape, the precision and the device of
+            the noise. Shape: (items, 5, frames).
 
     Returns:
-        Cepstrum of the noise for clean speech, then for the output. Shape: (2, items, 5, audible).
+        Cepstrum of the noise for clean speech, then for the output. Shape: (2, items, 5, frames).
     """
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
     random = np.random.RandomState()
@@ -292,13 +298,15 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
 
 @lru_cache(maxsize=256)
 def _state_after_motion_noise(seed: int, samples: int) -> Any:
-    """Return the state of NumPy's generator after the noise that pyclarity draws for HASQI.
+    """Return the state of NumPy's generator after the noise that pyclarity draws for the motion.
 
-    These are most of the random numbers. A study draws the same ones for all conditions and ears.
+    Before the noise on the levels, pyclarity draws noise for the motion of the basilar membrane of
+    both signals, which only HASQI uses. These are most of the random numbers. The state is stored,
+    because a study needs the same one for all conditions and ears.
 
     Args:
         seed: Seed of the generator.
-        samples: Number of samples of a channel.
+        samples: Number of samples at 24 kHz per channel.
     """
     random = np.random.RandomState(seed)
     for _ in range(2 * CHANNELS):
@@ -312,7 +320,8 @@ def _state_after_motion_noise(seed: int, samples: int) -> Any:
 def _intelligibility(features: Tensor) -> Tensor:
     """Compute HASPI as the mean of ten small networks, divided by its largest possible value.
 
-    The best score is therefore 1. The features are the ten correlations of ``correlation``.
+    The best score is therefore 1. The features are ten correlations, see
+    ``envelope_modulation.correlation``.
 
     Shape: (..., 10) -> (...,).
     """
@@ -326,7 +335,7 @@ def _intelligibility(features: Tensor) -> Tensor:
 
 @constant
 def _network(part: str) -> NDArray[np.float64]:
-    """Return weights of the networks that map features to HASPI, biases first.
+    """Load weights of the ten networks that map features to HASPI. In each row the bias is first.
 
     Shape: (10, 4, 11) for ``"hidden"``, (10, 5) for ``"output"``, (1,) for ``"normalisation"``.
     """

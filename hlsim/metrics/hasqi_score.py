@@ -1,7 +1,7 @@
 """HASQI version 2 in PyTorch: the quality of speech in an impaired ear.
 
 The score is that of pyclarity 0.9.0, with a gradient. The notes in ``hlsim.metrics.haspi_score`` on
-rates, lengths, levels and alignment apply to it, too.
+rates, lengths, levels and alignment apply here, too.
 
 Source: Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio
 Eng. Soc. 62(3), 99-117.
@@ -37,11 +37,12 @@ def hasqi(
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean speech that NAL-R has amplified for the same impaired
-    ear, and is differentiable in ``output``.
+    ear, and is differentiable in ``output``. A delay of the output has no effect.
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
-        clean: Clean speech, not amplified unless ``equalisation`` is 2. Shape: (..., time).
+        clean: Clean speech, not amplified unless ``equalisation`` is 2. Shape: (..., time). Lengths
+            of both that differ by 0.1 s at most are cut to the shorter one, with a warning.
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
@@ -55,11 +56,12 @@ def hasqi(
             NAL-R or another prescription has amplified.
 
     Returns:
-        Scores, an array if ``output`` is one. Shape: (...,).
+        Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of other shapes, too short, or not finite; clean speech that is silent
-            or below 20 dB SPL; a rate, level, audiogram, length or seed out of range.
+        ValueError: Signals of different shapes or on different devices, too short, or not finite;
+            clean speech that is silent or below 20 dB SPL; a rate, level, audiogram, length, seed
+            or equalisation out of range; an unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -93,11 +95,11 @@ class HasqiReference(QualityReference):
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity, 1 or 2, see ``hasqi``.
         keep: Store the clean speech's features, about 18 MB per second in float32; otherwise they
-            are computed for each score.
+            are computed, and the level is validated, for each score.
 
     Raises:
         ValueError: Clean speech that lasts less than 0.7 s, is not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram or length out of range.
+            SPL; a rate, level, audiogram, length or equalisation out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

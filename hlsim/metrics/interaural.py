@@ -1,7 +1,7 @@
 """Differences of level and time between two ears, by which listeners localise sounds.
 
-They are computed in five octaves around 250 Hz to 4 kHz. A training loss,
-``hlsim.losses.interaural``, compares them.
+The differences are computed in five octaves around 250 Hz to 4 kHz. The training loss in
+``hlsim.losses.interaural`` compares the differences of two signals.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ class Interaural(NamedTuple):
         level: Level of the left ear minus that of the right ear in dB.
         time: Time in microseconds by which the left ear receives the sound earlier, from -1000 to
             1000.
-        coherence: Correlation of both ears' signals after a shift by this time, from 0 to 1. The
-            time difference is meaningful where the coherence is close to 1.
+        coherence: Correlation of both ears' signals after a shift by this time, 1 at most. It is
+            negative if no shift brings the signals into phase. The time difference is meaningful
+            where the coherence is close to 1.
 
     >>> Interaural(torch.zeros(5), torch.zeros(5), torch.ones(5)).coherence
     tensor([1., 1., 1., 1., 1.])
@@ -55,18 +56,20 @@ def interaural(waveform: Samples, *, sample_rate: int = 16000) -> Interaural:
     """Compute the differences of level and time between two ears over a whole signal, per octave.
 
     The time difference is the delay with the largest cross-correlation of the waveforms in the
-    octave. Above 1.5 kHz, listeners perceive delays of the envelope instead.
+    octave. Above 1.5 kHz, listeners perceive delays of the envelope instead. The results are
+    float64 and have no gradient.
 
     Args:
         waveform: Waveforms of the left and the right ear. Shape: (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns:
-        Level difference in dB, time difference in microseconds, and coherence. Shape of each:
-        (..., 5).
+        Level difference in dB, time difference in microseconds, and coherence, see ``Interaural``.
+        Shape of each: (..., 5).
 
     Raises:
-        ValueError: The waveform has another shape, or the rate is out of range.
+        ValueError: The waveform is not a floating-point signal of two channels, or the rate is out
+            of range.
 
     >>> noise = torch.randn(16000)
     >>> interaural(torch.stack((10.0 * noise, noise))).level.round()
@@ -104,8 +107,8 @@ def interaural_change(before: Samples, after: Samples, *, sample_rate: int = 160
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Difference of the output minus that of the input, for level and time, and the coherence of
-        the output.
+        Level and time differences of the output minus those of the input, and the coherence of the
+        output.
 
     Raises:
         ValueError: The shapes differ or are not (..., 2, time), or the rate is out of range.
@@ -127,13 +130,16 @@ def interaural_change(before: Samples, after: Samples, *, sample_rate: int = 160
 
 
 def spectra_of_ears(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Compute the mean power and cross spectra of two ears.
+    """Compute the mean power spectra and the mean cross spectrum of two ears.
 
-    Shape: (..., 2, time) -> (..., frequencies), (..., frequencies), complex (..., frequencies),
-        (frequencies, 5).
+    Args:
+        waveform: Waveforms of the left and the right ear in Pa. Shape: (..., 2, time).
+        sample_rate: Sample rate in Hz.
 
-    Returns: Powers of the left and of the right ear in Pa^2, the cross spectrum, and the
-        frequencies of each octave as 0 or 1.
+    Returns:
+        Power spectra of the left and of the right ear in Pa^2, (..., frequencies) each; the complex
+        cross spectrum, left times conjugate of right, (..., frequencies); and a matrix with 1 where
+        a frequency lies in an octave and 0 elsewhere, (frequencies, 5).
 
     >>> spectra_of_ears(torch.randn(2, 16000), 16000)[0].shape
     torch.Size([257])
@@ -154,7 +160,12 @@ def spectra_of_ears(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor,
 def _octaves(points: int, sample_rate: int) -> NDArray[np.float64]:
     """Assign the frequencies of a Fourier transform to octaves.
 
-    Returns: 1 where a frequency lies in an octave, otherwise 0. Shape: (points // 2 + 1, 5).
+    Args:
+        points: Length of the transform.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        1 where a frequency lies in an octave, otherwise 0. Shape: (points // 2 + 1, 5).
     """
     hz = np.arange(points // 2 + 1) * sample_rate / points
     octaves_from_centre = np.log2(np.maximum(hz, 1.0)[:, None] / np.array(OCTAVES))

@@ -2,10 +2,10 @@
 
 The score is that of pyclarity 0.9.0, with a gradient. In 15 one-third-octave bands and segments of
 0.4 s, a model of the brain delays the signal of one ear, changes its level and subtracts it from
-that of the other ear, with the errors that listeners make. The delay and the level are those that
-maximise the ratio of the modulation of clean speech to that of the output. Where one ear has a
-larger ratio, that ear counts. The score is the mean correlation of the envelopes of clean speech
-and output. Please note:
+that of the other ear, with the errors that listeners make (*equalisation and cancellation*). The
+delay and the level are those that maximise the ratio of the modulation of clean speech to that of
+the output. If one ear alone has a larger ratio, the signal of that ear is used. The score is the
+mean correlation of the envelopes of clean speech and output. Please note:
 
 - MBSTOI assumes normal hearing and ignores the level. For a listener with a hearing loss, apply a
   simulator to the outputs first.
@@ -39,13 +39,13 @@ FRAME, HOP, POINTS = 256, 128, 512
 """Samples of a frame, samples between frames, and points of a frame's Fourier transform."""
 
 SEGMENT = 30
-"""Frames that are correlated, 0.4 s."""
+"""Number of frames that are correlated at once, 0.4 s."""
 
 BANDS, LOWEST_CENTRE_HZ = 15, 150.0
 """Number of one-third-octave bands, and centre of the lowest one."""
 
 RANGE_DB = 40.0
-"""Level below that of the loudest frame at which clean speech counts as silent."""
+"""Difference in dB from the loudest frame at which clean speech counts as silent."""
 
 DELAYS = np.linspace(-1e-3, 1e-3, 100)
 """Interaural delays in seconds that are compared."""
@@ -54,7 +54,7 @@ LEVELS = np.linspace(-20.0, 20.0, 40)
 """Interaural levels in dB that are compared."""
 
 CPU_SEGMENTS, GPU_SEGMENTS = 2**17 // 4000, 2**25 // 4000
-"""Segments that are computed at once. Each takes 4000 values per band."""
+"""Number of segments that are computed at once. Each needs 4000 values per band."""
 
 LEFT_PAIR, RIGHT_PAIR = 0, 4
 """Positions of two products among the ten pairwise products of a band's four features.
@@ -69,21 +69,24 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
     gradient: which frames are speech, the interaural delays and levels, and the better ear. Scores
-    are computed in float64 where the device supports it. Zeros at the end of an item change its
-    score by up to 0.007, so score the items of a padded batch one by one.
+    are computed in float64 (float32 on Apple's GPUs), and returned in the dtype of the signals.
+    Zeros at the end of an item change its score by up to 0.007, so score the items of a padded
+    batch one by one.
 
     Args:
         output: Output of an aid at the left and the right ear. Shape: (..., 2, time).
         clean: Clean speech at the left and the right ear, time-aligned with ``output``. Shape:
-            (..., 2, time).
+            (..., 2, time). Lengths of both that differ by 0.1 s at most are cut to the shorter one,
+            with a warning.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns:
         Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of other shapes, on different devices or not finite; clean speech that
-            is silent or lasts less than 0.41 s without its pauses; a rate out of range.
+        ValueError: Signals of different shapes, without two channels, on different devices or not
+            finite; clean speech that is silent or lasts less than 0.41 s without its pauses; a rate
+            out of range.
 
     >>> from hlsim import example_speech
     >>> clean = torch.stack([example_speech(), example_speech()])
@@ -108,7 +111,7 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
 
 
 def _score_batch(signals: Tensor, rate: int) -> Tensor:
-    """Compute MBSTOI of items at once.
+    """Compute MBSTOI of several items at once.
 
     Args:
         signals: Clean speech, then the output, at the left, then the right ear. Shape: (items, 2,
@@ -125,7 +128,7 @@ def _score_batch(signals: Tensor, rate: int) -> Tensor:
 def _resample(signals: Tensor, rate: int) -> Tensor:
     """Resample signals to 10 kHz in the frequency domain, with one sample more, as pyclarity does.
 
-    Shape: (..., time) -> (..., points).
+    Shape: (..., time) -> (..., time at 10 kHz + 1).
     """
     time = signals.shape[-1]
     points = int(time * (RATE / rate) + 1)
@@ -136,9 +139,10 @@ def _resample(signals: Tensor, rate: int) -> Tensor:
 
 
 def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
-    """Remove the frames where clean speech is silent at both ears, and overlap and add the others.
+    """Remove the frames where clean speech is silent at both ears, and overlap-add the others.
 
-    A frame is silent at an ear if it is 40 dB or more below the loudest frame of that ear.
+    A frame is silent at an ear if it is 40 dB or more below the loudest frame of that ear. The
+    shortened signals are divided into frames again.
 
     Args:
         signals: Clean signals of the left and the right ear, then the outputs, at 10 kHz. Shape:
@@ -177,28 +181,29 @@ def _remove_silence(signals: Tensor) -> tuple[Tensor, list[int]]:
 
 
 def _frames_to_end(counts: list[int], device: torch.device) -> Tensor:
-    """Count, for each frame, the frames of its item that are not before it.
+    """Return, for each frame, the number of frames from it to the end of its item.
 
     Args:
         counts: Number of frames of each item.
         device: Device of the result.
 
-    Returns: Counts, such as 3, 2, 1 for an item of three frames. Shape: (frames of all items,).
+    Returns:
+        Numbers, such as 3, 2, 1 for an item of three frames. Shape: (frames of all items,).
     """
     return torch.cat([torch.arange(count, 0, -1, device=device) for count in counts])
 
 
 @constant
 def _window() -> NDArray[np.float64]:
-    """Return a Hann window without the zeros at its ends."""
+    """Return a Hann window without the zeros at its ends. Shape: (256,)."""
     return np.hanning(FRAME + 2)[1:-1]
 
 
 def _band_features(frames: Tensor) -> Tensor:
     """Compute four features of each band in each frame.
 
-    They are the power of the left ear, that of the right ear, and the real and the imaginary part
-    of their cross-spectrum.
+    The features are the power of the left ear, that of the right ear, and the real and the
+    imaginary part of their cross-spectrum.
 
     Args:
         frames: Windowed frames of clean speech, then of the output, at the left, then the right
@@ -218,7 +223,7 @@ def _mean_correlation(features: Tensor, counts: list[int]) -> Tensor:
     """Compute the mean correlation over all segments of each item.
 
     Args:
-        features: Output of ``_band_features``.
+        features: Output of ``_band_features``. Shape: (frames of all items, bands, 8).
         counts: Number of frames of each item.
 
     Returns:
@@ -239,7 +244,7 @@ def _mean_correlation(features: Tensor, counts: list[int]) -> Tensor:
 
 @constant
 def _band_matrix() -> NDArray[np.float64]:
-    """Return 1 where a frequency lies in a band, and 0 elsewhere: (frequencies, bands)."""
+    """Return 1 where a frequency lies in a band, and 0 elsewhere. Shape: (frequencies, bands)."""
     bins = np.arange(POINTS // 2 + 1)[:, None]
     edges = LOWEST_CENTRE_HZ * 2.0 ** ((2.0 * np.arange(BANDS + 1) - 1.0) / 6.0)
     edge_bins = np.rint(edges * POINTS / RATE)
@@ -250,7 +255,8 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
     """Compute the correlation of the envelopes of clean speech and output in each segment.
 
     The correlation is a mean over bands. The envelopes are those after equalisation and
-    cancellation with the best delay and level, or those of one ear if it is better.
+    cancellation with the best delay and level, or those of one ear where its ratio of modulation is
+    larger.
 
     Args:
         windows: Segments of the output of ``_band_features``. Shape: (segments, bands, 8, frames).
@@ -285,11 +291,11 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
 
 
 def _correlation(both: Tensor, clean: Tensor, output: Tensor) -> Tensor:
-    """Divide covariances by standard deviations; 0 where a signal has no modulation.
+    """Compute correlations from covariances and variances; 0 where a signal has no modulation.
 
     Args:
         both: Covariances of the envelopes of clean speech and output.
-        clean, output: Variances of both.
+        clean, output: Variances of the envelopes, of the same shape.
     """
     is_varying = (clean > 0.0) & (output > 0.0)
     clean, output = (torch.where(is_varying, part, 1.0) for part in (clean, output))
@@ -300,7 +306,8 @@ def _find_largest_ratio(clean: Tensor, output: Tensor, grid: Tensor) -> tuple[Te
     """Find the delay and level with the largest ratio of modulation, clean speech to output.
 
     Args:
-        clean, output: Products of features. Shape: (segments, bands, pairs).
+        clean, output: Products of features, summed over the frames of a segment. Shape: (segments,
+            bands, pairs).
         grid: Output of ``_cancellation_weights``. Shape: (bands, pairs, delays * levels).
 
     Returns:

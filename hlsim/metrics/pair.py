@@ -13,20 +13,20 @@ from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.torchtools import Samples, as_samples
 
 SHORTEST_SECONDS = 0.7
-"""Shortest signal in seconds for which a score can be trusted."""
+"""Shortest duration of a signal in seconds for which a score can be trusted."""
 
 LARGEST_LENGTH_DIFFERENCE = 0.1
-"""Largest difference in seconds between the lengths of two signals, of which the longer is cut."""
+"""Largest difference in seconds for which the longer of two signals is cut instead of rejected."""
 
 Equalisation = Literal[1, 2]
-"""1: the reference of HASQI and HAAQI is amplified by NAL-R here. 2: it is amplified already."""
+"""Mode of HASQI and HAAQI: 1 amplifies the clean signal by NAL-R, 2 takes an amplified one."""
 
 Noise = Literal["expected", "seeded", "none"]
 """Internal noise of the ear: its mean effect, the noise that pyclarity draws, or none."""
 
 
 def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, str]) -> int:
-    """Return the length of the shorter of two signals, and warn if their lengths differ.
+    """Return the length of the shorter of two signals in samples, and warn if the lengths differ.
 
     Args:
         lengths: Lengths of both signals in samples.
@@ -70,7 +70,7 @@ def check_pair(output: Tensor, clean: Tensor) -> None:
 
 
 def check_finite(name: str, signals: Tensor) -> None:
-    """Raise ValueError if a sample is NaN or infinite. The host waits for the device once.
+    """Raise ValueError if a sample is NaN or infinite. This synchronises with a GPU.
 
     Args:
         name: Name of the signals, for the message.
@@ -91,18 +91,17 @@ def match_pair(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Cut an output and a clean signal to one length, and validate that they can be compared.
 
-    Arrays are converted to tensors.
-
-    The precision of the clean signal becomes that of the output if this is higher.
+    Arrays are converted to tensors. If the output is float64, the clean signal becomes float64.
 
     Args:
         output: Output of an aid. Shape: (..., time).
-        clean: Clean signal. Shape: (..., time), where ``time`` may differ by 0.1 s.
+        clean: Clean signal. Shape: (..., time), where ``time`` may differ by up to 0.1 s.
         sample_rate: Sample rate in Hz.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
 
     Returns:
-        Output, clean signal, and lengths that are limited to the common length.
+        Output and clean signal of the common length, and ``lengths`` (None if there are none) with
+        the common length as their maximum.
 
     Raises:
         ValueError: A signal is not a waveform, the shapes or devices differ, the lengths differ by
@@ -144,6 +143,10 @@ def scores_or_errors(
         ears: Thresholds of the ear of each item in dB HL. Shape: (items, 8).
         ends: Number of samples of each item before padding.
         settings: Further keyword arguments of ``score``.
+
+    Returns:
+        For each item, its score, a tensor without dimensions, or its ValueError. A wrong setting or
+        shape causes the same error for every item.
 
     >>> from hlsim.metrics import haspi
     >>> silence = torch.zeros(1, 16000)

@@ -1,7 +1,7 @@
 """Comparison of two signals in one impaired ear, which HASQI and HAAQI have in common.
 
 The ear receives the clean signal amplified by NAL-R, and the output of an aid as it is. The scores
-therefore show distortion, noise and colour, not whether enough is audible.
+therefore show distortion, noise and changes of the spectrum, not whether enough is audible.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ THRESHOLD_NOISE_DB = -10.0
 """Level of the noise on the motion of the basilar membrane, in dB over threshold."""
 
 FROZEN_SAMPLES = 2**17
-"""Length of the fixed noise of ``noise="expected"``, from which every channel takes a part."""
+"""Number of samples of the fixed noise of ``noise="expected"``. Each channel uses a part of it."""
 
 FROZEN_STRIDE = 4001
 """Samples between the starts of the parts of two neighbouring channels."""
 
 
 class QualityParts(NamedTuple):
-    """HASQI or HAAQI with the two parts from which it follows. Shape of all: (...,).
+    """HASQI or HAAQI, and its two parts. Shape of each attribute: (...).
 
     Attributes:
         combined: The score, 0 to 1.
         nonlinear: Similarity of envelopes and fine structure, 0 to 1. Noise and distortion reduce
             it.
-        linear: Similarity of long-term spectra, 0 to 1. Changes of the frequency response reduce
-            it.
+        linear: Similarity of long-term spectra, 0 to 1. Changes of the long-term spectrum, such as
+            another frequency response, reduce it.
 
     >>> QualityParts(torch.tensor(0.4), torch.tensor(0.5), torch.tensor(0.8)).nonlinear
     tensor(0.5000)
@@ -69,9 +69,9 @@ class _Comparison(NamedTuple):
             (HASQI) or 8 ms (HAAQI). Shape: (items, channels, segments).
         coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
             (items, channels, segments).
-        energy: Mean square of the envelope of the clean signal's fine structure, with the noise
-            of the ear, in each segment of 16 ms; see ``segment_spectra``. Shape: (items, channels,
-            segments), with fewer segments than the levels of HAAQI.
+        energy: Mean square of the envelope of the clean signal's fine structure in each segment of
+            16 ms, with the ear's noise if ``noise`` is ``"seeded"``; see ``segment_spectra``.
+            Shape: (items, channels, segments), with fewer segments than the levels of HAAQI.
         clean_spectrum, output_spectrum: Long-term levels in dB over threshold. Shape: (items,
             channels).
     """
@@ -100,11 +100,11 @@ class QualityReference(Reference):
         equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes
             signals that NAL-R or another prescription has amplified.
         keep: Store the clean signals' features, about 18 MB per second in float32; otherwise they
-            are computed for each score.
+            are computed, and the level is validated, for each score.
 
     Raises:
         ValueError: Clean signals that last less than 0.7 s, are not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram or length out of range.
+            SPL; a rate, level, audiogram, length or equalisation out of range.
 
     >>> from hlsim import example_speech
     >>> from hlsim.metrics import HasqiReference
@@ -114,50 +114,53 @@ class QualityReference(Reference):
     """
 
     envelope_segment: ClassVar[int]
-    """Samples of a segment of the smoothed envelopes at 24 kHz."""
+    """Length of a segment over which envelopes are smoothed, in samples at 24 kHz."""
 
     split_by_rate: ClassVar[Any] = None
-    """Function that divides fluctuations of envelopes into bands of modulation."""
+    """Function that divides the fluctuations of envelopes into bands of modulation, or None."""
 
     def score(self, output: Audio, *, noise: Noise = "expected", seed: int = 0) -> Audio:
         """Return the score of each output of an aid.
 
         Args:
-            output: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
+            output: Outputs with the shape, rate and scale of the clean signals. Shape: (...,
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise of each item.
 
         Returns:
-            Scores, 0 to 1, an array if ``output`` is one. Shape: (...,).
+            Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
 
         Raises:
-            ValueError: Outputs of another shape, not finite or on another device.
+            ValueError: Outputs of another shape, not finite or on another device; an unknown noise
+                or a seed out of range.
         """
         return as_type_of(output, self.parts(output, noise=noise, seed=seed).combined)
 
     def parts(self, output: Samples, *, noise: Noise = "expected", seed: int = 0) -> QualityParts:
         """Return the score of each output of an aid with its nonlinear and its linear part.
 
-        The parts of arrays are tensors, too.
-
         Args:
-            output: Outputs of the shape, rate and scale of the clean signals. Shape: (...,
+            output: Outputs with the shape, rate and scale of the clean signals. Shape: (...,
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise of each item.
 
+        Returns:
+            Score and parts, tensors even if ``output`` is an array. Shape of each: (...).
+
         Raises:
-            ValueError: Outputs of another shape, not finite or on another device.
+            ValueError: Outputs of another shape, not finite or on another device; an unknown noise
+                or a seed out of range.
         """
         return QualityParts(*self._compare_all(output, noise, seed).unbind(-1))
 
     @staticmethod
     @abstractmethod
     def _combine(envelopes: Tensor, fine: Tensor, x: Tensor, y: Tensor) -> QualityParts:
-        """Compute the score of each item and its parts.
+        """Compute the score of each item and its parts. Shape of each part: (items,).
 
         Args:
             envelopes: Correlation of the envelopes. Shape: (items,).
@@ -203,7 +206,20 @@ class QualityReference(Reference):
     def _adapt(
         self, power: Tensor, motion: Tensor, inner: Tensor, delays: Tensor, extent: Extent
     ) -> tuple[Tensor, Tensor]:
-        """Return the smoothed levels, with equal group delays, and the adapted motion."""
+        """Simulate the inner hair cells: smoothed levels, and motion with the level as envelope.
+
+        Args:
+            power: Power of the compressed envelopes. Shape: (items, channels, padded).
+            motion: Compressed motion of the basilar membrane. Shape: (items, channels, padded).
+            inner: Loss of the inner hair cells in dB. Shape: (items, channels) or (channels,).
+            delays: Delays in samples that compensate for different group delays, used for the
+                levels only. Shape: (items, channels).
+            extent: Number of samples of each item before padding.
+
+        Returns:
+            Levels in dB over threshold, (items, channels, segments), and motion, (items, channels,
+            padded).
+        """
         levels = ear_model.nerve_levels(power, inner)
         motion = _scale_motion_to_level(motion, power, levels, self._unit)
         delayed = _delay(levels, delays, extent)
@@ -212,7 +228,7 @@ class QualityReference(Reference):
     def _compare(
         self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
-        """Compute the score of each item, its nonlinear and its linear part.
+        """Compute the score of each item, its nonlinear part and its linear part.
 
         Shape: -> (items, 3).
         """
@@ -281,8 +297,14 @@ class QualityReference(Reference):
             motion: Motion of the channels, (items, channels, padded).
             delays: Delays in samples, (items, channels).
             channels: The channels.
-            noise: Noise with standard deviation 1 of all channels, or None for no noise.
-            extent: Lengths of the items. Samples after the longest are left out.
+            noise: Noise of standard deviation 1 for all 32 channels, (items, 32, longest) or (32,
+                longest), or None for no noise.
+            extent: Number of samples of each item before padding. Samples after the longest item
+                are left out.
+
+        Returns:
+            Spectra, (items, channels, segments, frequencies), and mean squares, (items, channels,
+            segments).
         """
         motion = motion[..., : extent.longest]
         if noise is not None:
@@ -297,11 +319,14 @@ class _Channels:
 
     Attributes:
         channels: The channels.
-        envelope, motion: ``lag_spectrum`` of both, for the alignment of an output's envelope and
-            motion. Shape: (items, channels, frequencies).
-        delays: Delays in samples that make up for different group delays. Shape: (items, channels).
-        smooth_levels: Smoothed levels. Shape: (items, channels, segments).
-        adapted_motion: Motion after adaptation. Shape: (items, channels, padded).
+        envelope, motion: Results of ``lag_spectrum`` for the clean signal's envelope and motion,
+            with which those of an output are aligned. Shape: (items, channels, frequencies).
+        delays: Delays in samples that compensate for different group delays. Shape: (items,
+            channels).
+        smooth_levels: Levels in dB over threshold, smoothed over segments. Shape: (items, channels,
+            segments).
+        adapted_motion: Motion whose envelope is the level at the auditory nerve. Shape: (items,
+            channels, padded).
         segments: Spectra and mean squares of segments of that motion by ``segment_spectra``.
         level: Long-term level in dB over threshold. Shape: (items, channels).
     """
@@ -328,10 +353,10 @@ def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: 
     only converted to the scale of the input, as in pyclarity.
 
     Args:
-        motion: Motion of the basilar membrane.
-        power: Power of its envelope, in multiples of that at 0 dB SPL.
-        levels: Levels in dB over threshold.
-        unit: Amplitude of 20 uPa in the signals.
+        motion: Motion of the basilar membrane in multiples of 20 uPa.
+        power: Power of its envelope, where 1 is 0 dB SPL.
+        levels: Levels at the auditory nerve in dB over threshold.
+        unit: Amplitude of 20 uPa on the scale of the input.
 
     Shape: (items, channels, padded) three times -> (items, channels, padded).
     """
@@ -386,9 +411,12 @@ def _frozen_table() -> NDArray[np.float64]:
 
 
 def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
-    """Amplify signals by NAL-R. As in pyclarity, the output begins at the filter's last tap.
+    """Amplify signals by NAL-R for ears with thresholds in dB HL.
 
-    Shape: (items, padded), (items, 8) dB HL -> (items, padded).
+    As in pyclarity, the first 140 samples of the filter's output are left out, so that the result
+    is 70 samples earlier than the signal.
+
+    Shape: (items, padded), (items, 8) -> (items, padded).
     """
     points = fft_length(extent.longest + NALR_ORDER, 2)
     taps = filters_with_gains(nalr_gains_db(ears.double()), FREQUENCIES, RATE, NALR_ORDER)

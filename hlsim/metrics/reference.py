@@ -1,7 +1,7 @@
 """Scores of many outputs against the same clean signals, which are prepared once.
 
 ``Reference`` is the base of ``HaspiReference``, ``HasqiReference`` and ``HaaqiReference``. It
-computes items in groups: a single item on a CPU, all items on a GPU.
+computes items in groups: one at a time on a CPU, all at once on a GPU.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ Result = TypeVar("Result")
 
 
 class PreparedBatch(NamedTuple):
-    """Clean signals of a batch as an ear receives them, ready to be compared with outputs of aids.
+    """Clean signals of a batch with their features in an ear, to be compared with outputs of aids.
 
     Attributes:
         clean: The clean signals.
         cells: Hair cells of the ear, or of the ear of each item. Shape: (32,) or (items, 32).
-        features: Features of the clean signals, for a few channels of the ear at a time.
+        features: Features of the clean signals, one object for each group of channels of the ear.
 
     >>> PreparedBatch._fields
     ('clean', 'cells', 'features')
@@ -62,19 +62,19 @@ class Reference(ABC):
     Args:
         clean: Clean signals. The scores have their dtype and their device. Their gradient is not
             computed. Shape: (..., time).
-        audiogram: Ear that receives the clean signals, or one for each item.
+        audiogram: Ear that receives the clean signals; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity for HASQI and HAAQI: 1 amplifies the clean signals by NAL-R,
             2 takes signals that are amplified already.
-        keep: Store the clean signals' features; otherwise they are computed for each score, which
-            takes less memory.
+        keep: Store the clean signals' features; otherwise they are computed, and the level is
+            validated, for each score, which takes less memory.
 
     Raises:
         ValueError: Clean signals that last less than 0.7 s, are not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram or length out of range.
+            SPL; a rate, level, audiogram, length or equalisation out of range.
 
     >>> from hlsim.metrics import HaspiReference
     >>> issubclass(HaspiReference, Reference)
@@ -122,7 +122,7 @@ class Reference(ABC):
 
     @property
     def nbytes(self) -> int:
-        """Size of the stored features in bytes."""
+        """Size of the stored features in bytes, 0 with ``keep=False``."""
         return _count_bytes(self._batches)
 
     def _thresholds(self, audiogram: AudiogramLike) -> Tensor:
@@ -146,7 +146,7 @@ class Reference(ABC):
     @torch.inference_mode(False)  # the features may serve a training later
     @torch.no_grad()
     def _prepare(self, items: slice) -> PreparedBatch:
-        """Validate the clean signals of some items, and compute their features."""
+        """Validate the clean signals of a group of items, and compute their features."""
         with torch.autocast(self._clean.device.type, enabled=False):
             clean = CleanBatch(self._rows, self._ends, items, self._rate, self._full_scale_spl)
             at_ear, cells = self._sound_at_ear(clean)
@@ -160,7 +160,7 @@ class Reference(ABC):
 
     @abstractmethod
     def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
-        """Return the clean signals as they reach the ear of the reference, and its hair cells.
+        """Return the clean signals as they reach the reference's ear, and the ear's hair cells.
 
         The ear of HASPI is normal. That of HASQI and HAAQI is the impaired one, for which the
         signals are amplified by NAL-R unless they are already.
@@ -182,11 +182,16 @@ class Reference(ABC):
         """Compute the features of the clean signals in some channels.
 
         Args:
-            sound: Clean signals behind the middle ear. Shape: (items, padded).
+            sound: Clean signals behind the middle ear at 24 kHz, in multiples of 20 uPa. Shape:
+                (items, padded).
             cells: Hair cells of all channels.
             channels: The channels.
-            longest_delay: Delay to which all channels are delayed. Shape: (items, 1).
+            longest_delay: Group delay in samples that all channels have after alignment. Shape:
+                (items, 1).
             extent: Number of samples of each item before padding.
+
+        Returns:
+            Features in the form that ``_compare`` of the subclass reads.
         """
 
     @abstractmethod
@@ -197,7 +202,8 @@ class Reference(ABC):
 
         Args:
             batch: The clean signals.
-            output: Aligned outputs behind the middle ear. Shape: (items, padded).
+            output: Aligned outputs behind the middle ear at 24 kHz, in multiples of 20 uPa. Shape:
+                (items, padded).
             noise: Kind of the internal noise of the ear.
             seed: Seed of the noise.
             ears: For HASPI one argument, the hair cells of the impaired ears of all items, with
@@ -205,13 +211,19 @@ class Reference(ABC):
                 ears as the clean signals.
 
         Returns:
-            Numbers for each item from which its score follows. Shape: (items, numbers).
+            For each item ten features of HASPI, or score, nonlinear and linear part of HASQI and
+            HAAQI. Shape: (items, numbers).
         """
 
     def _compare_all(self, output: Samples, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
-        """Validate outputs, and compare them with the clean signals.
+        """Validate outputs, and compare them with the clean signals of all groups.
 
-        The arguments are those of ``_compare``. Shape: (..., time) -> (..., numbers).
+        The arguments are those of ``_compare``, but with outputs at the sample rate and on the
+        scale of the clean signals. Shape: (..., time) -> (..., numbers).
+
+        Raises:
+            ValueError: The noise is unknown, the seed is out of range, or outputs have another
+                shape than the clean signals, are not finite or on another device.
         """
         check_choice("noise", noise, Noise)
         check_number("seed", seed, 0, 2**32 - 1, whole=True)
@@ -231,7 +243,7 @@ class Reference(ABC):
 
 
 def _count_bytes(value: Any) -> int:
-    """Return the size of all tensors in lists, tuples and objects, in bytes."""
+    """Return the size in bytes of all tensors in lists, tuples and attributes of objects."""
     if isinstance(value, Tensor):
         return value.nbytes
     if not isinstance(value, list | tuple):
@@ -250,8 +262,8 @@ def map_on_cores(
     Args:
         function: Function to call.
         arguments: Arguments of the calls.
-        signal: Tensor on which the function depends. If it is not on a CPU or has a gradient, the
-            calls are made in this thread, to which the hooks of autograd belong.
+        signal: Tensor on which the function depends. If it is not on a CPU or requires a gradient,
+            the calls are made in this thread, to which the hooks of autograd belong.
 
     Returns:
         Results in the order of the arguments.

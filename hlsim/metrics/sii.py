@@ -1,6 +1,6 @@
 """The speech intelligibility index (SII) of ANSI S3.5-1997, by third octaves.
 
-It is the share of speech, weighted by the importance of each band, that is audible.
+The index is the audible share of speech, 0 to 1, with a weight for the importance of each band.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _IMPORTANCE = (
     *(0.0083, 0.0095, 0.0150, 0.0289, 0.0440, 0.0578, 0.0653, 0.0711, 0.0818, 0.0844, 0.0882),
     *(0.0898, 0.0868, 0.0844, 0.0771, 0.0527, 0.0364, 0.0185),
 )
-"""Importance of each band, table 3 of the standard."""
+"""Importance of each band, 1 in sum, table 3 of the standard."""
 
 _NORMAL_SPEECH = (
     *(32.41, 34.48, 34.75, 33.98, 34.59, 34.27, 32.06, 28.30, 25.01, 23.00, 20.15, 17.32),
@@ -33,7 +33,7 @@ INTERNAL_NOISE = (
 """Spectrum level of the internal noise of a normal ear in dB SPL per Hz, table 3."""
 
 SILENCE = -50.0
-"""Spectrum level in dB SPL per Hz that stands for no noise."""
+"""Spectrum level in dB SPL per Hz that means no noise."""
 
 
 def sii(
@@ -47,7 +47,7 @@ def sii(
         speech: Spectrum levels of the speech at the ear, as in a free field, in dB SPL per Hz at
             ``SII_BANDS``, (18,).
         noise: Spectrum levels of noise, in the same unit, (18,); by default none.
-        thresholds: Thresholds of the ear in dB HL, (18,); by default those of a normal ear.
+        thresholds: Thresholds of the ear in dB HL at ``SII_BANDS``, (18,); by default 0 dB HL.
 
     Raises:
         ValueError: An argument does not have 18 levels.
@@ -69,7 +69,16 @@ def sii(
 
 
 def _masking(speech: NDArray[np.float64], noise: NDArray[np.float64], hertz: NDArray) -> NDArray:
-    """Compute the noise with the masking that spreads from lower bands, in dB SPL per Hz, (18,)."""
+    """Compute the level of noise and of the masking that spreads from lower to higher bands.
+
+    Args:
+        speech: Spectrum levels of speech in dB SPL per Hz. Shape: (18,).
+        noise: Spectrum levels of noise in dB SPL per Hz. Shape: (18,).
+        hertz: Centres of the bands in Hz. Shape: (18,).
+
+    Returns:
+        Spectrum levels in dB SPL per Hz. Shape: (18,).
+    """
     # Speech masks itself by a level 24 dB below its own.
     masker = np.maximum(noise, speech - 24.0)
     slope = -80.0 + 0.6 * (masker + 10.0 * np.log10(hertz) - 6.353)  # dB per octave
@@ -82,10 +91,10 @@ def _masking(speech: NDArray[np.float64], noise: NDArray[np.float64], hertz: NDA
 
 
 def _as_levels(levels: ArrayLike) -> NDArray[np.float64]:
-    """Return levels as an array of shape (18,).
+    """Convert levels to a float64 array of shape (18,).
 
     Raises:
-        ValueError: The shape is another one.
+        ValueError: The levels have another shape.
     """
     array = np.asarray(levels, dtype=float)
     if array.shape != (len(SII_BANDS),):

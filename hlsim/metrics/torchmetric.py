@@ -2,8 +2,8 @@
 
 A metric collects the mean score over batches. The classes need the extra ``train``.
 
-The annotations are no strings (``from __future__ import annotations``), which ``torch.jit.script``
-does not understand in a class.
+This module does without ``from __future__ import annotations``, because ``torch.jit.script`` does
+not understand annotations that are strings in a class.
 """
 
 import warnings
@@ -34,10 +34,10 @@ _Metric: Any = require("torchmetrics", "train").Metric
 
 
 class _MeanScore(_Metric):
-    """Mean of a score over all items since the last ``reset``.
+    """Mean of a score over all items since the last ``reset``, the base class of the metrics.
 
     Subclasses set ``score`` to the function that computes scores, and ``ears_per_score`` to 2 if
-    both ears of a listener have one score.
+    both ears of a listener have one score in common.
     """
 
     is_differentiable = False
@@ -94,8 +94,9 @@ class _MeanScore(_Metric):
     def forward(self, *args: Any, **kwargs: Any) -> Tensor:
         """Update the metric by a batch, and return the mean score of this batch in this process.
 
-        The arguments are those of ``update``. (The method of torchmetrics resets the metric before
-        each batch, so that ``limit`` would begin again.)
+        The arguments are those of ``update``. The result is NaN if no item of the batch was scored.
+        This method replaces that of torchmetrics, which resets the metric before each batch, so
+        that ``limit`` would begin again.
         """
         total, count = self.total.clone(), self.count.clone()
         self.update(*args, **kwargs)
@@ -143,12 +144,11 @@ class _MeanScore(_Metric):
                 differ by up to 0.1 s.
             audiogram: One ear, or one per item. For two channels a ``Listener``, a pair of left
                 and right ear, or one of these per item. None takes that of the constructor.
-            lengths: Number of samples of each item of a padded batch.
-                Shape: (batch,).
+            lengths: Number of samples of each item of a padded batch. Shape: (batch,).
 
         Raises:
-            ValueError: The shapes do not fit, the signals are not what ``haspi`` accepts, there is
-                no audiogram, or ``audiogram`` or ``lengths`` are not as described.
+            ValueError: The shapes do not fit, a signal is not a floating-point tensor with time
+                last, there is no audiogram, or ``audiogram`` or ``lengths`` are not as described.
         """
         pair = match_pair(output, clean, self.sample_rate)
         longest = max(output.shape[-1], clean.shape[-1])
@@ -223,9 +223,9 @@ class HASPI(_MeanScore):
     """Mean HASPI v2, the intelligibility of outputs, over all items since ``reset``.
 
     HASPI rewards any gain, so log the mean level of the outputs, the attribute ``level``, as well.
-    The score of an item is that of ``haspi`` with the same settings, in double precision. On a CPU
-    one second of audio takes about 0.12 s on one core; ``limit`` bounds the cost of a validation
-    epoch.
+    The score of an item is that of ``haspi`` with the same settings, in double precision. With two
+    channels, an item has the score of the better ear. Scoring one second of audio takes about
+    0.12 s on one core of a CPU; ``limit`` bounds the cost of a validation epoch.
 
     In a LightningModule, write ``self.haspi = HASPI(sample_rate=16000)`` in the constructor, and
     ``self.haspi.update(output, clean, audiogram); self.log("haspi", self.haspi)`` in
@@ -233,17 +233,18 @@ class HASPI(_MeanScore):
 
     Attributes:
         level: Mean level in dB SPL of the outputs that were scored in this process.
-        count: Number of items that were scored.
-        failed: Number of items that could not be scored.
-        seen: Number of all items, with those beyond ``limit``.
+        count: Number of items that were scored in this process.
+        failed: Number of items that could not be scored in this process. The mean is computed
+            without them.
+        seen: Number of all items in this process, including those beyond ``limit``.
 
     Args:
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        audiogram: Ear of the batches for which ``update`` is passed none, such as those of
-            torchmetrics' ``MultitaskWrapper``.
+        audiogram: Ear for calls of ``update`` without an audiogram, such as those by torchmetrics'
+            ``MultitaskWrapper``.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
-        limit: Number of items that are scored from one reset to the next in each process; the
-            others are passed over. None scores all.
+        limit: Largest number of items that are scored from one reset to the next in each process;
+            the others are skipped. None scores all.
         options: Keyword arguments of ``torchmetrics.Metric``, except ``dist_sync_on_step``.
 
     Raises:
@@ -263,8 +264,8 @@ class HASQI(_MeanScore):
     """Mean HASQI v2, the quality of outputs, over all items since the last ``reset``.
 
     The arguments and attributes are those of ``HASPI``. Outputs are compared with clean speech that
-    NAL-R has amplified. Noise, distortion and changes of the spectrum lower the score, and a delay
-    is compensated. On a CPU one second of audio takes about 0.2 s.
+    NAL-R has amplified. Noise, distortion and changes of the spectrum reduce the score, and a delay
+    has no effect. Scoring one second of audio takes about 0.2 s on a CPU.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASQI()
@@ -301,7 +302,10 @@ def _mbstoi(
     sample_rate: int,
     full_scale_spl: float,
 ) -> Tensor:
-    """Compute MBSTOI, which does not depend on the ears and on the scale, item by item."""
+    """Compute MBSTOI item by item. It ignores ``ears`` and ``full_scale_spl``.
+
+    Shape: (items, 2, time) twice -> (items,).
+    """
     pairs = zip(output, clean, lengths, strict=True)
     scores = [mbstoi(x[:, :end], y[:, :end], sample_rate=sample_rate) for x, y, end in pairs]
     return torch.stack(scores)
@@ -341,11 +345,13 @@ class MBSTOI(_MeanScore):
         Args:
             output: Outputs of an aid at the left and the right ear. Shape: (2, time) or (batch, 2,
                 time).
-            clean: Clean speech of the same shape.
+            clean: Clean speech of the same shape. The longer of both is cut with a warning if they
+                differ by up to 0.1 s.
             lengths: Number of samples of each item of a padded batch. Shape: (batch,).
 
         Raises:
-            ValueError: The shapes do not fit, or the signals are not what ``mbstoi`` accepts.
+            ValueError: The shapes do not fit, a signal is not a floating-point tensor with time
+                last, or ``lengths`` are not as described.
         """
         check_two_channels(output)
         if output.ndim == 2:
@@ -354,12 +360,16 @@ class MBSTOI(_MeanScore):
 
 
 def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
-    """Return the thresholds of each item's ears on the CPU.
+    """Return the thresholds of each item's ears in dB HL on the CPU. Shape: -> (items, sides, 8).
 
-    Shape: (items, sides, 8) dB HL.
+    Args:
+        audiogram: Ears of all items or of each item.
+        items: Number of items.
+        sides: Number of ears per item, 1 or 2.
 
     Raises:
-        ValueError: The shape of the ears fits neither all items nor each of them.
+        ValueError: The shape of the ears fits neither all items nor each of them, or a level is out
+            of range.
     """
     if isinstance(audiogram, Tensor):
         audiogram = audiogram.cpu()  # a level out of range is an error there, and NaN on a GPU

@@ -33,10 +33,10 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 DRAWS = 4000
-"""Number of listeners that are simulated."""
+"""Number of listeners that ``simulate_proportions`` simulates."""
 
 INTERVAL = 0.9
-"""Proportion of listeners whose change lies in the interval."""
+"""Proportion of simulated listeners whose change lies in the interval of ``WordsChange``."""
 
 
 class Curve(NamedTuple):
@@ -51,7 +51,7 @@ class Curve(NamedTuple):
             and slope over the means of aids.
         covariance: Covariance of the three coefficients.
         dispersion: Parameter of the beta-binomial distribution of the words understood in a
-            sentence. The smaller the dispersion, the more sentences differ.
+            sentence. With a smaller dispersion, sentences differ more.
         listener: Standard deviation of the intercepts of listeners.
         listener_slope: Standard deviation of the slopes of listeners.
         aid: Standard deviation of the intercepts of aids.
@@ -73,13 +73,13 @@ class Curve(NamedTuple):
     challenge: float
 
     def of_challenge(self, challenge: int) -> Curve:
-        """Return the curve of sentences as in one of Clarity's first two enhancement challenges.
+        """Return the curve for sentences as in one of Clarity's first two enhancement challenges.
 
         Args:
-            challenge: 1 or 2.
+            challenge: Number of the challenge, 1 or 2.
 
         Raises:
-            ValueError: The challenge is another one.
+            ValueError: The number is neither 1 nor 2.
         """
         if challenge not in (1, 2):
             raise ValueError(
@@ -99,7 +99,7 @@ class WordsChange(NamedTuple):
         before: Mean proportion with the first aid, 0 to 1.
         after: Mean proportion with the second aid, 0 to 1.
         change: ``after`` minus ``before``.
-        low: Lower end of the interval in which the change of a new listener lies with a probability
+        low: Lower end of the interval that contains the change of a new listener with a probability
             of 90 %.
         high: Upper end of this interval.
 
@@ -130,26 +130,28 @@ def load_curve() -> Curve:
 def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = None) -> WordsChange:
     """Predict from HASPI the shares of words that a new listener understands with two aids.
 
-    The interval of 90 % contains the differences between listeners, aids and sentences, and the
+    The interval of 90 % includes the differences between listeners, aids and sentences, and the
     uncertainty of the coefficients. In a test with listeners that were left out of the fit, 88 to
-    92 of 100 changes lay in it. The listeners are simulated, always with the same random numbers.
+    92 of 100 changes lay in the interval. Listeners are simulated, always with the same random
+    numbers.
 
     Args:
         before: HASPI v2 of each sentence with the first aid, from 0 to 1. Shape: (items,).
         after: HASPI v2 of each sentence with the second aid, from 0 to 1. Shape: (items,), whose
             length may differ.
         challenge: 1 or 2 if the sentences are as hard as those of Clarity's first or second
-            enhancement challenge (one interfering sound; two or three, and a head that moves). At
-            the same HASPI, fewer words were understood in the second one. By default, the
-            difference between two such tests is a part of the uncertainty.
+            enhancement challenge. (The first had one interfering sound; the second had two or
+            three, and the listener's head moved.) At the same HASPI, fewer words were understood in
+            the second one. With None, the difference between two such tests is a part of the
+            uncertainty.
 
     Returns:
         Mean shares of words (0 to 1) with each aid, the second minus the first, and the limits
         between which this change lies for 90 % of new listeners.
 
     Raises:
-        ValueError: There are no scores, or they have another shape or are outside 0 to 1, or there
-            is no such challenge.
+        ValueError: There are no scores, they have another shape, one is NaN or outside 0 to 1, or
+            the challenge is neither 1, 2 nor None.
 
     >>> words_change([0.3] * 20, [0.8] * 20).change > 0.3
     True
@@ -171,7 +173,11 @@ def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = No
 
 
 def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
-    """Return scores as a float64 array, (items,), and their mean.
+    """Convert HASPI scores to a float64 array, (items,), and return it with its mean.
+
+    Args:
+        name: Name of the argument, for messages.
+        scores: HASPI of each sentence.
 
     Raises:
         ValueError: There are no scores, they do not have the shape (items,), or one is NaN or

@@ -1,1 +1,1 @@
-"""Kates' model of the ear, on which HASPI, HASQI and HAAQI rest."""
+"""Kates' model of the ear, on which the scores HASPI, HASQI and HAAQI are based."""

@@ -16,24 +16,25 @@ from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 MAX_LAG = 2400
-"""Largest time in samples, 100 ms, by which a channel of an output is shifted to be aligned."""
+"""Largest shift of a single channel of an output in samples, 100 ms."""
 
 HEADROOM = RATE // 500
-"""Samples, 2 ms, by which the output is late after alignment.
+"""Number of samples (2 ms) by which the whole output is late after its alignment.
 
-An aid may delay some frequencies less than the whole signal; these would be early otherwise.
+An aid may delay some frequencies less than the whole signal. Without this delay, they would be
+early.
 """
 
 
 def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
-    """Return the spectra of signals without their means, from which ``bulk_delays`` are computed.
+    """Compute the spectra of signals without their means, for the correlation in ``bulk_delays``.
 
     Args:
         signals: Signals at 24 kHz. Shape: (items, time).
         extent: Number of samples of each item before padding.
 
     Returns:
-        Spectra, long enough for correlations at all delays. Shape: (items, frequencies).
+        Complex spectra, zero-padded for correlations at all delays. Shape: (items, frequencies).
 
     >>> spectrum_for_alignment(torch.randn(1, 100), Extent((100,))).shape
     torch.Size([1, 101])
@@ -43,7 +44,7 @@ def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
 
 
 def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> Tensor:
-    """Return the delay that each output of an aid needs to lie 2 ms behind its clean signal.
+    """Compute the delay that each output of an aid needs to lie 2 ms behind its clean signal.
 
     The delay is found by the largest magnitude of the cross-covariance of the whole signals.
 
@@ -69,18 +70,18 @@ def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> T
 
 
 def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
-    """Return the spectrum of a clean signal's channels with which ``align_channels`` aligns others.
+    """Transform a clean signal's channels for ``align_channels``, which correlates outputs with it.
 
-    The result is the spectrum of the differences of neighbouring samples, from which follow the
-    steps of a correlation from lag to lag. Near its maximum, a correlation hardly changes: single
-    precision resolves the steps, but not the values.
+    The result is the spectrum of the differences between neighbouring samples. A correlation with
+    these differences is the change of the correlation with the signal from one lag to the next.
+    Near the maximum, single precision resolves these changes, but not the values themselves.
 
     Args:
         reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).
         extent: Number of samples of each item before padding.
 
     Returns:
-        Spectrum. Shape: (items, channels, frequencies).
+        Complex spectrum, (items, channels, frequencies).
 
     >>> lag_spectrum(torch.zeros(1, 2, 128), Extent((128,))).shape
     torch.Size([1, 2, 1297])
@@ -104,8 +105,8 @@ def align_channels(
 ) -> Tensor:
     """Shift each channel of an output to where it correlates best with the clean signal.
 
-    Channels are delayed by whole samples at 24 kHz, from -2399 to 2400 (100 ms), or by fewer than
-    the longest item has. Samples from outside of an item are 0. The shifts are constants for the
+    Channels are delayed by -2399 to 2400 samples (100 ms) at 24 kHz, and at most by the length of
+    the longest item. Samples from outside of an item are 0. The shifts are constants for the
     gradient.
 
     Args:

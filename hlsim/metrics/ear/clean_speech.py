@@ -2,7 +2,7 @@
 
 Everything in a score that depends on the clean signal alone is computed here once: it is validated,
 resampled to the ear's rate of 24 kHz, and cut to its audible part. The output of an aid is then
-brought to the same rate and cut to the same part, behind a delay that makes both match.
+resampled to the same rate, shifted in time to match the clean signal, and cut to the same part.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ LOWEST_REFERENCE_SPL = 20.0
 """Lowest level of clean speech or music in dB SPL for which a score can be trusted."""
 
 MIN_AUDIBLE_SAMPLES = 384
-"""Smallest number of samples at 24 kHz between silent ends, a segment of HASQI."""
+"""Smallest number of samples at 24 kHz from the first to the last audible one.
+
+It is the length of a segment of HASQI, 16 ms.
+"""
 
 
 class UnscorableError(ValueError):
@@ -35,13 +38,16 @@ class CleanBatch:
     Args:
         clean: Clean signals of all items. Shape: (all items, time).
         ends: Number of samples of each of these items before padding.
-        items: Which of them belong to the batch: one item on a CPU, because caches hold no more,
-            and all items on a GPU.
+        items: Range of the items that belong to the batch: one item on a CPU, because the caches
+            have no room for more, and all items on a GPU.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
 
     Attributes:
-        audible: Number of samples at 24 kHz from the first to the last one that is not silent.
+        items: Range of the items that belong to the batch.
+        dtype: Precision in which scores are computed, float32 or float64.
+        audible: Length of the audible part of each item: number of samples at 24 kHz from the first
+            to the last one that is not silent.
         signals: Audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
 
     Raises:
@@ -94,16 +100,30 @@ class CleanBatch:
         self.signals = self._cut(at_ear, -first)
 
     def _to_ear_rate(self, signals: Tensor) -> Tensor:
-        """Resample signals to 24 kHz, and convert them to multiples of 20 uPa."""
+        """Resample signals to 24 kHz, and convert them to multiples of 20 uPa.
+
+        Shape: (items, longest) -> (items, longest at 24 kHz).
+        """
         return ear_rate.to_ear_rate(signals, self._rate, self._extent) * self._gain
 
     def _cut(self, at_ear: Tensor, delays: Tensor) -> Tensor:
-        """Delay signals at 24 kHz, and cut them to the length of the audible parts."""
+        """Delay signals at 24 kHz, and cut them to the length of the audible parts.
+
+        Args:
+            at_ear: Signals. Shape: (items, time).
+            delays: Delays in samples; negative ones advance the signal. Shape: (items,).
+
+        Returns:
+            Parts of the signals. Shape: (items, padded).
+        """
         audible = self.audible
         return alignment.shift(at_ear, delays, self._resampled.ends, audible.ends, audible.padded)
 
     def align(self, output: Tensor) -> Tensor:
         """Return the parts of outputs that match the audible parts of the clean signals.
+
+        Each output is shifted as a whole to lie 2 ms behind its clean signal, see
+        ``alignment.bulk_delays``.
 
         Args:
             output: Outputs for all items, not only those of this batch. Shape: (all items,

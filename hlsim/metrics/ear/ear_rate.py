@@ -20,20 +20,23 @@ from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 ZERO_CROSSINGS, KAISER_BETA = 10, 5.0
-"""Zero crossings per side and window of the resampling filter, those of ``resample_poly``."""
+"""Zero crossings on each side of the resampling filter, and parameter of its Kaiser window.
+
+Both are those of scipy's ``resample_poly``.
+"""
 
 OUTPUTS_PER_ROW = 64
-"""Approximate number of resampled outputs that share a row of inputs."""
+"""Approximate number of output samples that are computed from one row of input samples."""
 
 RING_SAMPLES = 4096
-"""Number of samples after which the response of the Chebyshev filters has vanished."""
+"""Number of samples after which the impulse response of the Chebyshev filters has vanished."""
 
 AUDIBLE_RATIO = 0.001
 """Magnitude, relative to the maximum, below which the clean signal is silent at its ends."""
 
 
 def at_ear_rate(extent: Extent, sample_rate: int) -> Extent:
-    """Return the lengths of items that are resampled to 24 kHz.
+    """Convert the lengths of items from a sample rate to 24 kHz, and round them up.
 
     Args:
         extent: Number of samples of each item at ``sample_rate``.
@@ -48,8 +51,9 @@ def at_ear_rate(extent: Extent, sample_rate: int) -> Extent:
 def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
     """Resample signals to 24 kHz, the rate of the ear, without a change of their RMS level.
 
-    From rates above 24 kHz, the level of the band below 10.5 kHz is kept. The filter is a
-    Kaiser-windowed sinc as in scipy's ``resample_poly``.
+    Signals at rates above 24 kHz keep the RMS level of their band below 10.5 kHz instead. The
+    filter is a Kaiser-windowed sinc as in scipy's ``resample_poly``. Signals at 24 kHz are returned
+    as they are.
 
     Args:
         signals: Signals, zero after the end of each item. Shape: (items, time).
@@ -57,7 +61,7 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
         extent: Number of samples of each item at that rate.
 
     Returns:
-        Resampled signals, zero after the end of each item. Shape: (items, longest).
+        Resampled signals, zero after the end of each item. Shape: (items, longest at 24 kHz).
 
     >>> to_ear_rate(torch.randn(1, 16000), 16000, Extent((16000,))).shape
     torch.Size([1, 24000])
@@ -87,15 +91,21 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
 
 
 def _reach(up: int, down: int) -> int:
-    """Return the number of inputs before an output on which it depends."""
+    """Return the number of input samples before an output sample that contribute to it."""
     return -(-ZERO_CROSSINGS * max(up, down) // up)
 
 
 @constant
 def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
-    """Return the matrix from a row of input samples to a row of output samples.
+    """Return the resampling filter as a matrix from a row of inputs to a row of outputs.
 
-    Shape: (inputs, periods * up).
+    Args:
+        up: Numerator of the ratio of the rates, output to input.
+        down: Denominator of this ratio.
+        periods: Number of groups of ``up`` outputs per row; a group uses ``down`` inputs more.
+
+    Returns:
+        Matrix, (inputs, periods * up).
     """
     half = ZERO_CROSSINGS * max(up, down)
     taps = up * scipy.signal.firwin(
@@ -110,7 +120,7 @@ def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
 
 
 def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
-    """Return the mean power below 10.5 kHz, by Kates' Chebyshev filter of seventh order.
+    """Compute the mean power below 10.5 kHz, by Kates' Chebyshev filter of seventh order.
 
     Shape: (items, time) -> (items,).
     """
@@ -129,7 +139,8 @@ def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
     """Find the first and the last sample of each clean signal that is not silent.
 
-    A sample is not silent if its magnitude is above a thousandth of the signal's maximum.
+    A sample is not silent if its magnitude is above a thousandth of the signal's maximum. If all
+    samples are zero, the results are ``time`` and -1.
 
     Args:
         references: Clean signals. Shape: (items, time).

@@ -32,22 +32,28 @@ from hlsim.metrics.ear.model import CHANNELS
 from hlsim.torchtools import constant
 
 STRIDE = 9
-"""Samples at 24 kHz between frames."""
+"""Number of samples at 24 kHz between the starts of two frames."""
 
 WINDOW_SAMPLES = 52
 """Length of the smoothing window, which ends 26 samples after its frame."""
 
 WINDOW_STRIDES = -(-(WINDOW_SAMPLES + 2) // STRIDE)
+"""Number of strides that the zero-padded window spans."""
+
 WINDOW_LEAD = WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES // 2 - 1
+"""Number of zeros before a signal, so that the window of its first frame is complete."""
 
 SILENCE_DB = 2.5
-"""Level over threshold in dB that a frame of clean speech must exceed to count."""
+"""Level in dB over threshold that a frame of clean speech must exceed to count."""
 
 COSINES = 5
 """Number of cepstral coefficients."""
 
 RATES = (2.0, 6.0, 10.0, 16.0, 25.0, 40.0, 64.0, 100.0, 160.0, 256.0)
-"""Rates of modulation: centre frequencies of the modulation filters in Hz."""
+"""Rates of modulation: centre frequencies of the modulation filters in Hz.
+
+The filter of the lowest rate is a low-pass.
+"""
 
 FRAME_RATE = 2560.0
 """Frame rate for which pyclarity designs the modulation filters. The true one is 24000 / 9."""
@@ -56,10 +62,10 @@ MAX_FILTER_SECONDS = 0.24
 """Duration of the filters up to 10 Hz. The others have as many periods as that at 10 Hz."""
 
 NOISE_DB = 0.1
-"""Standard deviation of the noise on the firing rate, in dB."""
+"""Standard deviation of the ear's internal noise on the levels at the auditory nerve, in dB."""
 
 ENERGY_FLOOR = 1e-30
-"""Energy below which a signal counts as constant."""
+"""Sum of squares, without the mean, below which a signal counts as constant."""
 
 
 def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
@@ -67,12 +73,12 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
 
     Args:
         levels: Levels in dB over threshold at 24 kHz. Shape: (items, channels, padded).
-        delays: Delays in samples that make up for different group delays of the channels. Shape:
-            (items, channels), int64.
+        delays: Delays in samples that compensate for the different group delays of the channels.
+            Shape: (items, channels), int64.
         extent: Number of samples of each item before padding.
 
     Returns:
-        Frames. Shape: (items, channels, ceil(longest / 9)).
+        Frames in dB over threshold. Shape: (items, channels, ceil(longest / 9)).
 
     >>> delays = torch.zeros(1, 2, dtype=torch.int64)
     >>> smooth_frames(torch.ones(1, 2, 128), delays, Extent((128,))).shape
@@ -93,7 +99,7 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
 
 @constant
 def _smoothing() -> NDArray[np.float64]:
-    """Return a Hann window without its zeros, nine taps per column: (STRIDE, WINDOW_STRIDES)."""
+    """Return a Hann window of sum 1, nine taps per column. Shape: (STRIDE, WINDOW_STRIDES)."""
     window = np.hanning(WINDOW_SAMPLES + 2)[1:-1]
     padded = np.concatenate(
         (np.zeros(WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES), window / window.sum())
@@ -102,15 +108,17 @@ def _smoothing() -> NDArray[np.float64]:
 
 
 def mean_amplitude(levels: Tensor) -> Tensor:
-    """Return the contribution of some channels to the mean amplitude over all 32 channels.
+    """Compute the contribution of some channels to the mean amplitude over all 32 channels.
 
-    The mean, the sum of the contributions of all channels, shows whether a frame is audible.
+    Add the contributions of all channels. Their sum, the mean amplitude, shows whether a frame is
+    audible.
 
     Args:
         levels: Frames of these channels in dB over threshold. Shape: (items, channels, frames).
 
     Returns:
-        Amplitudes, where 1 is the threshold. They have no gradient. Shape: (items, frames).
+        Contributions, where an amplitude of 1 is the threshold. They have no gradient. Shape:
+            (items, frames).
 
     >>> mean_amplitude(torch.zeros(1, 16, 2))
     tensor([[0.5000, 0.5000]])
@@ -119,18 +127,18 @@ def mean_amplitude(levels: Tensor) -> Tensor:
 
 
 def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
-    """Return the contribution of some channels to the five cepstral coefficients of each frame.
+    """Compute the contribution of some channels to the five cepstral coefficients of each frame.
 
-    The coefficients, the sums of the contributions of all channels, describe the shape of the
-    spectrum. They are its projections on five cosines over the 32 channels, evenly spaced on the
-    ERB scale, with half a period to two and a half periods and a norm of 1.
+    Add the contributions of all channels to get the coefficients, which describe the shape of the
+    spectrum. They are the projections of its levels on five cosines over the channel number (which
+    is an ERB scale), with 0.5, 1, ... 2.5 periods and a norm of 1.
 
     Args:
         levels: Frames of these channels in dB over threshold. Shape: (..., channels, frames).
-        channels: Which of the 32 channels of the ear these are.
+        channels: Range of these channels among the 32 of the ear.
 
     Returns:
-        Contributions in dB over threshold. Shape: (..., 5, frames).
+        Contributions in dB. Shape: (..., 5, frames).
 
     >>> cepstrum(torch.ones(32, 4)).shape
     torch.Size([5, 4])
@@ -141,15 +149,18 @@ def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
 def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
     """Find the frames in which clean speech exceeds the threshold of hearing.
 
-    The host waits for the device once.
+    A frame is audible if its mean amplitude is more than 2.5 dB above the threshold. The function
+    synchronises with a GPU once.
 
     Args:
-        amplitude: Mean amplitude of clean speech over all channels. Shape: (items, frames).
-        extent: Number of samples of each item before padding.
+        amplitude: Mean amplitude of clean speech over all channels, where 1 is the threshold.
+            Shape: (items, frames).
+        extent: Number of samples at 24 kHz of each item before padding.
 
     Returns:
-        Indices of the audible frames of each item, (items, most audible frames), and the number of
-        audible frames of each item. Items with fewer frames have other indices at the end.
+        Indices of the audible frames of each item in ascending order, (items, longest), and the
+        number of audible frames of each item, of which ``longest`` is the largest. Shorter rows are
+        filled up with indices of other frames.
 
     Raises:
         UnscorableError: An item has fewer than two audible frames.
@@ -172,7 +183,7 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
 
 @constant
 def _cosines() -> NDArray[np.float64]:
-    """Return five cosines over the channels, of 0.5 to 2.5 periods and of norm 1: (5, 32)."""
+    """Return five cosines over the channels, of 0.5 to 2.5 periods and norm 1. Shape: (5, 32)."""
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
     waves = np.cos(np.arange(1, COSINES + 1)[:, None] * angle)
     return waves / np.linalg.norm(waves, axis=1, keepdims=True)
@@ -185,11 +196,11 @@ class _Covariance(NamedTuple):
     """Covariances of the cepstral coefficients of two signals at each rate of modulation.
 
     Attributes:
-        xx, yy, xy: Sums of squares and of products of the filtered coefficients without their
-            means. Shape: (items, 10, 5).
-        waves: Coefficients without their means before the filters. Shape: (items, 5, audible)
-            twice.
-        spectra: Spectra of these. Shape: (items, 5, frequencies) twice.
+        xx, yy, xy: Sums over time of the squares and of the products of the filtered coefficients,
+            clean x and output y, without their means. Shape: (items, 10, 5).
+        waves: Coefficients x and y before the filters, without their means. Shape: (items, 5,
+            audible frames) each.
+        spectra: Fourier transforms of ``waves``. Shape: (items, 5, frequencies) each.
     """
 
     xx: Tensor
@@ -200,11 +211,10 @@ class _Covariance(NamedTuple):
 
 
 def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Covariance:
-    """Filter the coefficients over time by ten band-passes without delay, and compute covariances.
+    """Filter the coefficients over time by ten zero-phase filters, and compute covariances.
 
     Args:
-        clean, output: Cepstral coefficients of the audible frames. Shape: (items, 5,
-            audible).
+        clean, output: Cepstral coefficients of the audible frames. Shape: (items, 5, frames).
         extent: Number of audible frames of each item.
     """
     frames, points = extent.longest, _points(extent.longest)
@@ -225,12 +235,12 @@ def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Co
 
 
 def _points(frames: int) -> int:
-    """Return the length of the Fourier transform by which the longest filter is applied."""
+    """Return a length of the Fourier transform at which even the longest filter does not wrap."""
     return fft_length(frames + len(_filters()[0]) // 2, 256)
 
 
 def _filters() -> list[NDArray[np.float64]]:
-    """Return a Hann-windowed cosine for each rate, symmetric about the middle."""
+    """Return the taps of the ten modulation filters: a Hann window, then Hann-windowed cosines."""
     filters = []
     for k, rate in enumerate(RATES):
         seconds = MAX_FILTER_SECONDS if k < 2 else MAX_FILTER_SECONDS * RATES[2] / rate
@@ -245,17 +255,17 @@ def _filters() -> list[NDArray[np.float64]]:
 
 @constant
 def _responses(points: int) -> NDArray[np.float64]:
-    """Return the frequency responses of the modulation filters: (10, points // 2 + 1)."""
+    """Return the frequency responses of the modulation filters. Shape: (10, points // 2 + 1)."""
     return zero_phase_responses(_filters(), points)
 
 
 def zero_phase_responses(
     filters: Sequence[NDArray[np.float64]], points: int
 ) -> NDArray[np.float64]:
-    """Return the frequency responses of symmetric filters without their delay, which are real.
+    """Compute the frequency responses of symmetric filters without their delay, which are real.
 
     Args:
-        filters: Taps of each filter, an odd number, symmetric about the middle one.
+        filters: Taps of each filter, an odd number of them, symmetric about the middle one.
         points: Length of the Fourier transform.
 
     Returns:
@@ -275,7 +285,7 @@ def zero_phase_responses(
 
 
 def normalised_covariance(xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
-    """Return the magnitude of the correlation of two signals; 0 where one of them is constant.
+    """Compute the magnitude of the correlation of two signals; 0 where one of them is constant.
 
     Args:
         xx, yy: Sum of squares of each signal, from which its mean was subtracted. Any shape.
@@ -292,12 +302,12 @@ def normalised_covariance(xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
 def correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tensor:
     """Compute the features of HASPI: how much an output is correlated with clean speech.
 
-    Both signals have no internal noise of the ear. The magnitude of the correlation is averaged
-    over the five cepstral coefficients. A coefficient that is constant over time counts as 0.
+    The magnitude of the correlation is averaged over the five cepstral coefficients. A coefficient
+    that is constant over time counts as 0. The ear's internal noise is not added here.
 
     Args:
         clean, output: Cepstral coefficients of the audible frames of clean speech and of the
-            output. Shape: (items, 5, audible).
+            output. Shape: (items, 5, audible frames).
         extent: Number of audible frames of each item.
 
     Returns:
@@ -312,16 +322,17 @@ def correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tensor:
 
 
 def expected_correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tensor:
-    """Compute the features of HASPI in the mean over the ear's internal noise, without drawing it.
+    """Compute the mean of the features of HASPI over all draws of the ear's internal noise.
 
-    HASPI adds noise to the levels of both signals. The noise increases the energies by which the
-    covariance is divided, and contributes zero on average to the covariance itself. The mean and
-    the variance of the quotient are computed to second order. The mean of the quotient's magnitude
-    is that of a folded normal distribution.
+    HASPI adds noise to the levels of both signals. Here no noise is drawn: its mean effect follows
+    from its variance. The noise increases the energies by which the covariance is divided, and
+    contributes zero on average to the covariance itself. The mean and the variance of the quotient
+    are computed to second order. The mean of the quotient's magnitude is that of a folded normal
+    distribution.
 
     Args:
         clean, output: Cepstral coefficients of the audible frames of clean speech and of the
-            output. Shape: (items, 5, audible).
+            output, without noise. Shape: (items, 5, audible frames).
         extent: Number of audible frames of each item.
 
     Returns:
@@ -356,13 +367,19 @@ def expected_correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tenso
 
 
 def _energies_filtered_twice(covariance: _Covariance, extent: Extent) -> list[Tensor]:
-    """Return the energies of coefficients and of white noise after filtering them twice.
+    """Compute the energies of coefficients and of white noise after filtering them twice.
 
-    They determine the covariance of the coefficients with noise that passed the same filter. The
-    filters are circular, therefore each item is transformed with as many points as it is alone.
+    They determine the variance of sums of products: of coefficients with noise, and of noise with
+    noise, where both passed the same filter. Circular filters have results that depend on the
+    length of the transform, therefore each item is transformed with the length that it has alone.
+
+    Args:
+        covariance: Coefficients before the filters and their spectra.
+        extent: Number of audible frames of each item.
 
     Returns:
-        Energies xx, yy and xy of the coefficients, (items, 10, 5), and of noise, (items, 10, 1).
+        Energies xx, yy and xy of the coefficients, (items, 10, 5) each, and energy of noise of
+        variance 1, (items, 10, 1).
     """
     items = []
     for item, frames in enumerate(extent.ends):
@@ -380,9 +397,10 @@ def _energies_filtered_twice(covariance: _Covariance, extent: Extent) -> list[Te
 
 @lru_cache(maxsize=1024)
 def _noise_energy(frames: int) -> NDArray[np.float64]:
-    """Return the energy of white noise of variance 1 at each rate of modulation.
+    """Return the expected energy of white noise of variance 1 behind each modulation filter.
 
-    The means before and after the filters are subtracted, as in ``_modulation_covariance``.
+    The energy is a sum of squares over the frames. The means before and after the filters are
+    subtracted, as in ``_modulation_covariance``.
 
     Args:
         frames: Number of frames.
@@ -406,9 +424,9 @@ def _noise_energy(frames: int) -> NDArray[np.float64]:
 
 @constant
 def _twice_filtered(points: int) -> NDArray[np.float64]:
-    """Return the weights of squared spectra in the energy after filtering twice.
+    """Return the weights by which a sum of squared spectra is the energy after filtering twice.
 
-    Shape: (10, frequencies).
+    Shape: (10, points // 2 + 1).
     """
     sides = np.full(points // 2 + 1, 2.0)
     sides[[0, -1]] = 1.0

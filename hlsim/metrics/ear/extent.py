@@ -32,10 +32,10 @@ def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
 
 @dataclass(frozen=True)
 class Extent:
-    """Number of samples, or of frames, of each item of a padded batch.
+    """Length of each item of a padded batch, in samples or in frames.
 
-    All items of a batch are padded to the length of the longest one. The methods compute as if
-    there were no padding.
+    All items of a batch are padded to the length of the longest one. The methods ignore the values
+    of the padding.
 
     Args:
         ends: Length of each item before padding.
@@ -72,7 +72,7 @@ class Extent:
         return torch.where(inside, signal, 0.0)
 
     def mean(self, signal: Tensor) -> Tensor:
-        """Return the mean of each item over its length without the padding.
+        """Compute the mean over the time of each item without its padding.
 
         Shape: (items, ..., time) -> (items, ...).
         """
@@ -80,14 +80,14 @@ class Extent:
         return self.cut(signal).sum(-1) / ends.view(-1, *[1] * (signal.ndim - 2))
 
     def centred(self, signal: Tensor) -> Tensor:
-        """Subtract the mean of each item, and set the samples after its end to zero.
+        """Subtract the mean of each item (and channel), and set the samples after its end to zero.
 
         Shape: (items, ..., time) -> (items, ..., longest).
         """
         return self.cut(signal[..., : self.longest] - self.mean(signal).unsqueeze(-1))
 
     def inside(self, device: torch.device) -> Tensor:
-        """Return True for each sample before the end of its item, and False for padding.
+        """Mark the samples before the end of each item by True, and the padding by False.
 
         Shape: -> bool (items, longest).
         """

@@ -3,9 +3,9 @@
 Both scores compare the output of an aid with clean speech or music by:
 
 - the *envelopes*: levels of the ear's 32 channels, smoothed over 16 or 8 ms. Five numbers describe
-  the shape of the spectrum at a time, the *cepstrum*: projections on cosines over frequency.
+  the shape of the spectrum at a time, the *cepstrum*: projections on cosines over the channels.
 - the *fine structure*: the motion of the basilar membrane within segments of 16 ms, which shows
-  whether the fast vibrations are the same, too.
+  whether the fast vibrations are the same.
 - the long-term spectra: the level of each channel over the whole signal.
 
 Segments overlap by half; the first and the last one are half as long. All signals are at 24 kHz.
@@ -32,31 +32,32 @@ from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 SEGMENT = 384
-"""Samples of a segment of the fine structure, 16 ms at 24 kHz."""
+"""Number of samples of a segment of the fine structure, 16 ms at 24 kHz."""
 
 HALF_SEGMENT = SEGMENT // 2
 """Samples between the starts of neighbouring segments."""
 
 MAX_LAG = RATE // 1000
-"""Largest lag in samples between the fine structures of two signals, 1 ms in both directions."""
+"""Largest delay in samples between the fine structures of two signals, 1 ms in each direction."""
 
 FFT_POINTS = 432
-"""Points of the transforms of segments, enough for a segment and the lags."""
+"""Points of the Fourier transform of a segment, enough for its correlation at all lags."""
 
 SILENCE_DB = 2.5
-"""Level over threshold in dB that a segment, and a channel in it, must exceed to count."""
+"""Level in dB over threshold that a segment, and a channel in it, must exceed to count."""
 
 SYNCHRONY_HZ = 3500.0
 """Frequency above which hair cells lose synchrony (Johnson 1980)."""
 
 SYNCHRONY_ORDER = 5
-"""Order of the low-pass that describes this loss."""
+"""Order of the low-pass that describes the loss of synchrony."""
 
 NEPERS_PER_DB = math.log(10.0) / 20.0
+"""Factor from a level in dB to the natural logarithm of an amplitude."""
 
 
 def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
-    """Return the number of segments of each item.
+    """Compute the number of segments of each item.
 
     Segments overlap by half. The first and the last one are half as long.
 
@@ -76,7 +77,7 @@ def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
 
 
 def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Tensor:
-    """Smooth the levels of channels: compute the Hann-weighted mean of each segment.
+    """Smooth the levels of channels by the Hann-weighted mean of each segment.
 
     Neighbouring segments overlap by half. The first and the last one are half as long.
 
@@ -107,7 +108,10 @@ def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Ten
 
 @constant
 def _half_windows(segment: int) -> NDArray[np.float64]:
-    """Return the rising and the falling half of a Hann window, each of sum 1: (segment / 2, 2)."""
+    """Return the rising and the falling half of a Hann window, each scaled to the sum 1.
+
+    Shape: (segment / 2, 2).
+    """
     window = np.hanning(segment).reshape(2, segment // 2).T
     return window / window.sum(0)
 
@@ -120,19 +124,21 @@ def envelope_correlation(
 ) -> Tensor:
     """Compute how well the fluctuations of an output's spectrum follow those of the clean signal.
 
-    Five cepstral coefficients describe the shape of the spectrum in each segment. The result is the
-    mean magnitude of their correlations over time. Only segments that are audible in the clean
-    signal count; the value is 0 where there are fewer than two. The host waits for the device once.
+    Five cepstral coefficients describe the shape of the spectrum in each segment. Each coefficient
+    of the output is correlated over time with that of the clean signal; the result is the mean
+    magnitude of these correlations. Only segments that are audible in the clean signal count. If
+    there are fewer than two, the value is 0. The function synchronises with a GPU once.
 
     Args:
         clean, output: Levels of the clean signal and of the output by ``smooth_levels``.
             Shape: (items, 32, segments).
         counts: Number of segments of each item.
-        split_by_rate: Function that divides fluctuations into bands of modulation, which are
-            correlated separately. Shape: (items, 5, time) -> (items, bands, 5, time or more).
+        split_by_rate: Function that divides the fluctuations of the coefficients into bands of
+            modulation, which are correlated separately. Shape: (items, 5, time) -> (items, bands,
+            5, time or more). None correlates the coefficients as they are.
 
     Returns:
-        Correlation of each item, 0 to 1. Shape: (items,).
+        Mean correlation of each item, 0 to 1. Shape: (items,).
 
     >>> levels = 40.0 + torch.randn(1, 32, 5)
     >>> envelope_correlation(levels, 2.0 * levels, Extent((5,))).round(decimals=4)
@@ -159,14 +165,14 @@ def envelope_correlation(
 
 
 def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
-    """Return for each segment whether it exceeds the threshold of hearing.
+    """Mark the segments whose mean amplitude over the channels is above ``SILENCE_DB``.
 
     Args:
         levels: Levels in dB over threshold. Shape: (items, 32, segments).
         counts: Number of segments of each item.
 
     Returns:
-        Shape: (items, segments), bool.
+        True for audible segments, False for others and for padding. Shape: (items, segments).
     """
     loudness = (levels.detach() * NEPERS_PER_DB).exp().mean(1)
     return counts.inside(levels.device) & (loudness > 10.0 ** (SILENCE_DB / 20.0))
@@ -174,7 +180,7 @@ def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
 
 @constant
 def _cosines() -> NDArray[np.float64]:
-    """Return five cosines over the channels, of 0.5 to 2.5 periods: (5, 32)."""
+    """Return five cosines over the channels, with 0.5 to 2.5 periods. Shape: (5, 32)."""
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
     return np.cos(np.arange(1, 6)[:, None] * angle)
 
@@ -183,11 +189,11 @@ def _cosines() -> NDArray[np.float64]:
 
 
 _FIRST, _INNER, _LAST = 0, 1, 2
-"""Kinds of segments: the first and the last one are half as long."""
+"""Kinds of segments. The first and the last segment are half as long as the inner ones."""
 
 
 def _segment_kinds(counts: Extent, device: torch.device) -> Tensor:
-    """Return the kind of each segment. Shape: -> int64 (items, segments)."""
+    """Return the kind of each segment: first, inner or last. Shape: -> int64 (items, segments)."""
     indices = torch.arange(counts.longest, device=device)
     is_last = indices == integers(counts.ends, device)[:, None] - 1
     return torch.where(is_last, _LAST, (indices > 0).long())
@@ -204,8 +210,8 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
         extent: Number of samples of each item before padding.
 
     Returns:
-        Spectra, (items, channels, segments, frequencies), and mean squares of the envelope, which
-        are twice those of the motion, (items, channels, segments).
+        Complex spectra, (items, channels, segments, frequencies), and mean squares of the envelope,
+        which are twice those of the motion, (items, channels, segments).
 
     >>> spectra, energy = segment_spectra(torch.randn(1, 2, 1000), Extent((1000,)))
     >>> spectra.shape, energy.shape
@@ -226,7 +232,7 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
 
 @constant
 def _windows() -> NDArray[np.float64]:
-    """Return the window of each kind of segment: (3, SEGMENT).
+    """Return the Hann window of each kind of segment. Shape: (3, SEGMENT).
 
     The first segment has the falling half of a window, the last one the rising half.
     """
@@ -238,7 +244,7 @@ def _windows() -> NDArray[np.float64]:
 
 @constant
 def _inside() -> NDArray[np.float64]:
-    """Return 1 for the samples of a segment and 0 for its padding, by kind: (3, SEGMENT)."""
+    """Return 1 for the samples of each kind of segment, 0 for its padding. Shape: (3, SEGMENT)."""
     inside = np.ones((3, SEGMENT))
     inside[[_FIRST, _LAST], HALF_SEGMENT:] = 0.0
     return inside
@@ -249,7 +255,8 @@ def coherence(
 ) -> Tensor:
     """Compute how similar the fine structures of two signals are in each segment of 16 ms.
 
-    The similarity is the largest normalised cross-covariance over delays of up to 1 ms.
+    The similarity is the largest magnitude of the normalised cross-covariance at delays of up to
+    1 ms. It is 0 where one of the signals is constant.
 
     Args:
         clean, output: Spectra and mean squares of both signals by ``segment_spectra``.
@@ -274,9 +281,10 @@ def coherence(
 
 @constant
 def _lag_weights() -> NDArray[np.float64]:
-    """Return 1 over the autocorrelation of the window of the first, inner and last segments.
+    """Return weights that compensate for the smaller overlap of two windowed segments at each lag.
 
-    The lags are 0 to 24 and -24 to -1 samples. Shape: (3, 49).
+    A weight is 1 over the autocorrelation of the window. The rows are the kinds of segments; the
+    columns are lags of 0 to 24, then -24 to -1 samples. Shape: (3, 49).
     """
     lags = [*range(MAX_LAG + 1), *range(MAX_LAG, 0, -1)]
     rows = []
@@ -289,8 +297,8 @@ def _lag_weights() -> NDArray[np.float64]:
 def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor:
     """Compute the mean coherence of all segments and channels in which the clean signal is audible.
 
-    Above 3.5 kHz channels count less, because the nerve no longer follows each vibration. The value
-    is 0 where fewer than two segments are audible.
+    Channels above 3.5 kHz count less, because the nerve no longer follows each vibration. Items
+    with fewer than two audible segments have the value 0.
 
     Args:
         coherences: Values by ``coherence``. Shape: (items, 32, segments).
@@ -342,12 +350,12 @@ def channel_shares(levels: Tensor) -> Tensor:
 def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
     """Compute the similarity of two long-term spectra from their differences.
 
-    The similarity is 1 - 32 s / scale, where s is the standard deviation of the differences over
-    the 32 channels, and at least 0.
+    The similarity is 1 - 32 s / scale, but at least 0, where s is the standard deviation of the
+    differences over the channels.
 
     Args:
         differences: One spectrum minus the other. Shape: (..., channels).
-        scale: Value of 32 s at which the similarity is 0.
+        scale: Value of 32 s from which on the similarity is 0.
 
     Returns:
         Similarity from 0 to 1. Shape: (...).

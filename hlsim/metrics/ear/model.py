@@ -3,7 +3,7 @@
 The model divides a sound into 32 channels, band-passes from 80 Hz to 8 kHz. In each channel:
 
 1. A gammatone filter splits off the band. Its complex output has a magnitude, the *envelope*, and a
-   real part, the *motion* of the basilar membrane. Louder sounds and a hearing loss widen it.
+   real part, the *motion* of the basilar membrane. Loud sounds and a hearing loss widen the filter.
 2. The outer hair cells amplify soft sounds more than loud ones. A wide *control* filter measures
    how loud the sound is. A hearing loss reduces this gain.
 3. The inner hair cells turn the envelope into a level in dB over the threshold of hearing, and
@@ -18,8 +18,8 @@ multiple of 64 samples; the padding has no effect. Channels are computed a few a
 all of them do not fit into caches.
 
 Source: Kates 2013, "An auditory model for intelligibility and quality predictions", Proceedings of
-Meetings on Acoustics 19, 050184. The constants are those of pyclarity 0.9.0, which this model
-equals.
+Meetings on Acoustics 19, 050184. The constants are those of pyclarity 0.9.0, whose results this
+model reproduces.
 """
 
 from __future__ import annotations
@@ -52,28 +52,31 @@ CHANNELS = 32
 """Number of channels of the ear."""
 
 MIN_CENTRE_HZ, MAX_CENTRE_HZ = 80.0, 8000.0
-"""Centre frequencies of the first and of the last channel."""
+"""Centre frequencies of the first and of the last channel in Hz."""
 
 EAR_Q, MIN_ERB_HZ = 9.26449, 24.7
-"""Constants of the equivalent rectangular bandwidth (Moore and Glasberg 1983)."""
+"""Constants of the equivalent rectangular bandwidth (ERB) of Moore and Glasberg (1983).
+
+The ERB at f Hz is ``MIN_ERB_HZ + f / EAR_Q`` Hz.
+"""
 
 AUDIOMETRIC_HZ = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0)
 """Frequencies in Hz whose thresholds matter. Those at 3 and 8 kHz do not."""
 
 AUDIOMETRIC_INDICES = tuple(FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ)
-"""Positions of these frequencies in an audiogram."""
+"""Positions of ``AUDIOMETRIC_HZ`` among the eight frequencies of an audiogram."""
 
 KNEE_SPL, CEILING_SPL = 30.0, 100.0
 """Levels in dB SPL between which a normal ear compresses."""
 
 WIDENING_SPL = 50.0
-"""Level in dB SPL above which filters widen. At twice that level they are widest."""
+"""Level in dB SPL above which filters widen. From 100 dB SPL on they are widest."""
 
 CONTROL_LOSS = 100.0
 """Hearing loss in dB HL that gives the bandwidth of the control filters."""
 
 CPU_CHUNK, GPU_CHUNK = 2**19, 2**25
-"""Samples of all items and channels that are computed at once.
+"""Number of samples, over all items and channels, that are computed at once.
 
 On a CPU they fit into its caches. On a GPU they take 128 MB per tensor in float32.
 """
@@ -95,9 +98,9 @@ def centre_frequencies() -> NDArray[np.float64]:
 
 @constant
 def _normal_decay() -> NDArray[np.float64]:
-    """Return the decay per sample of gammatones of normal bandwidth.
+    """Return the decay of the gammatones of a normal ear, in nepers per sample at 24 kHz.
 
-    The response of a channel decays by exp(-decay) from one sample to the next. Shape: (32,).
+    The impulse response of a channel contains the factor exp(-decay n) at sample n. Shape: (32,).
     """
     erb: NDArray[np.float64] = MIN_ERB_HZ + centre_frequencies() / EAR_Q
     return 2.0 * math.pi / RATE * 1.019 * erb
@@ -105,7 +108,9 @@ def _normal_decay() -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class HairCells:
-    """Effect of a hearing loss on the hair cells of each channel. Shape of all: (..., 32), float64.
+    """Effect of a hearing loss on the hair cells of each channel.
+
+    Shape of each attribute: (..., 32), or (..., channels) for some of the channels, float64.
 
     Attributes:
         outer: Loss of the outer hair cells in dB: gain that soft sounds no longer receive.
@@ -134,7 +139,9 @@ def hair_cells(thresholds: Tensor) -> HairCells:
     """Divide a hearing loss between outer and inner hair cells.
 
     The outer hair cells account for 80 % of the loss, up to the loss at which they no longer
-    compress, and the inner hair cells for the rest.
+    compress, and the inner hair cells for the rest. Thresholds are interpolated linearly in Hz to
+    the centre of each channel, and constant below 250 and above 6000 Hz. Those below 0 dB HL count
+    as 0. The result has no gradient.
 
     Source: Moore et al. 1999, J. Acoust. Soc. Am. 106(5), 2761-2778.
 
@@ -165,18 +172,18 @@ def hair_cells(thresholds: Tensor) -> HairCells:
 
 @compute_once
 def _control_bandwidth(device: torch.device) -> Tensor:
-    """Return the bandwidth of the control filters, relative to normal hearing. Shape: (32,)."""
+    """Return the bandwidth of the control filters relative to normal hearing. Shape: (32,)."""
     return hair_cells(torch.full((8,), CONTROL_LOSS, device=device)).bandwidth
 
 
 def channel_chunks(sound: Tensor) -> Iterator[slice]:
-    """Split the 32 channels into groups that are computed at once, from low to high frequencies.
+    """Split the 32 channels into groups that fit into the caches of a CPU, or into a GPU's memory.
 
     Args:
         sound: Sound that is divided into channels. Shape: (items, time).
 
     Yields:
-        Channels of each group.
+        Channels of each group, from low to high frequencies.
 
     >>> len(list(channel_chunks(torch.zeros(1, 48000))))
     4
@@ -191,21 +198,29 @@ def channel_chunks(sound: Tensor) -> Iterator[slice]:
 
 
 def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
-    """Return the decay per sample of gammatones of a bandwidth that is relative to normal hearing.
+    """Convert the bandwidth of gammatones to their decay in nepers per sample at 24 kHz.
 
-    Shape: (..., channels) -> (..., channels).
+    Args:
+        bandwidth: Bandwidths relative to normal hearing. Shape: (..., channels).
+        channels: The channels.
+
+    Returns:
+        Decays. Shape: (..., channels).
     """
     return bandwidth * _normal_decay(like=bandwidth)[channels]
 
 
 def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recursion:
-    """Return the gammatones of some channels.
+    """Design the gammatone filters of some channels.
 
     Args:
-        bandwidth: Bandwidths of the filters, relative to normal hearing, which are the same for all
-            items, or those of each item. Shape: (channels,) or (items, channels).
+        bandwidth: Bandwidths relative to normal hearing. Shape: (channels,) if all items have the
+            same ones, otherwise (items, channels).
         channels: The channels.
         dtype: Precision of the filters.
+
+    Returns:
+        Filters, whose leading dimensions are those of ``bandwidth``.
     """
     centres = centre_frequencies(like=bandwidth)[channels]
     # The response of normal and wider filters has vanished after this number of samples.
@@ -216,7 +231,7 @@ def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recur
 
 @compute_once
 def _control_filters(start: int, stop: int, device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the wide filters that measure the level in the channels ``[start, stop)``.
+    """Design the wide filters that measure the level in the channels ``[start, stop)``.
 
     The range is two numbers, because arguments of ``compute_once`` must be hashable.
     """
@@ -228,7 +243,7 @@ def _apply_gammatones(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tenso
     """Filter signals by gammatones, and return the real part and the power of the envelope.
 
     Args:
-        filters: The gammatones.
+        filters: Gammatones of all items or of each item.
         signal: Signals. Shape: (items, padded).
 
     Returns:
@@ -242,16 +257,19 @@ def _apply_gammatones(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tenso
 
 
 def _control_power(signal: Tensor, channels: slice) -> Tensor:
-    """Return the power of the control filters' envelopes.
+    """Compute the power of the envelopes of the control filters, whose level decides on the gain.
 
-    Shape: (items, padded) -> (items, channels, padded).
+    Shape: (items, padded) -> (items, channels, padded), where 1 is 0 dB SPL.
     """
     filters = _control_filters(channels.start, channels.stop, signal.device, signal.dtype)
     return _apply_gammatones(filters, signal)[1]
 
 
 def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Extent) -> Tensor:
-    """Return the bandwidths of the filters, which widen with the level, relative to normal hearing.
+    """Compute the bandwidths of the filters relative to normal hearing; they grow with the level.
+
+    Up to a mean level of 50 dB SPL in the control filter, the bandwidth is that of the hair cells,
+    and from 100 dB SPL on that of the control filter.
 
     Args:
         control: Power of the control filters' envelopes. Shape: (items, channels, padded).
@@ -275,10 +293,12 @@ class CochlearOutput:
     """Response of the inner ear to a sound in some channels, before the inner hair cells.
 
     Attributes:
-        power: Power of the envelope after compression. Shape: (items, channels, padded).
+        power: Power of the envelope after compression, where 1 is 0 dB SPL. Shape: (items,
+            channels, padded).
         bandwidth: Bandwidth of the filters, relative to normal hearing. Shape: (items, channels),
             float64.
-        motion: Compressed motion of the basilar membrane. Shape: (items, channels, padded).
+        motion: Compressed motion of the basilar membrane, in multiples of 20 uPa. Shape: (items,
+            channels, padded).
         level: Long-term level in dB over threshold, 0 or more. Shape: (items, channels).
 
     ``motion`` and ``level`` are empty unless they were requested.
@@ -332,7 +352,7 @@ def simulate_cochlea(
 
 
 def _compression_gain(control: Tensor, cells: HairCells) -> Tensor:
-    """Return the gain of the outer hair cells on amplitudes.
+    """Compute the gain of the outer hair cells, a factor for amplitudes that is smoothed in time.
 
     Args:
         control: Power of the control filters' envelopes. Shape: (items, channels, padded).
@@ -354,10 +374,11 @@ def _compression_gain(control: Tensor, cells: HairCells) -> Tensor:
 
 
 def _long_term_level(mean_power: Tensor, mean_control: Tensor, cells: HairCells) -> Tensor:
-    """Return the level of each channel over the whole signal, in dB over threshold.
+    """Compute the level of each channel over the whole signal, in dB over threshold.
 
     Args:
-        mean_power: Mean power of the envelopes before compression. Shape: (items, channels).
+        mean_power: Mean power of the envelopes before compression, where 1 is 0 dB SPL. Shape:
+            (items, channels).
         mean_control: Mean power of the control filters' envelopes. Shape: (items, channels).
         cells: Hair cells of these channels.
 
@@ -377,7 +398,7 @@ def _long_term_level(mean_power: Tensor, mean_control: Tensor, cells: HairCells)
 def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
     """Compute the levels that the inner hair cells pass to the auditory nerve.
 
-    They are levels over the threshold of hearing, and emphasise onsets by adaptation.
+    The hair cells subtract their loss from the level, and emphasise onsets by adaptation.
 
     Args:
         power: Power of the compressed envelopes, where 1 is 0 dB SPL. Shape: (items, channels,
@@ -397,14 +418,14 @@ def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
-    """Return the group delay of each channel's filter at its centre frequency in whole samples.
+    """Compute the group delay of each channel's filter at its centre frequency in whole samples.
 
     Args:
         bandwidth: Bandwidths of the filters, relative to normal hearing. Shape: (items, channels).
         channels: The channels.
 
     Returns:
-        Delays in samples. Shape: (items, channels), int64.
+        Delays in samples at 24 kHz. Shape: (items, channels), int64.
 
     >>> group_delays(torch.ones(1, 2), slice(0, 2))
     tensor([[449, 404]])
@@ -415,10 +436,12 @@ def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
 
 
 def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tensor:
-    """Return the longest group delay of all channels, to which the scores delay every channel.
+    """Compute the longest group delay of all channels.
 
-    One of the first three channels has the longest delay, because their filters widen by a factor
-    of 1.28 at most, and the fourth filter is 1.37 times as wide as the first.
+    The scores delay all other channels by the difference, so that the channels are synchronous. The
+    longest delay is that of the narrowest filter, which is one of the first three: the first filter
+    widens by a factor of 1.28 at most, and the fourth is at least 1.37 times as wide as the first
+    one in a normal ear.
 
     Args:
         signal: Sound behind the middle ear. Shape: (items, padded).
@@ -426,7 +449,7 @@ def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tenso
         extent: Number of samples of each item before padding.
 
     Returns:
-        Delay in samples. Shape: (items, 1), int64.
+        Delay in samples at 24 kHz. Shape: (items, 1), int64.
 
     >>> longest_group_delay(torch.zeros(1, 128), hair_cells(torch.zeros(8)), Extent((128,)))
     tensor([[449]])

@@ -2,9 +2,9 @@
 
 A recursive filter computes each output sample from earlier outputs, which would take a loop over
 samples in Python. Here a signal is divided into blocks of 64 samples. Within a block, the output is
-a matrix times the block. All that later blocks need to know of earlier ones are one to eight
-numbers, the *state* of the filter, which a small matrix advances from block to block. The result is
-the exact output of the filter, fast on a GPU, too, and differentiable.
+a matrix times the block. One to eight numbers, the *state* of the filter, sum up the influence of
+earlier blocks on later ones; a small matrix advances the state from block to block. The result is
+the exact output of the filter and differentiable, and its computation is fast on a GPU, too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch.nn import functional
 from hlsim.torchtools import as_tensor, compute_once, constant
 
 BLOCK = 64
-"""Samples of a block. Signals are padded to a multiple of it."""
+"""Number of samples per block. Signals are padded to a multiple of it."""
 
 RATE = 24000
 """Sample rate in Hz at which the ear is defined."""
@@ -33,11 +33,10 @@ Array = NDArray[np.float64]
 def apply_filter(
     design: Callable[[torch.device, torch.dtype], Recursion], signal: Tensor
 ) -> Tensor:
-    """Filter a signal.
+    """Filter a signal by a real filter that is designed for its device and precision.
 
     Args:
-        design: Function that returns the filter for a device and a precision, such as
-            ``middle_ear``.
+        design: Function that returns the filter for a device and a dtype, such as ``middle_ear``.
         signal: Signal whose length is a multiple of 64. Shape: (..., time).
 
     Returns:
@@ -50,7 +49,7 @@ def apply_filter(
 
 
 class Recursion(NamedTuple):
-    """Recursive filters as the matrices that process a signal in blocks of 64 samples.
+    """One or more recursive filters, as matrices that process a signal in blocks of 64 samples.
 
     The output of a block is ``block @ through + state @ outward``. The next block has the state
     ``state @ step + block @ inward``. The state sums up all earlier blocks in a few numbers.
@@ -98,9 +97,9 @@ class Recursion(NamedTuple):
 
 
 def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
-    """Compute the state after each block.
+    """Compute the state of a filter after each block.
 
-    In each round, the number of blocks that a state sums up doubles.
+    In each round of the loop, the number of blocks that a state sums up doubles.
 
     Args:
         inputs: Contribution of each block to the state. Shape: (..., blocks, states).
@@ -131,13 +130,13 @@ def _recursion(
     device: torch.device,
     dtype: torch.dtype,
 ) -> Recursion:
-    """Return a filter in state-space form as matrices for blocks of 64 samples.
+    """Convert a filter from state-space form to matrices for blocks of 64 samples.
 
     With the input u and the state x, the output is y = c x + d u, and the next state is a x + b u.
-    The state is balanced, so that single precision suffices.
+    The form is balanced first, so that single precision suffices.
 
     Args:
-        a: Matrix from a state to the next one, of a stable filter. Shape: (states, states).
+        a: Matrix from a state to the next one. The filter must be stable. Shape: (states, states).
         b: Column from the input to the state. Shape: (states, 1).
         c: Row from the state to the output. Shape: (1, states).
         d: Factor from the input to the output.
@@ -202,7 +201,7 @@ ONSET_RATIO = 2.0
 """Response of an inner hair cell at an onset, relative to its steady response."""
 
 RAPID_SECONDS, SHORT_TERM_SECONDS = 0.002, 0.060
-"""Time constants of rapid and of short-term adaptation."""
+"""Time constants of rapid and of short-term adaptation in seconds."""
 
 
 @compute_once
@@ -210,9 +209,9 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter by which inner hair cells emphasise onsets, for levels in dB at 24 kHz.
 
     The response to an onset is twice the steady response, and decays with time constants of 2 and
-    60 ms. Kates describes it by an electrical circuit of two resistors and two capacitors, which is
-    solved by backward differences. Negative outputs must be set to zero. The filter's matrices are
-    on ``device`` in the precision ``dtype``.
+    60 ms. Kates describes the filter by an electrical circuit, which is solved here by backward
+    differences. Where the output is negative, the caller must replace it by zero. The filter's
+    matrices are on ``device`` in the precision ``dtype``.
 
     >>> adaptation(torch.device("cpu"), torch.float32).step.shape
     torch.Size([2, 2])
@@ -235,16 +234,17 @@ GAMMATONE_ORDER = 4
 
 @constant
 def _binomials() -> Array:
-    """Return the binomial coefficients of orders 0 to 3: row e, column d holds "d choose e".
+    """Return the binomial coefficients of orders 0 to 3: row e, column d is "d choose e".
 
-    They expand the powers of a distance that grows by one block. Shape: (4, 4).
+    They expand the powers (x + 1)^d of a distance x, in blocks, that grows by one block. Shape:
+    (4, 4).
     """
     orders = np.arange(GAMMATONE_ORDER)
     return scipy.special.comb(orders[None, :], orders[:, None])
 
 
 def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> Recursion:
-    """Return gammatone filters of fourth order, the band-passes of the ear, with complex output.
+    """Design gammatone filters of fourth order, the band-passes of the ear, with complex output.
 
     The magnitude of the output is the envelope of the band, and its real part the motion of the
     basilar membrane. A tone at the centre frequency keeps its amplitude.
@@ -305,7 +305,7 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
 
 
 def _as_real(real: Tensor, imaginary: Tensor) -> Tensor:
-    """Return a complex matrix as a real one that acts on real parts, then imaginary parts.
+    """Convert a complex matrix to a real one, for vectors of real parts and then imaginary parts.
 
     Shape: (..., rows, columns) twice -> (..., 2 rows, 2 columns).
     """
