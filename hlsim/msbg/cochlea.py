@@ -37,20 +37,20 @@ This is as long as the longest advance, and as the narrowest channel takes to de
 """
 
 _END_SAMPLES = 4096
-"""Samples at the end of an unaligned output for which all channels run at 44.1 kHz."""
+"""Number of last samples of an unaligned output for which all channels run at 44.1 kHz."""
 
 _END_LEAD_SAMPLES = 7296
-"""Samples before them on which they depend."""
+"""Number of samples before the last ``_END_SAMPLES`` that influence them."""
 
 _MAX_COMMON_PERIOD = 10000
-"""Largest number of samples of which FFT lengths that two rates share are multiples."""
+"""Largest period in samples at 44.1 kHz of which FFT lengths that suit two rates are multiples."""
 
 
 def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
     """Choose the length of the Fourier transforms with which MSBG filters a signal.
 
-    If this costs little, the length spans a whole number of samples at the sample rate of the
-    output, too. Then a spectrum can be converted to that rate.
+    If this costs little, the length also spans a whole number of samples at the sample rate of the
+    output. Then a spectrum can be converted to that rate without returning to the time domain.
 
     Args:
         length: Number of samples of the signal at 44.1 kHz.
@@ -264,7 +264,7 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
 
 @constant
 def _before_advanced_end(bank: FilterBank, points: int, length: int) -> NDArray[np.bool]:
-    """Compute a mask of the samples before the end of each channel: bool, (channels, points).
+    """Compute a mask: True for the samples of each channel before its end, bool (channels, points).
 
     pyclarity advances each channel by dropping its first samples, and fills the end with zeros.
     """

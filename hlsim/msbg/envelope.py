@@ -26,7 +26,7 @@ from hlsim.msbg.filterbank import FilterBank
 from hlsim.torchtools import constant
 
 STEP = 24
-"""Samples at 44.1 kHz from one value of an envelope, and of the gain from it, to the next."""
+"""Number of samples at 44.1 kHz from one value of an envelope, and of a gain, to the next."""
 
 HALF_RATE_STEP = 24.5
 """Samples at 44.1 kHz per step where signals run at 22.05 kHz: 1800 steps per second.
@@ -41,7 +41,7 @@ Together they have zeros of third order at the frequencies that alias to 0 Hz.
 """
 
 POWER_FLOOR = 1e-30
-"""Power in Pa^2 added to that of the signals, which keeps the gradients of silence finite."""
+"""Power in Pa^2 that is added to powers, which keeps the gradients of silence finite."""
 
 
 def detect(signals: Tensor, harmonics: bool) -> Tensor:
@@ -230,9 +230,13 @@ def envelope_lowpass(
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Design the low-pass at 44.1 kHz that smooths the envelope of each channel of a filter bank.
 
-    It is an elliptic filter of second order, with 0.25 dB of ripple up to its cut-off frequency.
-    This is 75 Hz, or three quarters of the equivalent rectangular bandwidth of a normal filter at
-    the channel's centre frequency if that is lower. The broadening of the bank does not count.
+    The low-pass is an elliptic filter of second order, with 0.25 dB of ripple up to its cut-off
+    frequency. The cut-off is 75 Hz, or three quarters of the equivalent rectangular bandwidth of a
+    normal filter at the channel's centre frequency if that is lower. The broadening of the bank has
+    no effect.
+
+    Args:
+        bank: Filter bank of a severity.
 
     Returns:
         Numerator and denominator for each channel, three coefficients each.

@@ -10,7 +10,7 @@ from hlsim.msbg.ear import MSBG_RATE
 from hlsim.torchtools import constant
 
 _CORNER_STEP_HZ = MSBG_RATE / 8192.0
-"""Unit of the high-passes' corner frequencies."""
+"""Unit of ``FilterBank.highpass_corners`` in Hz."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +169,9 @@ def _bessel_highpass(
     Args:
         corner_hz: Corner frequencies in Hz.
         omega: Frequencies of the response in radians per sample at 44.1 kHz.
+
+    Returns:
+        Complex response, in the shape to which both arguments broadcast.
     """
     s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner_hz / MSBG_RATE)
     return s**2 / (s**2 + 3.0 * s + 3.0)

@@ -25,10 +25,10 @@ from hlsim.msbg.recruitment import AHEAD
 from hlsim.torchtools import constant
 
 LOOK_BACK = 4096
-"""Number of last samples that matter, after which the slowest low-pass has decayed by 70 dB."""
+"""Number of last samples with an influence. In this time the slowest low-pass decays by 70 dB."""
 
 _PADDING = 8
-"""Number of samples that ``filtfilt`` adds."""
+"""Number of samples that ``filtfilt`` adds at the end of a signal."""
 
 Array = NDArray[np.float64]
 

@@ -46,7 +46,7 @@ from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matr
 from hlsim.torchtools import flatten_items, not_compiled, on_host, pair_items
 
 STRUCTURAL_DELAY = 1047
-"""Delay in samples at 44.1 kHz, without smearing, by which ``aligned`` advances the output.
+"""Delay in samples at 44.1 kHz that ``aligned`` removes from the output of ears without smearing.
 
 The three linear-phase filters delay by 507 + 507 + 66 = 1080 samples. The filter bank takes some of
 that back, less at high frequencies and with more loss: without a loss 186 at 200 Hz, 33 at 750 Hz,
@@ -54,7 +54,7 @@ that back, less at high frequencies and with more loss: without a loss 186 at 20
 """
 
 _POWER_FLOOR = 1e-30
-"""Power by which powers are divided at least."""
+"""Smallest power in Pa^2 by which powers are divided."""
 
 _HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which aligned signals run at 22.05 kHz inside the model."""
@@ -83,9 +83,9 @@ class _Group(NamedTuple):
 class MSBG(nn.Module):
     """The Moore, Stone, Baer and Glasberg model of what an impaired ear perceives.
 
-    It computes the same as ``Ear.process`` of pyclarity 0.9.0: outer and middle ear, spectral
-    smearing, gammatone filter bank, recruitment, the inverse of outer and middle ear, and a
-    low-pass filter. It is differentiable and takes batches.
+    The model computes the same as ``Ear.process`` of pyclarity 0.9.0: outer and middle ear,
+    spectral smearing, gammatone filter bank, recruitment, the inverse of outer and middle ear, and
+    a low-pass filter. It is differentiable and takes batches.
 
     Source: Baer and Moore (1993); Moore and Glasberg (1993); Nejime and Moore (1997).
 
@@ -100,10 +100,11 @@ class MSBG(nn.Module):
         full_scale_spl: Level in dB SPL of RMS 1.0.
         aligned: Whether the delay of the model is removed, so that the output has as many samples
             as the input. Otherwise the output is that of pyclarity, sample by sample at 44.1 kHz,
-            with its delay and, if it smears, 64 * (ceil(time / 64) + 3) samples long (in a mixed
-            batch the shorter ones end in zeros). Only for signals under 1000 samples do both
-            differ, by up to 3 % of the signal from 701 samples and 20 % from 441 samples, because
-            pyclarity pads the beginning. With fewer samples, pyclarity returns NaN or fails.
+            with its delay. If spectra are smeared, this output is 64 * (ceil(time / 64) + 3)
+            samples long at 44.1 kHz; in a batch, shorter outputs are zero-padded. For signals under
+            1000 samples, pyclarity's output differs, by up to 3 % of the signal from 701 samples
+            and 20 % from 441 samples, because pyclarity pads the beginning. With fewer samples,
+            pyclarity returns NaN or fails.
         rescale_active: Whether each signal is first scaled by the ratio of its overall RMS to the
             RMS of its active frames, 1 to 3 dB down depending on the utterance, as pyclarity does
             with one channel. (It scales two channels by one gain.)
@@ -111,8 +112,9 @@ class MSBG(nn.Module):
             smearing, recruitment remains; the difference shows what depends on smearing.
 
     Attributes:
+        emulates_msbg: True, because the simulator is MSBG.
         thresholds: Thresholds of the constructor's ears at ``FREQUENCIES`` in dB HL, (..., 8), or
-            None. They are constants; to train an ear, pass it with each call.
+            None. They have no gradient; to train an ear, pass it with each call.
         checkpoint: Whether to use gradient checkpointing: activations are computed again in the
             backward pass, a few items or one block at a time, instead of stored. False by default.
 
@@ -158,7 +160,7 @@ class MSBG(nn.Module):
         """Compute what the ear perceives.
 
         Args:
-            waveform: Input, where RMS 1.0 has the level ``full_scale_spl``.
+            waveform: Input signals, where RMS 1.0 has the level ``full_scale_spl``.
             audiogram: One ear, or ears whose thresholds, (..., 8), broadcast over the leading
                 dimensions of the waveform. By default, the ears of the constructor.
 
@@ -166,7 +168,8 @@ class MSBG(nn.Module):
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (as in the
-                standard audiogram ``"N7"``), or the shapes do not fit.
+                standard audiogram ``"N7"``), the shapes do not fit, or the waveform is not a
+                floating-point tensor with time last.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)
@@ -179,7 +182,8 @@ class MSBG(nn.Module):
     def delay(self, severity: str) -> int:
         """Return the delay of the model, which ``aligned=True`` removes from the output.
 
-        It is that of the filters and of the smearing, and depends on the severity of the loss only.
+        The filters and the smearing cause the delay, which depends only on the severity of the
+        loss and on the argument ``smearing`` of the constructor.
 
         Args:
             severity: Severity of the loss: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
@@ -195,7 +199,7 @@ class MSBG(nn.Module):
         return STRUCTURAL_DELAY + (SMEARING_DELAY if self._smears(severity) else 0)
 
     def _smears(self, severity: str) -> bool:
-        """Return whether the spectra of ears of a severity are smeared."""
+        """Return whether spectra are smeared for ears of a severity."""
         return self.smearing and severity in BROADENING
 
     def extra_repr(self) -> str:

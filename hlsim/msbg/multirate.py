@@ -46,7 +46,7 @@ _RECTIFIED_BELOW_HZ = 400.0
 """Centre frequency below which the channels themselves are rectified."""
 
 _MERGED_ABOVE = 1.75
-"""Centre frequency above which channels are merged into one, over the highest of interest."""
+"""Ratio to the highest frequency of interest above which channels are merged into one."""
 
 _MERGED_RATIO = 1.3
 """Expansion ratio at which the gain of merged channels is exact, that of a loss of 24 dB.
@@ -118,7 +118,7 @@ class MultirateBank:
 
     @property
     def nbytes(self) -> int:
-        """Size of the largest tensors in bytes."""
+        """Size in bytes of the low-passes and responses, the largest tensors."""
         return self.lowpass.nbytes + sum(band.response.nbytes for band in self.bands)
 
 
@@ -257,10 +257,13 @@ def _envelope_step(rate_divisor: int) -> float:
 
 
 def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
-    """Compute the factor on the envelope of merged channels that gives them the gain of their sum.
+    """Compute a correction of the envelope of channels that are merged into one.
+
+    With this factor on its envelope, the merged channel has the gain that the sum of separately
+    expanded channels would have. It is exact at one frequency and at ``_MERGED_RATIO``.
 
     Args:
-        responses: Responses of the channels at one frequency, (channels,).
+        responses: Complex responses of the channels at one frequency, (channels,).
     """
     exponent = _MERGED_RATIO - 1.0
     total = abs(responses.sum())

@@ -18,6 +18,7 @@ from hlsim.msbg.envelope import HALF_RATE_STEP, STEP
 from hlsim.msbg.smearing import HOP
 
 _BLOCK_SECONDS = 8.0
+"""Duration of the output of a block."""
 
 # The output of a block depends on samples around it by the filters, the delay, and the low-pass
 # filters down to 1e-6.

@@ -1,8 +1,8 @@
 """Loudness recruitment: each channel is multiplied by a gain that rises with its envelope.
 
 An impaired ear does not perceive soft sounds, and perceives sounds of 105 dB SPL as loud as a
-normal ear does. Between these, its loudness grows faster than normal. The gain simulates this: it
-is 1 at 105 dB SPL and falls towards soft sounds.
+normal ear does. Between these levels, its loudness grows faster than normal. The gain simulates
+this growth: it is 1 at 105 dB SPL and falls towards soft sounds.
 
 The envelope varies so slowly that it and the gain are computed once per *step* of 24 samples at
 44.1 kHz. The gain is interpolated between steps. Where a small envelope makes the gain change fast,
@@ -32,10 +32,10 @@ _MAX_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
 """Largest value of an envelope in Pa that changes the gain, where the gain reaches 1."""
 
 _TAPS = 6
-"""Number of steps from whose values that of a sample is interpolated."""
+"""Number of steps from whose values the value of a sample is interpolated."""
 
 AHEAD = _TAPS // 2
-"""Number of these steps that come after the sample."""
+"""Number of the ``_TAPS`` steps that come after the sample."""
 
 _SLIGHT_RATIO = 1.3
 """Expansion ratio at 24 dB HL, below which sudden changes of the gain are audible."""
@@ -153,7 +153,8 @@ def _correct_kinks(
 ) -> Tensor:
     """Compute gains again from the interpolated envelope where it dips, for slight losses.
 
-    There, interpolated gains would have audible kinks. A loss is slight below about 24 dB HL.
+    At these dips, interpolated gains would have audible kinks. A loss is slight below about 24 dB
+    HL.
 
     Shape: (..., channels, time), (..., channels, steps), (..., channels), (rows, columns) ->
         (..., channels, time).
@@ -199,7 +200,7 @@ def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
 def _pad_periodically(values: Tensor) -> Tensor:
     """Pad with two values before the first step and three after the last, for interpolation.
 
-    They are taken from the other end, because the signal is periodic.
+    The values are taken from the other end, because the signal is treated as periodic.
 
     Shape: (..., steps) -> (..., steps + 5).
     """

@@ -22,7 +22,7 @@ from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant
 
 _FIR_TAIL = 2 * EAR_DELAY + 132
-"""Samples at 44.1 kHz by which the inverse ear and the final low-pass lengthen a signal."""
+"""Number of samples at 44.1 kHz by which the inverse ear and the low-pass lengthen a signal."""
 
 
 def to_cochlea(signals: Tensor, rate: int, length: int, rate_divisor: int) -> Tensor:
@@ -130,7 +130,7 @@ def from_cochlea(
 def _inward_block_response() -> NDArray[np.complex128]:
     """Compute the frequency response of outer and middle ear at 44.1 kHz, complex (2049,).
 
-    It is for ``filter_in_blocks``, whose transforms have ``BLOCK_POINTS`` points.
+    The response is for ``filter_in_blocks``, whose transforms have ``BLOCK_POINTS`` points.
     """
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
@@ -170,7 +170,7 @@ def _outward_response(
 def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
     """Compute weights that fade a spectrum out at the lower Nyquist frequency, (bins,).
 
-    They are 1 where nothing is resampled.
+    The weights are all 1 if the outer rate is 44.1 kHz, so that nothing is resampled.
 
     Args:
         points: FFT length at 44.1 kHz.

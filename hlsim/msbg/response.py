@@ -31,7 +31,7 @@ Its reciprocal is several times as long as the impulse responses.
 """
 
 _MIN_RELATIVE_MAGNITUDE = 0.1
-"""Magnitude of a response over its maximum, below which the phase filter attenuates."""
+"""Magnitude relative to the maximum of a response below which the phase filter attenuates."""
 
 
 def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.complex128]:
@@ -118,7 +118,7 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
 
 @constant
 def _taps(rate: int, kind: str) -> NDArray[np.float64]:
-    """Compute an impulse response for each severity, from the response of its filter bank.
+    """Compute one impulse response for each severity, from the response of its filter bank.
 
     Args:
         rate: Sample rate in Hz.
@@ -147,8 +147,8 @@ def _taps(rate: int, kind: str) -> NDArray[np.float64]:
 def half_length(rate: int) -> int:
     """Return half the length in samples of MSBG's linear impulse responses, 64 ms.
 
-    These are the responses of MSBG for sounds that it does not make softer. They have this number
-    of samples before time 0, and as many from time 0 on.
+    The impulse responses (of MSBG for sounds that it does not make softer) have this number of
+    samples before time 0, and as many from time 0 on.
 
     Args:
         rate: Sample rate in Hz.

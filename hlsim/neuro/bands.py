@@ -1,7 +1,7 @@
-"""A small network that corrects the prior's gains, at a fraction of the full network's cost.
+"""A small network that corrects the prior's gains, at a fraction of the paper's network's cost.
 
-The prior (``hlsim.neuro.prior``) estimates MSBG's gains in each channel of its filter bank by its
-own formulae. The network works on channels, and on *steps* of a few frames of the spectrogram.
+The prior (``hlsim.neuro.prior``) estimates the gain in each channel of MSBG's filter bank by MSBG's
+formulae. The network works on channels, and on *steps* of a few frames of the spectrogram.
 """
 
 import math
@@ -15,21 +15,20 @@ from hlsim.neuro.config import NeuroConfig
 from hlsim.neuro.prior import CHANNELS, Prior
 
 MAX_SLOPE = 6.0
-"""Limit of the difference between the log envelopes of neighbouring channels."""
+"""Limit of the difference between the natural logarithms of envelopes of neighbouring channels."""
 
 
 class BandCorrection(nn.Module):
     """Network that simulates MSBG on a spectrogram, by correcting the gains of the prior.
 
     The spectrogram is smeared and multiplied by the corrected gains of MSBG's channels. The inputs
-    of the network are the fluctuation of each channel's level about its envelope (the smoothed
-    level), and the difference between the envelopes of neighbouring channels. Neither changes with
-    the level of the signal. The network predicts a correction of each channel's envelope, a factor
-    on its gain, and a phase.
+    of the network are the fluctuation of each channel's log level about its log envelope (the
+    smoothed level), and the difference between the log envelopes of neighbouring channels. Neither
+    changes with the level of the signal. The network predicts a correction of each channel's
+    envelope, a factor for its gain, and a phase shift.
 
-    The degrees of hearing loss, or severities, have different filter banks in MSBG. Each has
-    its own first and last layer. Before training the last layer is 0, and the output is that of the
-    prior.
+    The degrees of hearing loss, or severities, have different filter banks in MSBG. Each severity
+    has its own weights. Before training the last layer is 0, and the gains are those of the prior.
 
     Args:
         config: Settings of which these are used: ``channels``, the width of the network;
@@ -60,7 +59,7 @@ class BandCorrection(nn.Module):
         self.leave = nn.Parameter(torch.zeros(severities, 3 * CHANNELS, width))
 
     def forward(self, spectrum: Tensor, ears: Tensor, severity: Tensor, prior: Prior) -> Tensor:
-        """Return the spectrogram that ears perceive.
+        """Compute the spectrogram that ears perceive.
 
         Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
             frequencies).
@@ -91,12 +90,16 @@ class BandCorrection(nn.Module):
         return smeared * torch.view_as_complex(factors)
 
     def _features(self, log_levels: Tensor, log_envelope: Tensor) -> Tensor:
-        """Compute the input of the network: fluctuations, and differences of envelopes.
+        """Compute the input of the network: fluctuations, and differences of log envelopes.
 
         The last frame is repeated where the last step is incomplete.
 
-        Shape: (items, channels, frames), (items, channels, steps) -> (items, (step + 1) channels,
+        Shape: (items, channels, frames), (items, channels, steps) -> (items, (step + 1) * channels,
             steps).
+
+        Args:
+            log_levels: Natural logarithm of the levels of channels in Pa.
+            log_envelope: Natural logarithm of the envelopes in Pa, one per step.
         """
         missing_frames = -log_levels.shape[-1] % self.step
         if missing_frames:
@@ -155,6 +158,7 @@ def _interpolate_steps(values: Tensor, step: int) -> Tensor:
     Shape: (items, steps, ...) -> (items, steps * step, ...).
 
     Args:
+        values: One value per step, of any kind.
         step: Number of frames per step.
     """
     following = torch.cat((values[:, 1:], values[:, -1:]), 1)

@@ -14,9 +14,11 @@ from hlsim.neuro.pointwise import Pointwise
 class ConvPath(nn.Module):
     """The convolutional layers of a block, along time or along frequency.
 
-    They are a convolution of each channel, a linear expansion to more channels, a ReLU and a
-    transposed convolution of length 1 back to the number of channels. Their output is added to the
-    input. Source: the Neuro-MSBG paper, Section III.
+    The layers are a convolution of each channel, a linear expansion to more channels, a ReLU, and a
+    transposed convolution of length 1 back to the number of channels. The output of the last layer
+    is added to the input.
+
+    Source: the Neuro-MSBG paper, Section III.
 
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 

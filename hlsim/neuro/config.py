@@ -16,7 +16,7 @@ AudiogramInput = Literal["channel", "concatenated"]
 Phase = Literal["predicted", "input"]
 
 MAX_SIZE = 1024
-"""Largest accepted value of each size, which protects from mistakes and from exhausted memory."""
+"""Largest accepted value of each size. It protects from mistakes and from exhausted memory."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class ModelConfig:
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the settings to a dictionary of JSON values."""
+        """Convert the settings to a dict of JSON values."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Build settings from a dictionary, for example one that ``to_dict`` returned.
+        """Build settings from a dict, for example one that ``to_dict`` returned.
 
         Args:
             data: Values under the names of settings. Missing settings have their default values.
@@ -54,11 +54,12 @@ class NetworkConfig(ModelConfig):
 
     Attributes:
         fft: Length of the Fourier transform in samples at 16 kHz.
-        window: Length of the window in samples at 16 kHz.
+        window: Length of the Hann window in samples at 16 kHz.
         hop: Samples at 16 kHz from one frame to the next, at most a quarter of ``window``.
         channels: Number of feature maps of the network.
         dense_depth: Number of dilated convolutions of the encoder and of each decoder.
-        stride: Frames and frequencies of the spectrogram per point of the feature maps.
+        stride: Number of frames and of frequencies of the spectrogram per point of the feature
+            maps.
         block: Kind of the layers in the blocks: ``cnn``, ``mamba``, ``lstm`` or ``transformer``.
         blocks: Number of dual-path blocks.
         kernel: Lengths of a ``cnn`` block's convolutions along time and frequency, odd numbers.
@@ -139,9 +140,10 @@ class NetworkConfig(ModelConfig):
 
     @property
     def receptive_field(self) -> int | None:
-        """Number of samples before and after a sample of the output on which it depends.
+        """Number of input samples before and after an output sample that the layers combine for it.
 
-        None if the output depends on the whole signal, as with layers other than convolutions.
+        The samples have 16 kHz. None if the output depends on the whole signal, as with layers
+        other than convolutions. What the prior adds is in ``EarNetwork.receptive_field``.
         """
         if self.block != "cnn":
             return None
@@ -159,20 +161,20 @@ class NeuroConfig(NetworkConfig):
     Attributes:
         structure: ``bands``, ``dual-path`` or ``monolithic``. ``bands`` is a network along time
             that corrects the gains in MSBG's frequency channels (``hlsim.neuro.bands``), at a third
-            of the cost of the paper's ``dual-path`` networks. The monolithic baselines of the paper
-            have no encoder and no frequency axis: each frame is a vector of ``channels`` values,
-            and the blocks run along time only.
+            of the cost of the paper's ``dual-path`` networks. The ``monolithic`` baselines of the
+            paper have a linear encoder and no frequency axis: each frame is a vector of
+            ``channels`` values, and the blocks run along time only.
         audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation
             1), or ``concatenated`` for eight thresholds next to magnitude and phase along frequency
             (its Table IV).
         phase: ``predicted``, or ``input`` for a network that changes the magnitude only (Table
             III).
-        prior: Compute MSBG's gains by its formulae (``hlsim.neuro.prior``), and correct them by the
-            network. Otherwise the network learns everything, as in the paper.
-        level_aware: Use the log magnitude and no normalisation, so that the output depends on the
-            level as it does in an ear. Otherwise the level has no effect, as in MP-SENet: each
-            signal is scaled to an RMS of 1 and back, and instance normalisation follows the
-            convolutions.
+        prior: Estimate MSBG's gains by its formulae (``hlsim.neuro.prior``), and let the network
+            correct them. Otherwise the network learns everything, as in the paper.
+        level_aware: Use the log magnitude and no normalisation, so that the gain depends on the
+            level as it does in an ear. Otherwise the gain does not depend on the level, as in
+            MP-SENet: each signal is scaled to an RMS of 1 and back, and instance normalisation
+            follows the convolutions.
 
     Raises:
         ValueError: A value is out of range, or values do not fit together.
@@ -205,5 +207,6 @@ class NeuroConfig(NetworkConfig):
 
     @property
     def receptive_field(self) -> int | None:
+        """Receptive field as in ``NetworkConfig``, but None unless the network is level-aware."""
         # The scale of a normalised network depends on the whole signal.
         return super().receptive_field if self.level_aware else None

@@ -1,9 +1,9 @@
-"""Decoders: they turn the feature maps of a network into factors on a spectrogram.
+"""Decoders: they turn the feature maps of a network into factors of a spectrogram.
 
 A spectrogram has the shape (items, time, frequency). Feature maps are coarser: (items, channels,
-time / stride[0], frequency / stride[1]), rounded up. A decoder computes a patch of stride[0] by
-stride[1] points of the spectrogram from each of their points. ``size`` is the number of frames and
-frequencies to which the patches are cut.
+time / stride[0], frequency / stride[1]), rounded up. From each point of the feature maps, a decoder
+computes a patch of stride[0] by stride[1] points of the spectrogram. The patches together are cut
+to the number of frames and frequencies of the spectrogram.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from hlsim.neuro.encoder import DenseBlock
 
 EPS_SQUARE = 1e-8
-"""Smallest squared modulus by which a phase shift is normalised."""
+"""Smallest squared modulus by which ``phase_factor`` divides."""
 
 
 class Decoder(nn.Module):
@@ -48,7 +48,12 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.leave.bias)
 
     def forward(self, features: Tensor, size: tuple[int, int]) -> Tensor:
-        """Decode feature maps to a spectrogram with a number of frames and frequencies."""
+        """Decode feature maps to values at each point of a spectrogram, see the class.
+
+        Args:
+            features: Feature maps.
+            size: Number of frames and of frequencies of the spectrogram.
+        """
         patches = self.leave(self.dense(features).permute(0, 2, 3, 1))
         # (items, time, frequency, outputs * steps) -> (items, outputs, time, step, frequency, step)
         grid = patches.unflatten(-1, (-1, *self.stride)).permute(0, 3, 1, 4, 2, 5)
@@ -79,9 +84,10 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
 class _PhaseFactor(torch.autograd.Function):
     """exp(a) z / |z| for z = 1 + x + j y, with a hand-written backward pass.
 
-    It needs a third of autograd's operations. Let f be the result, g the gradient with respect to
-    f, and q = g conj(f). The gradient is Re q with respect to a, -y Im q / |z|^2 with respect to x,
-    and (1 + x) Im q / |z|^2 with respect to y. Shape of a, x and y: (items, time, frequency).
+    The backward pass needs a third of autograd's operations. Let f be the result, g the gradient
+    with respect to f, and q = g conj(f). The gradient is Re q with respect to a, -y Im q / |z|^2
+    with respect to x, and (1 + x) Im q / |z|^2 with respect to y. Shape of a, x and y: (items,
+    time, frequency).
     """
 
     @staticmethod

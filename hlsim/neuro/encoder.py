@@ -20,12 +20,12 @@ def log_magnitude(squared: Tensor) -> Tensor:
 def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
     """Compute the sine of the phase of spectra, an input of networks beside the magnitude.
 
-    Unlike the phase, it does not jump where the phase wraps from pi to -pi. In silence it fades to
-    0 with a finite gradient.
+    Unlike the phase, its sine does not jump where the phase wraps from pi to -pi. In silence the
+    result fades to 0 with a finite gradient.
 
     Args:
         spectrum: Complex spectra, any shape.
-        squared: Their squared magnitudes, of the same shape.
+        squared: Squared magnitudes of these spectra, of the same shape.
 
     >>> spectrum = torch.tensor([2.0j, 0.0j])
     >>> sine_of_phase(spectrum, torch.tensor([4.0, 0.0])).round(decimals=3)
@@ -83,8 +83,8 @@ class Unit(nn.Sequential):
 class DenseBlock(nn.Module):
     """Convolutions with dilations 1, 2, 4, ... in time, each of which reads all earlier outputs.
 
-    Each has a kernel of 3 by 3 points and a PReLU. They are not causal: they see as much of the
-    future as of the past.
+    Each convolution has a kernel of 3 by 3 points and a PReLU. The convolutions are not causal:
+    they see as much of the future as of the past. The output is that of the last convolution.
 
     Shape: (items, channels, time, frequency) -> (items, channels, time, frequency).
 

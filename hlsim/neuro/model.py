@@ -1,4 +1,4 @@
-"""Neuro-MSBG, a neural network that emulates MSBG, and loading of trained ones."""
+"""Neuro-MSBG, a neural network that emulates MSBG, and a function that loads trained networks."""
 
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from hlsim.neuro.prior import Prior
 from hlsim.torchtools import built_in_float32
 
 POWER_FLOOR = 1e-11
-"""Power in Pa^2 that is added to powers before square roots."""
+"""Power in Pa^2 that is added to powers before square roots, so that gradients are finite."""
 
 MIN_LOG_MASK = -12.0
 """Smallest natural logarithm of the network's factor on a magnitude."""
@@ -43,18 +43,19 @@ class NeuroMSBG(EarNetwork, HubModel):
 
     MSBG is the simulation of hearing loss by Moore, Stone, Baer and Glasberg. The output is the
     sound that the ear perceives, time-aligned with the input. The network multiplies the
-    spectrogram of the input by a complex factor at each point.
+    spectrogram of the input by a complex factor at each point. A call takes a waveform and an
+    audiogram, see ``forward``.
 
     With the default structure, ``bands``, MSBG's own formulae estimate the gains in its frequency
     channels, and a small network corrects them. With the structures of the paper, the input
     channels are magnitude, phase and the encoded audiogram. An encoder and dual-path blocks (layers
     along time, then along frequency) follow, and two decoders predict the magnitude and the phase
     of the factor. With ``config.prior``, the spectrogram is first multiplied by the estimate of
-    MSBG's gains, which is also the fourth input channel, and the network corrects it.
+    MSBG's gains, which is also an additional input channel, and the network corrects the product.
 
     ``torch.func.grad`` works with all networks. First derivatives are exact, and so are second
-    derivatives with ``cnn`` blocks and, on a CPU, with ``lstm`` blocks. Those that do not exist
-    raise RuntimeError.
+    derivatives with ``cnn`` blocks and, on a CPU, with ``lstm`` blocks. Where there is no second
+    derivative, computing one raises RuntimeError.
 
     Source: the Neuro-MSBG paper, Section III and Equation 1.
 
@@ -67,9 +68,9 @@ class NeuroMSBG(EarNetwork, HubModel):
             False, they are undefined until a state dict is loaded.
 
     Attributes:
-        emulates_msbg: Whether the simulator emulates MSBG.
-        highest_frequency: Highest frequency of outputs in Hz.
-        needs_exact_lengths: Whether silence after the end of a signal changes the output before.
+        emulates_msbg: True, because the simulator emulates MSBG.
+        highest_frequency: Highest frequency of outputs in Hz, 8000.
+        needs_exact_lengths: True, because silence after the end of a signal changes its output.
 
     Raises:
         ValueError: The rate or the level is out of range.
@@ -187,11 +188,13 @@ class DualPathNeuroMSBG(NeuroMSBG):
         return self._simulate(signals / rms, ears) * rms
 
     def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Compute what ears perceive, from signals in pascals or, unless level-aware, of RMS 1.
+        """Compute what ears perceive. The output has the scale of the input.
 
-        The output has the scale of the input.
+        Shape: (items, time), (items, 8) -> (items, time).
 
-        Shape: (items, time), (items, 8) in dB HL -> (items, time).
+        Args:
+            signals: Signals in pascals, or scaled to an RMS of 1 unless the network is level-aware.
+            ears: Thresholds in dB HL.
         """
         samples = signals.shape[-1]
         severity = severity_index(ears)
@@ -209,10 +212,18 @@ class DualPathNeuroMSBG(NeuroMSBG):
     def _features(
         self, spectrum: Tensor, powers: Tensor, ears: Tensor, prior_factor: Tensor | None
     ) -> Tensor:
-        """Compute the input channels.
+        """Compute the input channels of the encoder.
 
-        Shape: (items, frames, frequencies), the same, (items, 8), (items, frames, frequencies) ->
-            (items, 2 to 4, frames, rows).
+        Args:
+            spectrum: Complex spectrogram. Shape: (items, frames, frequencies).
+            powers: Squared magnitude of the spectrogram. Shape: (items, frames, frequencies).
+            ears: Thresholds in dB HL. Shape: (items, 8).
+            prior_factor: Complex factor of the prior, (items, frames, frequencies), or None.
+
+        Returns:
+            Magnitude, phase and, depending on the configuration, encoded audiogram and prior.
+            Shape: (items, 2 to 4, frames, rows), where rows are the frequencies, followed by the
+            eight thresholds if ``config.audiogram`` is ``"concatenated"``.
         """
         if self.config.level_aware:
             channels = [log_magnitude(powers), sine_of_phase(spectrum, powers)]
@@ -229,10 +240,15 @@ class DualPathNeuroMSBG(NeuroMSBG):
         return torch.cat((features, levels), -1)
 
     def _correction(self, features: Tensor, ears: Tensor, severity: Tensor) -> Tensor:
-        """Predict the factor on the spectrogram, in addition to that of the prior.
+        """Predict the factor by which the spectrogram is multiplied, besides that of the prior.
 
         Shape: (items, 2 to 4, frames, rows), (items, 8), (items,) -> complex (items, frames,
             frequencies), or real without a predicted phase.
+
+        Args:
+            features: Input channels from ``_features``.
+            ears: Thresholds in dB HL.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
         size = features.shape[2], self.stft.frequencies
         device = features.device.type
@@ -262,7 +278,7 @@ class DualPathNeuroMSBG(NeuroMSBG):
 def load_pretrained(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
 ) -> NeuroMSBG:
-    """Load a trained Neuro-MSBG, in evaluation mode and with weights that are not trained further.
+    """Load a trained Neuro-MSBG in evaluation mode, whose weights do not require a gradient.
 
     Nothing is downloaded.
 
@@ -273,7 +289,8 @@ def load_pretrained(
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: There is no such checkpoint, it is damaged, or it is no simulator.
+        ValueError: There is no such checkpoint, it is damaged, it is no simulator, or the rate or
+            the level is out of range.
 
     >>> import torch
     >>> load_pretrained("neuro-msbg")(torch.randn(2, 16000), "N3").shape

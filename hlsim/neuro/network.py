@@ -22,7 +22,10 @@ _CPU_SAMPLES = 128_000
 """Number of samples at 16 kHz that run at once on a CPU."""
 
 _DEVICE_SAMPLES = 960_000
-"""Samples of a long item, or with ``checkpoint`` of all items, that run at once elsewhere."""
+"""Number of samples at 16 kHz that run at once on a GPU.
+
+It applies to each item, or with ``checkpoint`` to all items together.
+"""
 
 
 class EarNetwork(nn.Module):
@@ -32,8 +35,8 @@ class EarNetwork(nn.Module):
     Subclasses set ``config`` and implement ``process_items``.
 
     On a CPU, a few items run at a time. Long signals run in overlapping parts if a sample of the
-    output depends on a limited part of the input (``cnn`` blocks). This changes no output, and
-    limits the memory for signals of any length if no gradient is computed.
+    output depends on a limited part of the input (``cnn`` blocks). The parts change no output, and
+    limit the memory for signals of any length if no gradient is computed.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
@@ -41,8 +44,8 @@ class EarNetwork(nn.Module):
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Attributes:
-        checkpoint: Whether activations are computed again in the backward pass, a few items or one
-            part at a time, instead of being stored. False by default.
+        checkpoint: Whether to use gradient checkpointing: activations are computed again in the
+            backward pass, a few items or one part at a time, instead of stored. False by default.
 
     Raises:
         ValueError: The rate or the level is out of range.
@@ -65,17 +68,19 @@ class EarNetwork(nn.Module):
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
         """Process waveforms for ears.
 
-        Shape: (..., time) -> (..., time).
+        Shape: (..., time) -> (..., time), with the leading dimensions of waveform and ears
+            broadcast.
 
         Args:
-            waveform: Input signals.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) in dB HL broadcasts
-                over the leading dimensions of the waveform. Of an ``Audiogram`` with other
-                frequencies, the network gets ``Audiogram.thresholds``, the eight interpolated ones.
+            waveform: Input signals, where RMS 1.0 has the level ``full_scale_spl``.
+            audiogram: One ear for all signals, or ears whose thresholds in dB HL, (..., 8),
+                broadcast over the leading dimensions of the waveform. An ``Audiogram`` with other
+                frequencies is interpolated to these eight (``Audiogram.thresholds``).
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
-                not broadcast, or the waveform is on another device than the weights.
+                not broadcast, or the waveform is not a floating-point signal with time last or is
+                on another device than the weights.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         weight = next(self.parameters())
@@ -92,7 +97,7 @@ class EarNetwork(nn.Module):
             return torch.cat(outputs).reshape(*batch, -1).to(waveform.dtype)
 
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Convert to pascals at 16 kHz, process in blocks or at once, and convert back.
+        """Convert signals to pascals at 16 kHz, process them in blocks or whole, and convert back.
 
         Shape: (items, time), (items, 8) -> (items, time).
         """
@@ -118,20 +123,20 @@ class EarNetwork(nn.Module):
         """Step and receptive field in samples at 16 kHz; None if the field is the whole signal.
 
         Parts of a signal must start at multiples of the step. The receptive field is the number of
-        samples before and after a sample of the output on which it depends.
+        input samples before and after an output sample that influence it.
         """
         field = self.config.receptive_field
         return None if field is None else (self.config.step, field + self._additional_field)
 
     def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Process signals in pascals at 16 kHz for ears in dB HL.
+        """Process signals in pascals at 16 kHz for ears with thresholds in dB HL.
 
         Shape: (items, time), (items, 8) -> (items, time).
         """
         raise NotImplementedError
 
     def _finish(self, result: Tensor) -> Tensor:
-        """Return the output in pascals from the result at the sample rate of the input.
+        """Post-process the result in pascals at the sample rate of the input, here not at all.
 
         Shape: (items, time) -> (items, time).
         """
@@ -139,5 +144,5 @@ class EarNetwork(nn.Module):
 
 
 def _samples_at_once(signals: Tensor) -> int:
-    """Return the number of samples at 16 kHz that run at once on the device of signals."""
+    """Return the number of samples at 16 kHz that run at once on the signals' device."""
     return _CPU_SAMPLES if signals.device.type == "cpu" else _DEVICE_SAMPLES

@@ -1,13 +1,13 @@
-"""A transposed convolution of length 1, computed as a matrix product."""
+"""A transposed convolution with a kernel of length 1, computed as a matrix product."""
 
 from torch import Tensor, nn
 from torch.nn import functional
 
 
 class Pointwise(nn.ConvTranspose1d):
-    """Linear layer with the parameters of a transposed convolution of length 1.
+    """Linear layer across channels, with the parameters of a transposed convolution of length 1.
 
-    Checkpoints store these parameters. A matrix product is faster than the convolution.
+    Checkpoints store the parameters of the convolution, but a matrix product is faster.
 
     Shape: (..., inputs) -> (..., outputs).
 

@@ -3,13 +3,13 @@
 A network that starts from it has to learn corrections only. The steps are those of MSBG, on frames
 of 8 ms instead of single samples:
 
-1. ``filter`` applies the fixed filter of the ear to the waveform.
+1. ``filter`` applies to the waveform the fixed filter that MSBG is for a normal ear.
 2. *Smearing* spreads the power of each frame over neighbouring frequencies, as the broad filters of
    an impaired ear do.
 3. The power in each *channel* of MSBG's filter bank gives a level, and the level, smoothed over
    time, an *envelope*.
 4. *Recruitment*, the fast growth of loudness of an impaired ear, turns the envelope into a gain.
-5. The channels are added up with their gains. Relative to their sum without gains, this is a
+5. The channels are added up with their gains. The ratio of this sum to the sum without gains is a
    complex factor at each frequency.
 
 The *severity* of a loss is its degree, 0 (none) to 3 (severe). As in MSBG, it selects the filter
@@ -40,13 +40,13 @@ from hlsim.neuro.smearing import SmoothSmearing
 from hlsim.torchtools import constant
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
-"""Number of samples at 16 kHz that fixed responses have before time 0, and from it on."""
+"""Number of samples at 16 kHz of fixed impulse responses before time 0, and as many from it on."""
 
 CHANNELS = max(bank.channels for bank in BANKS.values())
 """Number of channels of the largest filter bank. Smaller banks are padded with zeros."""
 
 _ENVELOPE_HALF_LENGTH = 20
-"""Number of frames that the low-pass of the envelopes has before and after time 0."""
+"""Number of frames before and after time 0 that the low-pass of the envelopes spans."""
 
 _LOG_CATCH_UP = (CATCH_UP_SPL - PASCAL_SPL) / 20.0 * math.log(10.0)
 """Natural logarithm of the catch-up level in Pa."""
@@ -58,17 +58,17 @@ MIN_ENVELOPE = 1e-7
 """Smallest value of an envelope in Pa."""
 
 MAX_POWER_RATIO = 1e16
-"""Largest factor of smearing on a power."""
+"""Largest ratio of the smeared to the original power."""
 
 _FLUCTUATION_DB = {"none": 0.0, "mild": 1.0, "moderate": 2.2, "severe": 3.3}
-"""Level in dB by which MSBG's envelope of speech is below that of a tone of the same power.
+"""Difference in dB by which MSBG's envelope of speech is below that of a tone of the same power.
 
 Speech fluctuates, and smeared frames partly cancel each other where they overlap. The values were
 measured in the channels of 32 clips to about 0.5 dB.
 """
 
 _GRID_RATIO = 160
-"""Ratio by which responses are computed on a finer grid than that of the transform.
+"""Number of points of the frequency grid for responses per frequency of the transform.
 
 44.1 kHz is 441 / 160 times 16 kHz, so that both rates share this grid.
 """
@@ -77,16 +77,18 @@ _GRID_RATIO = 160
 class Prior(nn.Module):
     """An estimate of the complex factors by which MSBG multiplies a spectrogram.
 
-    The constants of MSBG's formulae are computed for each severity. Each has a correction that is
-    trained, and has no effect before training.
+    The constants of MSBG's formulae are computed for each severity. Those of channels, envelopes
+    and smearing have a trainable correction, which has no effect before training; the two fixed
+    filters have none. The class estimates the factor itself (``forward``), and offers the steps to
+    a network that corrects them (``smear`` to ``gains_to_factors``).
 
     Args:
-        stft: Transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
+        stft: Transform at 16 kHz whose window is about as short as MSBG's smearing frame, 5.8 ms.
         compute: Compute the constants. With False, they are undefined until a state dict is loaded.
 
     Attributes:
-        receptive_field: Number of samples before and after a sample of the output on which it
-            depends, in addition to those of the transform.
+        receptive_field: Number of input samples at 16 kHz before and after an output sample that
+            influence it, in addition to those of the transform.
 
     >>> stft = STFT(128, 128, 32)
     >>> factor = Prior(stft)(torch.ones(1, 50, 65), torch.full((1, 8), 40.0), torch.tensor([2]))
@@ -122,11 +124,18 @@ class Prior(nn.Module):
                 buffer.copy_(torch.from_numpy(values))
 
     def _add_buffer(self, name: str, shape: tuple[int, ...]) -> None:
-        """Register an uninitialised buffer."""
+        """Register an uninitialised float32 buffer."""
         self.register_buffer(name, torch.empty(shape, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
-        """Return the constants of a name with their learned correction."""
+        """Return constants with their learned correction.
+
+        The correction is a factor: exp(learned), or for the complex responses ``"relative"``
+        1 + learned.
+
+        Args:
+            name: ``"excitation"``, ``"relative"``, ``"smoothing"`` or ``"smearing"``.
+        """
         known = getattr(self, f"{name}_known")
         learned = getattr(self, f"{name}_learned")
         if name != "relative":
@@ -137,13 +146,17 @@ class Prior(nn.Module):
         return known + torch.stack((real, imaginary))
 
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
-        """Filter waveforms as outer ear, middle ear and filter bank do without a loss.
+        """Filter waveforms as MSBG does where the gain of all its channels is 1.
+
+        These are its outer and middle ear, the sum of the channels of the filter bank, and the
+        inverse of outer and middle ear, without delay.
 
         Shape: (items, time), (items,) -> (items, time).
 
         Args:
             waveform: Signals in pascals at 16 kHz.
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the filter
+                bank.
         """
         return filter_without_delay(waveform, self.response[severity].to(waveform))
 
@@ -176,7 +189,8 @@ class Prior(nn.Module):
             spectrum: Spectrogram of the output of ``filter``.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
 
-        Returns: The smeared spectrogram and its power in Pa^2, which may be negative.
+        Returns:
+            The smeared spectrogram and its power in Pa^2, which may be negative.
         """
         smeared, smeared_power, *_ = SmoothSmearing.apply(spectrum, self._smearing()[severity])
         return smeared, smeared_power
@@ -196,7 +210,7 @@ class Prior(nn.Module):
         return (channel_powers + POWER_FLOOR).sqrt().mT
 
     def smooth(self, levels: Tensor, severity: Tensor, step: int = 1) -> Tensor:
-        """Smooth the levels of channels over time, which gives their envelopes in Pa.
+        """Smooth the levels of channels over time to their envelopes in Pa, 1e-7 or more.
 
         Shape: (items, channels, frames), (items,) -> (items, channels, ceil(frames / step)).
 
@@ -236,7 +250,8 @@ class Prior(nn.Module):
             gains: Complex gains: the real parts of all channels, followed by the imaginary parts.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
 
-        Returns: Real and imaginary part of the factor at each frequency.
+        Returns:
+            Real and imaginary part of the factor at each frequency.
         """
         real, imaginary = self._corrected("relative")[:, severity]
         # One matrix product computes real and imaginary parts, which alternate in its columns.
@@ -246,12 +261,14 @@ class Prior(nn.Module):
         return (gains.mT @ matrix).unflatten(-1, (-1, 2))
 
     def _smearing(self) -> Tensor:
-        """Return the matrices that smear powers before the outer and the middle ear.
+        """Return the matrices that smear the power spectra of sounds in front of the ear.
 
-        MSBG smears after these filters, so the matrices apply their power response and undo it.
+        MSBG smears behind the outer and the middle ear, so the matrices apply the power response of
+        these filters, smear, and undo the response.
 
-        Returns: Matrices of shape (severities, frequencies, frequencies), first the identity matrix
-            for ears without a loss.
+        Returns:
+            Matrices, (severities, frequencies, frequencies). The first one, for ears without a
+            loss, is the identity.
         """
         ear_ratio = self.ear_power / self.ear_power.unsqueeze(-1)
         smearing = self._corrected("smearing") * ear_ratio
@@ -260,7 +277,9 @@ class Prior(nn.Module):
 
 
 def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
-    """Compute the square root of the ratio of two powers, imaginary for negative ratios.
+    """Compute the square root of the ratio of two powers, smeared to original.
+
+    The root of a negative ratio is imaginary. The ratio is at most 1e16.
 
     Shape: (...), (...) -> complex (...).
     """
@@ -277,7 +296,9 @@ def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
 def _msbg_constants(stft: STFT) -> dict[str, NDArray[np.float64]]:
     """Compute the constants of the prior at the frequencies of a transform, by name.
 
-    They take most of the time in which a network is built, and are the same for all networks.
+    The computation takes most of the time in which a network is built. The constants are stored,
+    because they are the same for all networks with this transform. Their shapes are those of the
+    buffers of ``Prior``.
     """
     points = _GRID_RATIO * stft.fft
     model_points = points * 441 // 160
@@ -312,12 +333,14 @@ def _msbg_constants(stft: STFT) -> dict[str, NDArray[np.float64]]:
 
 
 def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
-    """Compute the low-passes of the envelopes at the frame rate.
+    """Compute the impulse responses of the envelopes' low-passes, without delay, at the frame rate.
 
     Args:
+        bank: Filter bank of a severity.
         hop: Samples at 16 kHz from one frame to the next.
 
-    Returns: Kernels of shape (channels, 2 * half length + 1), each with a sum of 1.
+    Returns:
+        Kernels, (channels, 41), each with a sum of 1.
     """
     points = 4096
     length = 2 * _ENVELOPE_HALF_LENGTH + 1
@@ -335,7 +358,12 @@ def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
 def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
     """Compute MSBG's smearing matrix at the frequencies of a transform.
 
-    Returns: Matrix of shape (frequencies, frequencies).
+    Args:
+        severity: ``"mild"``, ``"moderate"`` or ``"severe"``.
+        stft: Transform at 16 kHz.
+
+    Returns:
+        Matrix for power spectra behind the middle ear, (frequencies, frequencies).
     """
     spacing = NEURO_RATE / stft.fft
     # As MSBG's, the filters cover more than the frequencies of the transform, up to about 20 kHz.
@@ -348,9 +376,12 @@ def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
 
 @constant
 def _threshold_weights() -> NDArray[np.float64]:
-    """Compute the weights of thresholds in each channel, 0 for channels that a bank lacks.
+    """Compute the weights that interpolate thresholds to the centre frequencies of channels.
 
-    Returns: Weights of shape (severities, 8, channels).
+    They are 0 for channels that the bank of a severity does not have.
+
+    Returns:
+        Weights, (severities, 8, channels).
     """
     banks = [BANKS[severity] for severity in SEVERITIES]
     weights = [interpolation_weights(FREQUENCIES, bank.centre_frequencies) for bank in banks]
@@ -358,5 +389,5 @@ def _threshold_weights() -> NDArray[np.float64]:
 
 
 def _pad_channels(rows: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Add rows of zeros up to the number of channels of the largest bank."""
+    """Add rows of zeros, (channels of a bank, n) -> (channels of the largest bank, n)."""
     return np.pad(rows, ((0, CHANNELS - len(rows)), (0, 0)))

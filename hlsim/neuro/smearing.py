@@ -1,7 +1,8 @@
 """Smearing as in MSBG, but with bounded derivatives.
 
 Where smearing changes the sign of a power or fills an empty frequency, the derivatives of MSBG have
-no bound. Here the output itself is smoothed, so that first and second derivatives are exact.
+no bound. Here the output itself is a smooth function of the input, so that first and second
+derivatives are both bounded and exact.
 """
 
 from typing import Any
@@ -12,10 +13,10 @@ from torch import Tensor
 from hlsim.dsp.fft import power
 
 MIN_FACTOR = 1e-3
-"""Factor of smearing on a power, -30 dB, below which the smoothed factor hardly falls."""
+"""Ratio of smeared to original power, -30 dB, below which the smoothed factor levels off."""
 
 MAX_FACTOR = 1e4
-"""Factor of smearing on a power, 40 dB, above which the smoothed factor hardly rises."""
+"""Largest ratio of smeared to original power, 40 dB."""
 
 _SILENCE = 1e-24
 """Power in Pa^2 that is added to powers before and after smearing, so that silence stays silent."""
@@ -24,16 +25,16 @@ _SILENCE = 1e-24
 def _smooth_factor(spectrum_power: Tensor, smeared_power: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the complex square root of the ratio of two powers, with a bounded derivative.
 
-    The ratio r is at most ``MAX_FACTOR``. The factor is the square root of r + i e, where e is
-    ``MIN_FACTOR``. It passes smoothly from the root of a positive ratio to the imaginary root of
-    a negative one, whose derivatives have no bound.
+    The magnitude of the ratio r is limited to ``MAX_FACTOR``. The factor is the square root of
+    r + i e, where e is ``MIN_FACTOR``. The exact root of r would change at r = 0 from real to
+    imaginary with a slope without bound; this factor changes smoothly.
 
     Args:
-        spectrum_power: Power of the spectrum, above 0.
-        smeared_power: Power of the smeared spectrum, which may be negative.
+        spectrum_power: Power of the spectrum in Pa^2, above 0. Any shape.
+        smeared_power: Power of the smeared spectrum in Pa^2, which may be negative. The same shape.
 
     Returns:
-        Real and imaginary part of the factor.
+        Real and imaginary part of the factor, of the same shape.
     """
     ratio = smeared_power / _ratio_divisor(spectrum_power, smeared_power)
     size = (ratio.square() + MIN_FACTOR**2).sqrt()
@@ -49,12 +50,12 @@ def _smooth_factor(spectrum_power: Tensor, smeared_power: Tensor) -> tuple[Tenso
 
 
 def _ratio_divisor(spectrum_power: Tensor, smeared_power: Tensor) -> Tensor:
-    """Return the power by which the smeared power is divided, so that the ratio has a limit."""
+    """Return the divisor of the smeared power, which limits the ratio to ``MAX_FACTOR``."""
     return torch.add(spectrum_power, smeared_power.abs(), alpha=1.0 / MAX_FACTOR)
 
 
 class SmoothSmearing(torch.autograd.Function):
-    """Smearing of spectra as MSBG's, with bounded derivatives and a hand-written backward pass.
+    """Smearing of spectra as in MSBG, with bounded derivatives and a hand-written backward pass.
 
     Autograd would be as fast, but the loss would store 40 % more for its gradient.
 
@@ -67,12 +68,13 @@ class SmoothSmearing(torch.autograd.Function):
     - the gradient with respect to A is t p^T.
 
     Args:
-        spectrum: Spectrum of each frame, complex (frames, frequencies).
-        matrix: Smearing of powers, (frequencies, frequencies).
+        spectrum: Spectrum of each frame in Pa, complex (..., frames, frequencies).
+        matrix: Matrix by which power spectra are multiplied, (..., frequencies, frequencies).
 
     Returns:
-        The smeared spectrum, the smeared power, and the real and the imaginary part of the factor,
-        (frames, frequencies) each.
+        The smeared spectrum; the smeared power in Pa^2, which may be negative; and the real and the
+        imaginary part of the factor, which have no gradient. Shape of each: (..., frames,
+        frequencies).
 
     >>> spectrum = torch.ones(1, 2, dtype=torch.complex64)
     >>> smeared, *_ = SmoothSmearing.apply(spectrum, torch.tensor([[4.0, 0.0], [0.0, 1.0]]))

@@ -16,8 +16,8 @@ from hlsim.neuro.model import NeuroMSBG
 class SimulatedStream:
     """Simulator for a signal that arrives in chunks.
 
-    Call it with each chunk in turn; it returns as many samples of what is perceived. This output is
-    delayed by the simulator's look-ahead, so that it depends on past input only. Its first
+    Call it with each chunk in turn; it returns as many samples of the perceived signal. This output
+    is delayed by the simulator's look-ahead, so that it depends on past input only. Its first
     ``latency`` samples belong to the silence before the first chunk.
 
     Args:
@@ -25,8 +25,8 @@ class SimulatedStream:
         audiogram: One ear, or a listener with two.
 
     Attributes:
-        latency: Delay of the output in samples.
-        block: Every chunk must be a multiple of this many samples long.
+        latency: Delay of the output in samples: the look-ahead, rounded up to whole blocks.
+        block: Number of samples of which the length of every chunk must be a multiple.
 
     Raises:
         ValueError: The simulator is not a Neuro-MSBG at 16 kHz with a finite receptive field.
@@ -51,7 +51,13 @@ class SimulatedStream:
         self._past = torch.zeros(2 * self.latency)
 
     def __call__(self, chunk: Tensor) -> Tensor:
-        """Return what is perceived. Shape: (time,), or (2, time) for a listener -> the same.
+        """Return the next samples of the perceived signal, ``latency`` samples late.
+
+        Args:
+            chunk: Next samples of the input. Shape: (time,), or (2, time) for a listener.
+
+        Returns:
+            Perceived samples of the same shape.
 
         Raises:
             ValueError: The number of samples is no multiple of ``block``.

@@ -1,1 +1,1 @@
-"""Layers of the paper's other networks: Mamba, LSTM, Transformer, and no frequency axis."""
+"""Layers of the paper's other networks: Mamba, LSTM, Transformer, and frames without frequency."""

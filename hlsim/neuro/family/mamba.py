@@ -13,10 +13,10 @@ from hlsim.neuro.family.scan import selective_scan
 
 
 class Mamba(nn.Module):
-    """A causal layer for sequences, whose recursive filters depend on the sequence.
+    """Mamba layer: a causal layer for sequences, whose recursive filters depend on the sequence.
 
-    It is the selective state space model of Gu and Dao. The names of arguments and parameters are
-    those of ``mamba_ssm``.
+    The layer is the selective state space model of Gu and Dao. The names of arguments and
+    parameters are those of ``mamba_ssm``.
 
     Shape: (items, time, d_model) -> (items, time, d_model).
 

@@ -77,7 +77,7 @@ def selective_scan(
 
 
 def _recur(decay: Tensor, states: Tensor) -> None:
-    """Compute h[t] = decay[t - 1] h[t - 1] + drive[t] with h[-1] = 0.
+    """Compute h[t] = decay[t - 1] h[t - 1] + drive[t] with h[-1] = 0, in place of the drive.
 
     Neighbouring times are joined in pairs. The recurrence of the pairs has half the length and the
     same form, and the times between them follow from it. This takes about three operations per time
@@ -86,7 +86,7 @@ def _recur(decay: Tensor, states: Tensor) -> None:
     Args:
         decay: Decays, which are at most 1, from each time to the next. Shape: (items, time - 1,
             ...).
-        states: Drive, which the states replace. Shape: (items, time, ...).
+        states: Drive, which the states h replace in place. Shape: (items, time, ...).
     """
     half = states.shape[1] // 2
     if half == 0:
@@ -99,7 +99,7 @@ def _recur(decay: Tensor, states: Tensor) -> None:
 
 
 def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the states of some items.
+    """Compute the states of some items, see ``_SelectiveScan`` for the shapes of the arguments.
 
     Returns:
         Decays from each time to the next, (items, time - 1, states, channels); drives before their
@@ -113,7 +113,9 @@ def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Ten
 
 
 class _SelectiveScan(torch.autograd.Function):
-    """The scan with its gradient, where channels are last, so that each step works on whole rows.
+    """The scan with its gradient, which computes the states again instead of storing them.
+
+    Channels are the last dimension, so that each step of the recurrence works on whole rows.
 
     Shape: (items, time, channels) for delta and u, (items, time, states) for B and C, (states,
         channels) for A -> (items, time, channels).
@@ -185,7 +187,14 @@ class _ScanGradient(torch.autograd.Function):
 
 
 def _parts(A: Tensor, *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
-    """Divide tensors into parts of a few items, whose states fit into the cache of a CPU."""
+    """Divide tensors into parts of a few items, whose states fit into the cache of a CPU.
+
+    On a GPU the parts are larger, to keep it busy.
+
+    Args:
+        A: Rates, whose size is the number of states per time.
+        tensors: Tensors of shape (items, time, ...).
+    """
     at_once = _STATES_AT_ONCE_GPU if A.is_cuda else _STATES_AT_ONCE_CPU
     states_per_item = tensors[0].shape[1] * A.numel()
     items = max(1, at_once // states_per_item)

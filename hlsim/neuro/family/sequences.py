@@ -105,7 +105,9 @@ class BidirectionalLSTM(nn.Module):
 
 
 class EncoderLayer(nn.TransformerEncoderLayer):
-    """Transformer layer (self-attention and a feed-forward layer) whose memory grows with length.
+    """Transformer layer whose memory grows in proportion to the length of the sequence.
+
+    The layer consists of self-attention and a feed-forward layer, with normalisation before each.
 
     Shape: (sequences, length, channels) -> (sequences, length, channels).
 
