@@ -1,6 +1,6 @@
 """Properties of an aid that speech scores do not show: gain, tones, quiet noise, look-ahead, cost.
 
-An aid is a function ``(waveform, ear) -> waveform`` for one signal at 16 kHz in pascals.
+An aid is a function ``(waveform, ear) -> waveform`` for one signal at 16 kHz in pascals, (time,).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _CHANGE_THRESHOLD = 1e-4
 """Share of the output's peak that counts as a change. Rounding of Fourier transforms is less."""
 
 _SIDEBAND_DISTANCE_HZ = 20.0
-"""Distance from a tone in Hz from which on power counts as sidebands."""
+"""Distance from a tone in Hz beyond which power counts as sidebands."""
 
 _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)
 """Samples of the middle second of 2 s, which holds whole periods of each tone."""
@@ -56,7 +56,7 @@ Aid = Callable[[Tensor, Audiogram], Tensor]
 Aids = Mapping[str, Aid]
 Ears = Mapping[str, Audiogram]
 Results = list[dict[str, Any]]
-"""One dictionary per ear and aid, with the names ``ear`` and ``aid`` and the measured values."""
+"""One dict per ear and aid, with the names ``ear`` and ``aid`` and the measured values."""
 
 
 def measure_aids(
@@ -67,13 +67,12 @@ def measure_aids(
     Args:
         aids: Hearing aids, each under its name.
         ears: Audiograms, each under its name.
-        measure: Function ``(aid, ear, *arguments) -> dictionary``, such as
-            ``measure_steady_tones``.
+        measure: Function ``(aid, ear, *arguments) -> dict``, such as ``measure_steady_tones``.
         arguments: Arguments of ``measure`` after aid and ear.
 
     Returns:
-        One dictionary per ear and aid: the names ``aid`` and ``ear``, and the values. The order is
-        that of ``ears`` and, for each ear, that of ``aids``.
+        One dict per ear and aid: the names ``aid`` and ``ear``, and the values of ``measure``. The
+        order is that of ``ears`` and, for each ear, that of ``aids``.
 
     Raises:
         ValueError: An aid fails; the message names aid and ear.
@@ -126,7 +125,7 @@ def measure_gain_curve(
 def mean_band_levels(signals: Sequence[Tensor], *, hearing_level: bool = False) -> list[float]:
     """Compute the mean level of several signals in each of 24 bands of equal width in ERBs.
 
-    Powers are averaged over time and over the signals.
+    The mean is that of powers, over time and over the signals.
 
     Args:
         signals: Signals at 16 kHz in pascals. Shape of each: (time,).
@@ -165,11 +164,11 @@ def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     """Compute the power at more than 20 Hz from a tone, relative to the power near it, in dB.
 
     Args:
-        waveform: Tones, of which the middle second counts. Shape: (items, 32000).
-        hertz: Frequency of each tone. Shape: (items,).
+        waveform: Outputs for tones, of which the middle second counts. Shape: (items, 32000).
+        hertz: Frequency of each tone in Hz. Shape: (items,).
 
     Returns:
-        Ratios of -200 dB or more. Shape: (items,).
+        Ratios, at least -200 dB. Shape: (items,).
     """
     middle = waveform[:, _MIDDLE].double()
     window = torch.hann_window(middle.shape[-1], dtype=middle.dtype)
@@ -195,8 +194,9 @@ def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> d
     Returns:
         ``loudness_error_db``, the level that the ear perceives of the output minus the level that a
         normal ear perceives of the tone, by the exact MSBG; ``sidebands_db``, the power of the
-        output at more than 20 Hz from the tone relative to that near it; both have the shape
-        (levels, frequencies). ``levels`` (dB SPL) and ``frequencies`` (Hz) are the axes.
+        output at more than 20 Hz from the tone relative to that near it, in dB; both are nested
+        lists of shape (levels, frequencies). ``levels`` (dB SPL) and ``frequencies`` (Hz) are the
+        axes.
 
     >>> measure_steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
     0.0
@@ -219,9 +219,10 @@ def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, A
         speech: Utterance of 3 s at 16 kHz. Shape: (48000,).
 
     Returns:
-        ``look_ahead_ms``, by how many ms an output changes before its input; ``quiet_gain_db``, the
-        gains in dB for white noise at 25 and at 40 dB SPL (``QUIET_LEVELS``); and ``cpu_ms``, the
-        processor time in ms for one second of sound on one thread.
+        ``look_ahead_ms``, how much later input a sample of the output needs, see
+        ``measure_look_ahead``; ``quiet_gain_db``, the gains in dB for white noise at 25 and at 40
+        dB SPL (``QUIET_LEVELS``); and ``cpu_ms``, the processor time in ms for one second of sound
+        on one thread.
 
     >>> measure_wearability(lambda x, _: x, NORMAL, torch.randn(48000))["look_ahead_ms"]
     0.0
@@ -256,20 +257,21 @@ def measure_look_ahead(
     other: Tensor,
     positions: Iterable[int],
 ) -> int:
-    """Return how many samples ahead of its input an aid's output depends on.
+    """Measure the look-ahead of an aid: how many samples of later input its output depends on.
 
-    From a position on, another sound replaces the input. The result is how many samples before this
-    position the output changes by more than 1e-4 of the output's peak.
+    From a position on, a second sound replaces the input. The look-ahead is the number of samples
+    before this position from which the output differs by more than 1e-4 of its peak.
 
     Args:
-        aid: Function (signal, ear) -> output: a hearing aid for one ear, or aids for both ears.
-        ear: The audiogram, or the ``Listener`` of a pair.
+        aid: Function ``(signal, ear) -> output``: a hearing aid for one ear, or for both.
+        ear: The audiogram, or for both ears a ``Listener``.
         signal: First sound. Shape: (..., time).
         other: Second sound. Shape: (..., time).
-        positions: Samples from which on the second sound replaces the first one. Each is tried.
+        positions: Indices of the samples from which the second sound replaces the first one. Each
+            is tried.
 
     Returns:
-        The largest number of samples at any position, 0 for an aid without look-ahead.
+        The largest number of samples over all positions, 0 for an aid without look-ahead.
 
     >>> advance = lambda signal, ear: signal.roll(-2)  # by two samples
     >>> measure_look_ahead(advance, NORMAL, torch.ones(9), -torch.ones(9), [5])
@@ -289,18 +291,22 @@ def measure_look_ahead(
 def measure_reception_thresholds(
     aids: Aids, ears: Ears, reference: str, test: DigitTest
 ) -> Results:
-    """Measure how much noise ears tolerate with hearing aids, by a test with digits in noise.
+    """Measure speech reception thresholds of ears with hearing aids, by digits in noise.
 
     Args:
         aids: Hearing aids, each under its name.
         ears: Audiograms, each under its name.
-        reference: Name of the aid, such as none, to which benefits are relative.
+        reference: Name of one of ``aids``, such as ``"unaided"``, to which benefits are relative.
         test: Test with the same digits and noises for all ears and aids.
 
     Returns:
-        One dictionary per ear and aid, as ``measure_aids`` returns it, with ``threshold_db``, the
-        signal-to-noise ratio at which half of the triplets are understood, and ``benefit_db``, the
-        threshold with the reference minus that with the aid, both with their 95 % intervals.
+        One dict per ear and aid, as ``measure_aids`` returns it, with ``threshold_db``, the
+        signal-to-noise ratio in dB at which half of the triplets of digits are understood, and
+        ``benefit_db``, the threshold with the reference minus that with the aid. Both are an
+        ``Estimate`` with its 95 % interval.
+
+    Raises:
+        ValueError: An aid fails; the message names aid and ear.
 
     >>> test = DigitTest.draw(30, simulator="attenuation")
     >>> aids, ears = {"unaided": lambda signal, ear: signal}, {"N3": Audiogram.standard("N3")}
@@ -315,7 +321,7 @@ def measure_reception_thresholds(
 
 
 def _measure_reception_threshold(aid: Aid, ear: Audiogram, test: DigitTest) -> dict[str, Estimate]:
-    """Measure the threshold of one ear with an aid."""
+    """Measure the reception threshold of one ear with an aid, as the value of ``threshold_db``."""
     thresholds = torch.tensor(ear.thresholds)
     return {
         "threshold_db": test.measure(thresholds, lambda inputs, _: _aid_outputs(aid, inputs, ear))
@@ -329,16 +335,23 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
     Args:
         aid: The hearing aid.
         signals: Signals of equal length. Shape of each: (time,).
-        ear: The audiogram.
+        ear: Audiogram of the ear.
 
-    Returns: Outputs, cut to the length of the signals. Shape: (signals, time).
+    Returns:
+        Outputs, cut to the length of the signals. Shape: (signals, time).
+
+    Raises:
+        ValueError: An output is not valid, see ``cut_output``.
     """
     outputs = [cut_output(aid(signal.clone(), ear), signal, NEURO_RATE) for signal in signals]
     return torch.stack(outputs)
 
 
 def _band_powers(signal: Tensor) -> Tensor:
-    """Return the mean power in each of 24 bands. Shape: (utterances, time) -> (24,)."""
+    """Return the mean power in each of 24 bands, relative to 20 micropascals squared.
+
+    Shape: (utterances, time) -> (24,).
+    """
     return (10.0 ** (band_levels(signal.double(), NEURO_RATE) / 10.0)).mean((0, 1))
 
 

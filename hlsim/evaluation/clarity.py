@@ -2,8 +2,7 @@
 
 As in the challenges' scripts (claritychallenge/clarity, recipes/icassp_2023 and cec3), the
 reference is the target without its room, at the level of the target in the room. An RMS of 1.0 in a
-file is 100 dB SPL. The score of a listener is that of the ear with the higher score, by each
-measure.
+file is 100 dB SPL. A listener has one score per measure, that of the ear with the higher score.
 """
 
 from __future__ import annotations
@@ -59,14 +58,14 @@ _REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_refe
 """Ends of the names of references. The last one already has the target's level in the room."""
 
 _CHANGES = 8
-"""Number of positions at which the scene becomes another sound, to measure the look-ahead."""
+"""Number of positions at which the scene changes to noise, to measure the look-ahead."""
 
 _LOOK_AHEAD_SECONDS = 4.0
 """Length of the part of a scene on which the look-ahead is measured."""
 
 
 class _Pair(NamedTuple):
-    """A scene for a listener.
+    """A scene and one of the listeners for whom it is processed.
 
     Attributes:
         mix: File with the signals of the front microphones, whose name ends with ``CH1.wav``.
@@ -83,12 +82,12 @@ class _Pair(NamedTuple):
     listener: Listener
 
     def microphone(self, number: int) -> Path:
-        """Return the file with the signals of a microphone, of which 1 is the front one."""
+        """Return the file with both ears' signals of a microphone; number 1 is the front one."""
         return self.mix.with_name(f"{self.mix.name.removesuffix('1.wav')}{number}.wav")
 
     @property
     def output_name(self) -> str:
-        """Name of files with outputs of aids, that of the challenges."""
+        """Name of the file with an aid's output for both ears, as the challenges name it."""
         return f"{self.scene}_{self.name}_HA-output.wav"
 
 
@@ -122,7 +121,8 @@ def evaluate_scenes(
     Args:
         aids: Compensators (name or folder) and aids of your own, by their label in tables. An aid
             is ``package.module:name`` of a function ``(waveform, listener, sample_rate) ->
-            waveform`` for signals with shape (2, time) at the scale of the files.
+            waveform`` for signals with shape (2, time), at the scale of the files and the sample
+            rate of the first scene.
         scenes: Folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``) with two channels, and
             ``SCENE_target_anechoic_CH1.wav`` (or ``_target_anechoic``, ``_reference``) with one or
             two. If there is a ``SCENE_target_CH1.wav``, the target in the room, each channel of the
@@ -140,7 +140,8 @@ def evaluate_scenes(
             mean of these microphones, as in the baseline of the third challenge. An aid of your own
             with the attribute ``takes_microphones = True`` receives all of them, with shape
             (microphones, 2, time).
-        stride: Use every n-th pair of scene and listener. 15 gives the challenges' small test.
+        stride: Number n, of which every n-th pair of scene and listener is used. 15 gives the
+            challenges' small test.
         enhancers: ``package.module:name`` of functions ``(waveform, sample_rate) -> waveform`` that
             reduce noise, for signals in pascals with shape (..., time). Each adds a condition
             before NAL-R and before each aid.
@@ -148,7 +149,7 @@ def evaluate_scenes(
         precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         linked: Whether one level sets the gains of both ears, in compensators that support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
-        seed: Seed of the noise that HASPI and HASQI add.
+        seed: Seed of the noise that HASPI, HASQI and HAAQI add.
         listen: Number of scenes with sounds for the players of a page, as an ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
@@ -156,10 +157,9 @@ def evaluate_scenes(
 
     Returns:
         The evaluation of all conditions, ``unaided`` first. Its ``notes`` count files of scenes
-        and of ``outputs`` that are not used. The column ``combined`` of its table is
-        the mean of HASPI and HASQI. Its ``details["look_ahead_ms"]`` has
-        the measured look-ahead by condition, and None for ``outputs`` and for an aid that fails on
-        the first pair.
+        and of ``outputs`` that are not used. The column ``combined`` of its table is the mean of
+        HASPI and HASQI. Its ``details["look_ahead_ms"]`` has the measured look-ahead by condition,
+        and None for ``outputs`` and for an aid that fails on the first pair.
 
     Raises:
         ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, an
@@ -220,7 +220,9 @@ def evaluate_scenes(
 def _read_pairs(
     folder: Path, listeners: str | Path, scenes_listeners: str | Path | None
 ) -> list[_Pair]:
-    """Return all pairs of scene and listener, see ``evaluate_scenes``.
+    """Return the pairs of scene and listener, sorted by scene or in the order of the JSON file.
+
+    See ``evaluate_scenes`` for the files.
 
     Raises:
         ValueError: There is no scene, a scene lacks its reference, a file is broken or names an
@@ -262,7 +264,7 @@ def _read_pairs(
 
 
 def _read_names(path: Path) -> list[tuple[str, str]]:
-    """Return the names of scenes and listeners in ``scenes_listeners.json``.
+    """Return pairs (scene, listener) of names, as ``scenes_listeners.json`` lists them.
 
     Raises:
         ValueError: The file cannot be read, or has another structure.
@@ -287,7 +289,7 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
 
 
 def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> list[str]:
-    """Return a sentence about microphones that no aid receives, or none."""
+    """Return a list with a note about microphones that no aid receives, or an empty list."""
     unused = [number for number in _MICROPHONES if number not in numbers]
     scenes = {pair.scene for pair, n in product(pairs, unused) if pair.microphone(n).is_file()}
     if not scenes:
@@ -302,7 +304,7 @@ def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int])
 def _describe_unused_outputs(
     label: str, folder: Path, pairs: Sequence[_Pair], all_pairs: Sequence[_Pair]
 ) -> list[str]:
-    """Return a sentence about audio files of an aid that no pair uses, or none.
+    """Return a list with a note about audio files of an aid that no pair uses, or an empty list.
 
     Args:
         label: Label of the aid.
@@ -335,7 +337,10 @@ def _make_conditions(
     linked: bool,
     **levels: Any,
 ) -> list[Condition]:
-    """Return no aid, NAL-R and all aids, each but recorded ones also after every enhancer.
+    """Return the conditions: no aid, NAL-R, the aids, and the recorded outputs, in this order.
+
+    NAL-R and each aid that is not recorded come after the conditions in which an enhancer precedes
+    them.
 
     Args:
         aids: Aids by their label, see ``evaluate_scenes``.
@@ -373,7 +378,7 @@ def _make_conditions(
 
 
 def _folder_name(condition: Condition) -> str:
-    """Return the name of the folder for the signals of a condition."""
+    """Return the name of the folder for a condition's signals, without unusual characters."""
     return re.sub(r"[^\w.+-]+", "-", condition.name).strip(".-")
 
 
@@ -381,9 +386,9 @@ def _folder_name(condition: Condition) -> str:
 def _measure_look_ahead(
     condition: Condition, pair: _Pair, rate: int, microphones: Sequence[int]
 ) -> float | None:
-    """Measure the look-ahead in ms on the beginning of a scene.
+    """Measure the look-ahead of a condition in ms, on the first 4 s of a scene.
 
-    It is None for existing outputs, and for an aid that fails.
+    It is None for existing outputs, and for an aid whose call raises ValueError.
     """
     if condition.process is None:
         return None
@@ -401,7 +406,9 @@ def _measure_look_ahead(
 
 
 def _input_of(condition: Condition, signals: Tensor) -> Tensor:
-    """Return the mean of all microphones, or their signals for an aid that takes them.
+    """Return the input of a condition: the mean of all microphones, (2, time).
+
+    An aid with ``takes_microphones`` gets all signals, (microphones, 2, time).
 
     Args:
         condition: Condition with the aid.
@@ -422,6 +429,8 @@ def _write_signals(
 ) -> dict[str, Path | ValueError]:
     """Write the reference and the outputs of a scene for a listener.
 
+    Existing outputs are only validated.
+
     Args:
         out: Folder of the results.
         conditions: Conditions with their aids.
@@ -430,7 +439,9 @@ def _write_signals(
         rate: Sample rate in Hz.
         pair: The scene and the listener.
 
-    Returns: File of the outputs for both ears under each condition, or why there is none.
+    Returns:
+        By the name of the condition, the file with its outputs for both ears, or the error that
+        prevented it.
 
     Raises:
         ValueError: A file of the scene is broken, or has another rate or length.
@@ -477,7 +488,8 @@ def _read_microphones(pair: _Pair, rate: int, numbers: Sequence[int]) -> Tensor:
 def _read_scene(pair: _Pair, rate: int, microphones: Sequence[int]) -> tuple[Tensor, Tensor]:
     """Read the microphones' signals, and the reference at the level of the target in the room.
 
-    Returns: Signals for the left and the right ear: of the microphones, with shape (microphones, 2,
+    Returns:
+        Signals for the left and the right ear: of the microphones, with shape (microphones, 2,
         time), and of the reference, with shape (2, time).
 
     Raises:
@@ -496,7 +508,9 @@ def _read_scene(pair: _Pair, rate: int, microphones: Sequence[int]) -> tuple[Ten
 
 
 def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:
-    """Read the channels for the left and the right ear; one channel is for both. Shape: (2, time).
+    """Read the channels for the left and the right ear. Shape: (2, time).
+
+    If the file has one channel, both ears get it.
 
     Args:
         path: Audio file.
@@ -504,7 +518,7 @@ def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Te
         numbers: Accepted numbers of channels.
 
     Raises:
-        ValueError: The file has another sample rate or number of channels.
+        ValueError: The file cannot be read, or has another sample rate or number of channels.
     """
     waveform, file_rate = read_audio(path)
     if file_rate != rate or len(waveform) not in numbers:

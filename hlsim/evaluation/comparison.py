@@ -35,14 +35,16 @@ class ConditionComparison:
         level_change: Change of the mean output level of the same items in dB; NaN if levels are
             not known.
         unit: Column of the table that several items share, such as ``"listener"``.
-        unit_means: The same statistics over one mean score per unit, because items of one listener
-            are not independent; None if an item has no unit, or with fewer than two units.
+        unit_means: The same statistics over the mean scores of each unit, because items of one
+            listener are not independent; None if an item has no unit, or with fewer than two units.
         left_out: Number of items that lack one of the two scores.
         p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state, adjusted by Holm
             unless the comparison is planned; None if a test is not defined.
         planned: Whether the comparison was planned before the scores were known, so that its p
-            values are not adjusted.
-        family: Number of comparisons by the same measure for which the p values are adjusted.
+            values are not adjusted. False if it is the only one by this measure, where an
+            adjustment changes nothing.
+        family: Number of comparisons by the same measure for which the p values are adjusted; 1 for
+            a planned comparison.
 
     >>> import pandas
     >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
@@ -95,7 +97,11 @@ def compare(
         unit: Column that groups items, such as ``"listener"``. The group means are tested as well.
 
     Returns:
-        The comparisons of each measure in turn. A pair is left out if no item has both scores.
+        All comparisons by the first measure, then all by the second one, and so on. A pair is left
+        out if no item has both scores.
+
+    Raises:
+        KeyError: The table lacks a measure, or the condition ``baseline``.
 
     >>> import pandas
     >>> rows = [(i, c, 0.1 * i + 0.2 * (c == "b")) for i in range(6) for c in "ab"]
@@ -119,7 +125,14 @@ def compare(
 def _adjust(
     comparisons: Sequence[ConditionComparison], planned: Collection[PlannedComparison]
 ) -> list[ConditionComparison]:
-    """Mark the planned comparisons of a measure, and adjust the p values of all others."""
+    """Mark the planned comparisons of a measure, and adjust the p values of all others.
+
+    Args:
+        comparisons: All comparisons by one measure, with p values that are not adjusted.
+        planned: See ``compare``.
+
+    Returns: Changed copies, in the same order.
+    """
     planned_pairs = {(measure, frozenset(pair)) for measure, *pair in planned}
     marked = []
     for c in comparisons:
@@ -136,10 +149,16 @@ def _adjust(
 def _compare_pair(
     table: DataFrame, measure: str, before: str, after: str, unit: str
 ) -> ConditionComparison | None:
-    """Compare ``after`` with ``before`` over the items that have both scores; None without any.
+    """Compare ``after`` with ``before`` over the items that have both scores; None if none has.
 
-    The table has columns ``item``, ``condition`` and the measure, and may have ``level`` and the
-    unit. The p values are not adjusted.
+    The p values are not adjusted.
+
+    Args:
+        table: Table with the columns ``item``, ``condition`` and the measure, and perhaps ``level``
+            and the unit.
+        measure: Column of the score.
+        before, after: Names of the conditions.
+        unit: Column that groups items.
     """
     scores = table.pivot(index="item", columns="condition", values=measure)[[before, after]]
     pairs = scores.dropna()
@@ -170,10 +189,11 @@ def _compare_pair(
 def _compare_units(
     units: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> PairedComparison | None:
-    """Compare the means of each unit, second minus first.
+    """Compare the mean scores of each unit, second minus first, where a unit is a group of items.
 
     Args:
-        units: Name of the unit of each item, empty if it is unknown. Shape: (items,).
+        units: Name of the unit of each item, empty if it is unknown. Shape: (items,), or empty if
+            the table has no units.
         first, second: Scores under both conditions. Shape: (items,).
 
     Returns:

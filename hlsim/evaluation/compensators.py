@@ -77,7 +77,7 @@ def evaluate_compensators(
 
     Scores are stored as they become known. An interrupted run can be continued, and a run with one
     more compensator, or with another simulator, computes only the scores that are missing. An item
-    is used only if every condition has all its scores.
+    that lacks a value under any condition is left out of all comparisons.
 
     Args:
         compensators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
@@ -89,18 +89,19 @@ def evaluate_compensators(
         noise: Folder of recordings of noise. Every second item is then noisy, at signal-to-noise
             ratios of 2.5 to 17.5 dB.
         enhancers: Names ``package.module:name`` of functions ``(waveform, sample_rate) ->
-            waveform`` that reduce noise before each aid, in conditions such as ``gtcrn + NAL-R``.
+            waveform`` that reduce noise. Each is put before every prescription and compensator, in
+            further conditions such as ``gtcrn + NAL-R``.
         simulator: Name or folder of the Neuro-MSBG whose training loss is compared with that of
             the exact MSBG, because an aid may exploit errors of the network.
         measures: Names of measures in addition to HASPI and HASQI.
         precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         items: Number of items. With noise, 400 items are 200 of clean and 200 of noisy speech.
         seconds: Length of an item in seconds. HASPI is not reliable much below 3.
-        levels: Levels of the clean speech in dB SPL, in turn.
-        gain_ears: Names of the standard ears for gain curves, steady tones and ``srt``.
-        srt: Whether to measure speech reception thresholds in noise by the digit test, too. Such a
-            threshold belongs to an ear and an aid, not to an item. It takes about five seconds for
-            each of them, without the time of the aid.
+        levels: Levels of the clean speech in dB SPL, through which the items cycle.
+        gain_ears: Names of the standard ears for the measurements in ``details``. If ``audiogram``
+            is passed, they use this ear instead.
+        srt: Whether to measure speech reception thresholds in noise by the digit test, too, one
+            threshold per ear and aid. Each takes about five seconds, without the time of the aid.
         seed: Seed of all random draws.
         listen: Number of items with sounds for the players of a page, as the ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
@@ -108,9 +109,10 @@ def evaluate_compensators(
             and of all scores.
 
     Returns:
-        The evaluation with the groups ``clean`` and ``noisy`` (speech in noise)
-        if they have items. Its ``details`` are ``gain_curves``, ``steady_tones`` and ``wearing``:
-        results of ``measure_aids`` with ``measure_gain_curve``, ``measure_steady_tones`` and
+        The evaluation with the groups ``clean`` and ``noisy`` (speech in noise), if they have
+        items, which hold the comparisons. The column ``gap`` of its table is the surrogate gap, as
+        a fraction. Its ``details`` are ``gain_curves``, ``steady_tones`` and ``wearing``: results
+        of ``measure_aids`` with ``measure_gain_curve``, ``measure_steady_tones`` and
         ``measure_wearability``; with ``srt``, also ``reception_thresholds``, that of
         ``measure_reception_thresholds``.
 
@@ -197,13 +199,14 @@ def _make_conditions(
     equalisers: Mapping[str, nn.Module],
     enhancers: Mapping[str, WaveformPlugin],
 ) -> list[Condition]:
-    """Return the conditions, each of which is compared with all earlier ones.
+    """Return the conditions, each of which the study compares with all earlier ones.
 
-    They are: unaided; each prescription, followed by its enhanced versions; and for each trained
-    aid NAL-R and the equaliser at its level, its enhanced versions, and then the aid itself.
+    The order is: unaided; each prescription, then this prescription behind each enhancer; and for
+    each trained aid, NAL-R at its level, the equaliser at its level, the aid behind each enhancer,
+    and the aid.
 
     Args:
-        aids: Prescriptions, NAL-R among them, and trained aids, each under its name.
+        aids: Prescriptions, NAL-R among them, and then trained aids, each under its name.
         equalisers: For each trained aid, under its name, an equaliser with its mean gain.
         enhancers: Enhancers, by the part of their names after the colon.
     """
@@ -228,9 +231,9 @@ def _make_conditions(
 
 
 def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
-    """Return the evaluations of clean speech and of speech in noise, by name.
+    """Return the evaluations of clean speech and of speech in noise, as ``clean`` and ``noisy``.
 
-    An item that lacks a value in one condition is in no group.
+    An item that lacks a value in one condition is in no group. A group without items is left out.
 
     Raises:
         ValueError: No item has all values.

@@ -1,6 +1,8 @@
-"""Conditions: no aid, an equaliser, an aid at another's level, your own, and their names.
+"""Conditions of studies, each a way to process the input of an item, and their names.
 
-A hearing aid is a function or module ``(waveform, ear) -> waveform``.
+They are: no aid; an equaliser with the mean gain of an aid; an aid at the output level of another
+one; an aid behind noise reduction; and an aid of your own. A hearing aid is a function or module
+``(waveform, ear) -> waveform``.
 """
 
 from __future__ import annotations
@@ -30,13 +32,13 @@ NAL_R = "NAL-R"
 """Name of the linear prescription NAL-R."""
 
 COMPRESSION = "WDRC"
-"""Name of wide dynamic range compression with its default settings."""
+"""Name of the prescription ``WDRC`` with its default settings."""
 
 BEFORE, AFTER = "before", "after"
 """Names of recorded speech before and after a treatment."""
 
 NAL_R_AT_LEVEL, TRAINED = "NAL-R, same level", "trained aid"
-"""Names of NAL-R at the output level of the aid that the demo trains, and of this aid."""
+"""Names of two conditions of the demo: the aid that it trains, and NAL-R at its output level."""
 
 _EQUALISER_TAPS = 513
 """Number of taps of an equaliser, which gives it a resolution of 31 Hz at 16 kHz."""
@@ -45,9 +47,9 @@ _LOWEST_GAIN_DB = -100.0
 """Lowest gain of an equaliser in dB."""
 
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
-"""Gains in dB that equalisers have measured in this process, by equaliser and ear.
+"""Gains in dB of the 24 bands of each equaliser for each ear, by equaliser and ear.
 
-Processes receive copies of an equaliser with each item, so that a copy cannot store its gains.
+Each task of a study gets a new copy of the equaliser, so the gains are kept in the process.
 """
 
 
@@ -66,12 +68,12 @@ class Unaided(nn.Module):
 class AtLevelOf(nn.Module):
     """Hearing aid whose output is scaled to the RMS level of another aid's output.
 
-    Both aids process the same input. HASPI rewards any gain, so that aids are compared at equal
-    level.
+    Both aids process the same input. HASPI rises with any gain, so a comparison at equal level
+    shows what else an aid does.
 
     Args:
-        aid: The aid whose output is returned.
-        other: The aid whose level the output gets.
+        aid: Aid whose output is returned.
+        other: Aid whose output level is used.
 
     >>> AtLevelOf(Unaided(), Unaided())(torch.ones(2), Audiogram.standard("N3"))
     tensor([1., 1.])
@@ -84,7 +86,10 @@ class AtLevelOf(nn.Module):
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         """Return the output of ``aid`` at the RMS level of the output of ``other``.
 
-        Samples after the end of the waveform do not count, because a study does not score them.
+        Both outputs are cut to the length of the waveform first, because a study scores no later
+        sample.
+
+        Shape: (..., time) -> (..., time).
         """
         time = waveform.shape[-1]
         level = level_spl(self.other(waveform.clone(), audiogram)[..., :time])
@@ -94,8 +99,8 @@ class AtLevelOf(nn.Module):
 class EqualiserLike(nn.Module):
     """Linear filter with the mean gain that a hearing aid has for speech, measured for each ear.
 
-    The filter is used as a condition: if the aid has a higher score, the reason is not its mean
-    gain.
+    Studies use it as a rival of the aid: if the aid has a higher score than this filter, the reason
+    is not the aid's mean gain.
 
     Args:
         aid: The aid whose gain is measured.
@@ -118,7 +123,8 @@ class EqualiserLike(nn.Module):
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         """Filter a waveform at 16 kHz with the aid's mean gain for one ear, without delay.
 
-        The gains of an ear are measured once per process. Later changes of the aid have no effect.
+        The gains for an ear are measured at its first call in a process. Later changes of the aid
+        have no effect.
 
         Shape: (..., time) -> (..., time).
         """
@@ -128,9 +134,9 @@ class EqualiserLike(nn.Module):
         return _equalise_bands(waveform, _GAINS[key])
 
     def gains_db(self, audiogram: Audiogram) -> list[float]:
-        """Measure the aid's mean gain for an ear, in dB, rounded to 0.1 dB, in 24 bands.
+        """Measure the aid's gain for an ear in the 24 bands of ``measure_gain_curve``, in dB.
 
-        The bands are those of ``measure_gain_curve``. The lowest gain is -100 dB.
+        The gain of a band is the mean over ``levels``, at least -100 dB, rounded to 0.1 dB.
         """
         curve = measure_gain_curve(self.aid, audiogram, self.utterances, self.levels)
         mean = np.mean(curve["gain_db"], 0).clip(_LOWEST_GAIN_DB, None)
@@ -140,9 +146,13 @@ class EqualiserLike(nn.Module):
 def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
     """Filter a waveform at 16 kHz with linear phase and without delay.
 
+    Gains in dB are interpolated over log frequency, and constant below and above the centres.
+
     Args:
-        waveform: Signals with shape (..., time).
+        waveform: Signals. Shape: (..., time).
         gains_db: Gains in dB at the 24 frequencies of ``band_centres``.
+
+    Returns: Filtered signals. Shape: (..., time).
     """
     hertz = np.linspace(0.0, NEURO_RATE / 2.0, _EQUALISER_TAPS)
     gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
@@ -151,7 +161,7 @@ def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
 
 
 class PluginAid(nn.Module):
-    """Hearing aid for two ears that a user has written as a function, which is loaded by its name.
+    """Hearing aid for both ears that a user has written as a function, loaded by its name.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name`` of a function ``(waveform,
@@ -162,6 +172,9 @@ class PluginAid(nn.Module):
         takes_microphones: Whether the function has this attribute, set to True. It then receives
             the signals of several microphones, with shape (microphones, 2, time).
         may_crash: True, because compiled code of the function may end the process.
+
+    Raises:
+        ValueError: The function cannot be loaded.
 
     >>> PluginAid("builtins:max", 16000)
     PluginAid()
@@ -197,14 +210,14 @@ class Enhanced(nn.Module):
 
     Args:
         enhancer: Function ``(waveform, sample_rate) -> waveform`` for signals in pascals.
-        aid: The aid.
+        aid: Aid that processes the enhanced signal.
         sample_rate: Sample rate of all signals in Hz.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0 in the inputs and outputs.
 
     Attributes:
         may_crash: True, because compiled code of the enhancer may end the process.
 
-    >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
+    >>> enhancer = WaveformPlugin("torch:mul", "enhancer")  # waveform * sample_rate
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
     tensor([16000., 16000.])
     """
@@ -223,7 +236,10 @@ class Enhanced(nn.Module):
         self.gain = gain_to_pascals(full_scale_spl)
 
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
-        """Enhance the waveform, and return the aid's output for the result, (..., time)."""
+        """Enhance the waveform, and return the aid's output for the enhanced signal.
+
+        Shape: (..., time) -> (..., time).
+        """
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
         aided: Tensor = self.aid(enhanced, ear)
         return aided
@@ -232,14 +248,15 @@ class Enhanced(nn.Module):
 def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
     """Load functions ``(waveform, sample_rate) -> waveform`` that reduce noise for hearing aids.
 
-    They process signals in pascals with shape (..., time), and are tried on two seconds of speech.
+    They process signals in pascals with shape (..., time), at the sample rate of the study. Each is
+    tried on two seconds of speech at 16 kHz.
 
     Args:
         names: ``package.module:name`` or ``path/to/file.py:name`` of each function.
 
     Returns:
-        The enhancers, each under the name of its function, the part of its name after the colon, or
-        under its whole name if another function has this name.
+        The enhancers, each under the part of its name after the colon, or under its whole name if
+        an earlier enhancer has the same part.
 
     Raises:
         ValueError: An enhancer cannot be loaded, or its output for speech is not a waveform or not

@@ -41,7 +41,7 @@ _SPEECH_LEVEL = 65.0
 _MAX_SECONDS = 5.0  # of an utterance that is scored, so that HASPI takes half as long
 
 _Signals = Mapping[str, Sequence[Tensor]]
-"""One signal per item in pascals, each with shape (time,), by the name of a condition."""
+"""Dict from the name of a condition to one signal per item, in pascals, each with shape (time,)."""
 
 
 def evaluate_trained_aid(
@@ -53,16 +53,21 @@ def evaluate_trained_aid(
     the means of the voices, because utterances of one voice are not independent.
 
     Args:
-        aid: The aid, which is called with a waveform in pascals at 16 kHz, (time,), and an ear.
-        audiogram: The ear.
+        aid: Trained aid, which is called with a waveform in pascals at 16 kHz, (time,), and an ear.
+        audiogram: Audiogram of the ear.
         ear_name: Name of the ear, for the page.
         training_steps: Number of training steps, for the page.
         running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
     Returns:
-        The evaluation. Its ``details`` have ``gain_curves`` of the aids, ``perceived_levels`` in
-        24 bands in dB SPL, and ``speech_levels_hl``, the levels of the input and of the aid's
-        output in dB HL. Its ``sounds`` are those of the last utterance.
+        The evaluation. Its ``details`` have ``gain_curves`` of NAL-R and the aid, see
+        ``measure_aids``; ``perceived_levels``, by condition the levels that the ear perceives in
+        24 bands in dB SPL; and ``speech_levels_hl``, the levels of the input and of the aid's
+        output in these bands in dB HL. Its ``sounds`` are those of the last utterance.
+
+    Raises:
+        ValueError: The aid fails, or no output could be scored.
+        MissingExtraError: A package is not installed.
     """
     nal_r = NALR()
     conditions = [
@@ -104,7 +109,10 @@ def evaluate_trained_aid(
 
 
 def _read_items(audiogram: Audiogram) -> list[Item]:
-    """Read the utterances to score, each with a seed of its own."""
+    """Read the bundled validation utterances as items for an ear: 16 kHz, 65 dB SPL, at most 5 s.
+
+    The seed of an item, for HASPI's noise, is its number. Its facts are ``voice`` and ``severity``.
+    """
     items = []
     for number, path in enumerate(find_audio(bundled.SPEECH / "valid")):
         waveform, rate = read_audio(path)
@@ -118,9 +126,9 @@ def _read_items(audiogram: Audiogram) -> list[Item]:
 def _process(
     items: Sequence[Item], conditions: Sequence[Condition], audiogram: Audiogram
 ) -> tuple[_Signals, _Signals]:
-    """Return the outputs of all conditions, and what the ear perceives of them.
+    """Return the outputs of all conditions, and what the ear perceives of these outputs.
 
-    The perceived signals begin with those of a normal ear for clean speech.
+    The perceived signals also have what a normal ear perceives of clean speech, as the first entry.
     """
     perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
     outputs = {}
@@ -137,7 +145,10 @@ def _process(
 def _measure_gains(
     items: Sequence[Item], aids: Mapping[str, nn.Module], audiogram: Audiogram, ear_name: str
 ) -> list[dict[str, Any]]:
-    """Return the gain curves of the aids for the beginnings of the utterances."""
+    """Return the gain curves of the aids for the utterances, see ``measure_aids``.
+
+    All utterances are cut to the length of the shortest one.
+    """
     shortest = min(len(item.clean) for item in items)
     utterances = torch.stack([item.clean[:shortest] for item in items])
     return measure_aids(aids, {ear_name: audiogram}, measure_gain_curve, utterances, INPUT_LEVELS)
@@ -152,7 +163,11 @@ def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
 
 
 def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) -> ItemSounds:
-    """Return the sounds of the last utterance: perceived by the ear, and output of the aids."""
+    """Return the sounds of the last utterance for the page.
+
+    The first group has what ears perceive under each condition, the second one the outputs of the
+    aids.
+    """
     item = items[-1]
     aided = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
     groups = {

@@ -24,16 +24,16 @@ from hlsim.evaluation.study import Item
 from hlsim.progress import track
 
 SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
-"""Levels of the input in dB SPL that items for simulators have in turn."""
+"""Levels of the input in dB SPL through which items for simulators cycle."""
 
 INPUT_LEVELS = (50.0, 65.0, 80.0)
-"""Levels of the clean speech in dB SPL that items for hearing aids have in turn."""
+"""Levels of the clean speech in dB SPL through which items for hearing aids cycle."""
 
 _SNRS_DB = (2.5, 7.5, 12.5, 17.5)
-"""Signal-to-noise ratios in dB that noisy items have in turn, as in the paper."""
+"""Signal-to-noise ratios in dB through which noisy items cycle, as in the paper."""
 
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
-"""Bisgaard's audiograms that are part of every comparison of hearing aids."""
+"""Bisgaard's standard audiograms that are part of every comparison of hearing aids."""
 
 
 def draw_simulator_items(
@@ -49,21 +49,26 @@ def draw_simulator_items(
     """Draw the items on which simulators are compared: clips of speech, each for one ear.
 
     Half of the ears are from ``audiograms``, a quarter are mild standard ears (NH, N1, N2, S1) and
-    a quarter are random. With noise, every second item is noisy, at signal-to-noise ratios of 2.5,
-    7.5, 12.5 and 17.5 dB in turn. With five levels, the 80 noisy ones of 160 items contain each
-    combination of a ratio, a level and a quarter of the ears once.
+    a quarter are random. With noise, every second item is noisy, and the signal-to-noise ratios of
+    these items cycle through 2.5, 7.5, 12.5 and 17.5 dB. With five levels, the 80 noisy ones of 160
+    items contain each combination of a ratio, a level and one of the four quarters of the ears
+    once.
 
     Args:
         speech: Folder of recordings of clean speech.
         noise: Folder of recordings of noise, or None.
-        audiograms: CSV file of ears, or ``"standard"`` for Bisgaard's.
-        items: Number of items.
-        seconds: Length of an item in seconds.
+        audiograms: CSV file of ears, or ``"standard"`` for Bisgaard's, see ``read_audiograms``.
+        items: Number of items, 1 or more.
+        seconds: Length of each item in seconds, 0.02 or more.
         seed: Seed of all random draws.
-        levels: Levels of the signal with its noise in dB SPL, in turn.
+        levels: Levels of the speech with its noise in dB SPL, through which the items cycle.
 
-    Returns: Items at 16 kHz. Their facts are ``severity``, ``input_level`` (dB SPL), ``speech``
-        (clean or noisy), ``noise_snr`` (dB, NaN if clean) and ``audiogram``.
+    Returns: Items at 16 kHz, in pascals. Their facts are ``severity`` (degree of loss),
+        ``input_level`` (dB SPL), ``speech`` (clean or noisy), ``noise_snr`` (dB, NaN if clean) and
+        ``audiogram`` (thresholds in dB HL at the eight frequencies).
+
+    Raises:
+        ValueError: A folder or the file of ears cannot be read, or a number is out of range.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> settings = {"items": 2, "seconds": 1.0, "seed": 0}
@@ -100,23 +105,28 @@ def draw_aid_items(
     seed: int,
     levels: Sequence[float] = INPUT_LEVELS,
 ) -> list[Item]:
-    """Draw the items on which hearing aids are compared: clips of speech, for the ears in turn.
+    """Draw the items on which hearing aids are compared: clips of speech, each for one of the ears.
 
-    With noise, every second item is noisy, at signal-to-noise ratios of 2.5, 7.5, 12.5 and 17.5 dB
-    in turn. The noisy ones of ``8 * len(levels) * len(ears)`` items contain each combination of an
-    ear, a level and a ratio once; fewer items contain some of the combinations.
+    The items cycle through the ears. With noise, every second item is noisy, and the
+    signal-to-noise ratios of these items cycle through 2.5, 7.5, 12.5 and 17.5 dB. The noisy ones
+    of ``8 * len(levels) * len(ears)`` items contain each combination of an ear, a level and a ratio
+    once; fewer items contain some of the combinations.
 
     Args:
         speech: Folder of recordings of clean speech.
         noise: Folder of recordings of noise, or None.
         ears: Names and audiograms of the ears.
-        items: Number of items.
-        seconds: Length of an item in seconds.
+        items: Number of items, 1 or more.
+        seconds: Length of each item in seconds, 0.02 or more.
         seed: Seed of all random draws.
-        levels: Levels of the clean speech in dB SPL, in turn.
+        levels: Levels of the clean speech in dB SPL, through which the items cycle.
 
-    Returns: Items at 16 kHz. Their facts are ``ear``, ``severity``, ``input_level`` (dB SPL),
-        ``speech`` (clean or noisy), ``snr`` (dB, NaN if clean) and ``audiogram``.
+    Returns: Items at 16 kHz, in pascals. Their facts are ``ear`` (its name), ``severity`` (degree
+        of loss), ``input_level`` (dB SPL), ``speech`` (clean or noisy), ``snr`` (dB, NaN if clean)
+        and ``audiogram`` (thresholds in dB HL at the eight frequencies).
+
+    Raises:
+        ValueError: A folder cannot be read, or a number is out of range.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> settings = {"items": 1, "seconds": 1.0, "seed": 0}
@@ -141,12 +151,15 @@ def draw_aid_items(
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     """Return names and audiograms of the ears N2 to N6 and S1 to S3, and of those in a CSV file.
 
-    An ear of the file is named by its columns ``listener`` and ``ear``, and by the number of its
-    row if another ear has this name. A row with the name and the thresholds of an earlier ear is
-    left out.
+    The name of an ear in the file consists of its columns ``listener`` and ``ear``, and of the
+    number of its row if another ear has this name. A row with the name and the thresholds of an
+    earlier ear is left out.
 
     Args:
-        audiograms: CSV file of ears, or None.
+        audiograms: CSV file of ears, see ``read_audiograms``, or None.
+
+    Raises:
+        ValueError: The file cannot be read, or has a threshold above 100 dB HL.
 
     >>> [name for name, _ in read_ears(None)]
     ['N2', 'N3', 'N4', 'N5', 'N6', 'S1', 'S2', 'S3']
@@ -177,16 +190,18 @@ def ear_name(audiogram: Audiogram) -> str:
 def apply_treatments(
     items: Sequence[Item], treatments: Sequence[str], compensator: nn.Module | None = None
 ) -> list[Item]:
-    """Return the items with inputs that were processed in several ways, such as by an aid.
+    """Process the inputs of items in several ways, such as by an aid.
 
     Args:
-        items: Items without processing.
+        items: Items at 16 kHz, in pascals. They are not changed.
         treatments: Names of ways to process the input: ``"as-is"``, ``"louder"`` (by 20 dB),
             ``"nal-r"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
-        compensator: The compensator of the treatment ``"compensated"``.
+        compensator: Aid of the treatment ``"compensated"``, which is called with a waveform and an
+            ear.
 
-    Returns: Each item under each treatment in turn, which is its fact ``treatment``.
+    Returns: One item per item and treatment: all treatments of the first item, then all of the
+        second one. Each has the fact ``treatment``, the name of its treatment.
 
     Raises:
         ValueError: A treatment is unknown, or ``"compensated"`` lacks a compensator.
@@ -223,9 +238,13 @@ def _draw_clips(
     seconds: float,
     generator: torch.Generator,
 ) -> Iterator[tuple[int, Tensor, Tensor | None]]:
-    """Yield the number of each item, its speech, and for every second item a noise, else None.
+    """Yield the number, the clean speech and the noise of each item.
 
-    Shape of speech and noise: (time,).
+    The noise is None without a folder of noise, and for items with an even number. Speech and noise
+    have the shape (time,), and no calibrated level.
+
+    Raises:
+        ValueError: A number is out of range, or a folder has no usable audio.
     """
     check_number("items", items, 1)
     check_number("seconds", seconds, 0.02)
@@ -240,15 +259,17 @@ def _draw_clips(
 
 
 def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float, float, int]:
-    """Return level and SNR so that each ear occurs with all combinations.
+    """Choose the level and the SNR of an item, so that each ear gets all combinations of both.
 
     Args:
         ear: Number of the ear, or of the kind of ear.
         turn: Number of earlier items with this ear.
         levels: Levels in dB SPL.
 
-    Returns: The level, the SNR in dB, and by how many places the ratios are shifted in addition.
-        Without this shift, an even number of levels and the ratios would repeat together.
+    Returns:
+        The level in dB SPL; the SNR in dB; and an offset in the cycle of the SNRs, which is already
+        part of the SNR. With an even number of levels, the offset rises by 1 per cycle of the
+        levels, because some combinations would otherwise never occur. With an odd number, it is 0.
     """
     shift = 0 if len(levels) % 2 else turn // len(levels)
     number = ear + turn
@@ -256,7 +277,10 @@ def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float,
 
 
 def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor, float]:
-    """Return speech in noise at an SNR in dB, and this SNR, which is NaN without noise."""
+    """Add noise to speech at an SNR in dB, and return both the sum and the SNR.
+
+    Without noise (None), return the speech and NaN.
+    """
     if noise is None:
         return clean, math.nan
     # By RMS level. Trainings mix by active speech level, at which the same number is less noise.
@@ -264,7 +288,14 @@ def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor,
 
 
 def _facts(ear: Audiogram, level: float, snr_column: str, snr: float) -> dict[str, Any]:
-    """Return the facts of an item. ``snr_column`` is the name of the fact with the SNR."""
+    """Return the facts of an item, see ``draw_simulator_items``.
+
+    Args:
+        ear: Audiogram of the ear.
+        level: Level of the input in dB SPL.
+        snr_column: Name of the fact with the SNR.
+        snr: SNR in dB, or NaN for clean speech.
+    """
     return {
         "severity": ear.severity,
         "input_level": level,

@@ -1,7 +1,7 @@
 """Measures of a study: scores of speech for an ear, levels, loudness errors, and your own.
 
-A measure is a function of an ``Item`` and the output of a condition that returns numbers by the
-column of the study's table.
+A measure is a function of an ``Item`` and of the output of a condition. It returns a dict from
+columns of the study's table to numbers.
 """
 
 from __future__ import annotations
@@ -37,25 +37,27 @@ from hlsim.plugins import load_plugin
 from hlsim.torchtools import compute_once
 
 _CORRELATION_FLOOR = 0.2
-"""Correlation coefficient below which the lag of an output is unknown."""
+"""Largest magnitude of the correlation coefficient at which the lag of an output is unknown."""
 
 NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
 
 
 PRECISIONS = {32: torch.float32, 64: torch.float64}
-"""Precisions of the scores for an ear by their number of bits.
+"""Number types in which HASPI, HASQI and HAAQI can be computed, by their number of bits.
 
-Double precision takes twice the time. It gives the digits of pyclarity.
+64 bits take twice the time, and give the digits of pyclarity.
 """
 
 
 @dataclass(frozen=True)
 class _CleanSignal:
-    """Clean signal that equals another one with the same samples, so that it can be a key.
+    """Clean signal that is hashable, so that it can be an argument of ``compute_once``.
+
+    Two clean signals are equal if their digests are.
 
     Attributes:
-        digest: Hash of the samples and of their precision.
+        digest: Hash of the samples and of their number type.
         samples: The samples. Shape: (time,).
     """
 
@@ -82,18 +84,21 @@ def _prepare_quality(
 
 
 def _clean_signal(item: Item, precision: torch.dtype) -> _CleanSignal:
-    """Return the clean signal of an item in a precision."""
+    """Return the clean signal of an item, converted to a number type."""
     samples = item.clean.to(precision)
     return _CleanSignal(value_hash(samples), samples)
 
 
 def _noise(item: Item) -> dict[str, Any]:
-    """Return how the noise of an item's ear is drawn: as pyclarity draws it."""
+    """Return the arguments of a score with which it draws the ear's noise as pyclarity does."""
     return {"noise": "seeded", "seed": item.seed}
 
 
 def _haspi(precision: torch.dtype, item: Item, output: Tensor) -> Tensor:
-    """Compute HASPI. The clean signal is prepared once for all conditions and ears."""
+    """Compute HASPI as a scalar tensor.
+
+    A clean signal is prepared once for all conditions and ears.
+    """
     clean = _clean_signal(item, precision)
     reference = _prepare_haspi(clean, item.sample_rate, item.full_scale_spl)
     return reference.score(output.to(precision), item.ear, **_noise(item))
@@ -105,7 +110,10 @@ def _quality(
     item: Item,
     output: Tensor,
 ) -> Tensor:
-    """Compute HASQI or HAAQI. The clean signal is prepared once for all conditions of an ear."""
+    """Compute HASQI or HAAQI, depending on ``kind``, as a scalar tensor.
+
+    A clean signal is prepared once for all conditions of an ear.
+    """
     clean = _clean_signal(item, precision)
     reference = _prepare_quality(kind, clean, item.sample_rate, item.full_scale_spl, item.ear)
     return reference.score(output.to(precision), **_noise(item))
@@ -114,7 +122,7 @@ def _quality(
 def _score_for_ear(
     name: str, score: Callable[[Item, Tensor], Tensor], item: Item, output: Tensor
 ) -> Values:
-    """Compute a score that depends on the ear."""
+    """Compute a score that depends on the ear, as a dict with the one column ``name``."""
     return {name: float(score(item, output))}
 
 
@@ -123,19 +131,22 @@ _EAR_SCORES: dict[str, Callable[..., Tensor]] = {
     "hasqi": partial(_quality, HasqiReference),
     "haaqi": partial(_quality, HaaqiReference),
 }
-"""Functions of precision, item and output that compute the scores for an ear, by their names.
+"""Functions ``(number type, item, output) -> score`` of the scores for an ear, by name.
 
-They draw noise as pyclarity does, and round the rate to whole kHz as it does.
+They draw the ear's noise, and round the sample rate to whole kHz, as pyclarity does.
 """
 
 
 def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
-    """Compute STOI or PESQ, which do not depend on the ear."""
+    """Compute STOI or PESQ, which ignore the ear, as a dict with the one column ``name``."""
     return {name: score(output, item.clean, item.sample_rate)}
 
 
 def _ear_measure(name: str, bits: int = 32) -> Measure:
-    """Return the measure of HASPI, HASQI or HAAQI in a precision, which stored scores state."""
+    """Return the measure that computes HASPI, HASQI or HAAQI with 32 or 64 bits.
+
+    The number of bits is part of the key of stored scores.
+    """
     compute = partial(_score_for_ear, name, partial(_EAR_SCORES[name], PRECISIONS[bits]))
     packages = ["numpy"]  # NumPy draws the ear's noise.
     settings = f"{bits} bits"
@@ -160,23 +171,24 @@ MEASURES = {
         may_crash=True,
     ),
 }
-"""The scores of ``--measures``, each under its name. Higher is better for all of them.
+"""The scores of the option ``--measures``, each under its name. Higher is better for all of them.
 
-Those for an ear are computed in single precision.
+HASPI, HASQI and HAAQI are computed with 32 bits.
 """
 
 
 def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
-    """Return the measures of some names, without duplicates.
+    """Return the measures with the listed names, without duplicates.
 
     Args:
-        names: Names in ``MEASURES``, or ``package.module:name`` of your own functions.
+        names: Names in ``MEASURES``, or ``package.module:name`` of your own functions, see
+            ``load_measure``.
         precision: Number of bits of the numbers with which HASPI, HASQI and HAAQI are computed, 32
             or 64.
 
     Raises:
-        ValueError: There is no such measure or precision.
-        MissingExtraError: pesq is not installed.
+        ValueError: There is no such measure or precision, or your function cannot be loaded.
+        MissingExtraError: ``pesq`` is one of the names, and the package pesq is not installed.
 
     >>> [measure.name for measure in find_measures(["haspi", "hasqi"])]
     ['haspi', 'hasqi']
@@ -196,9 +208,12 @@ def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
 
 
 class _PluginMeasure:
-    """Function ``(item, output) -> numbers by column`` of a user.
+    """Measure that a user has written, ``(item, output) -> dict from column to number``.
 
-    It is pickled by its name, so that other processes import it in the same way.
+    It is pickled by its name, so that another process imports the function again.
+
+    Raises:
+        ValueError: The function cannot be loaded, or a call of it returns no dict.
     """
 
     def __init__(self, name: str) -> None:
@@ -221,7 +236,11 @@ class _PluginMeasure:
 
 
 def load_measure(name: str) -> Measure:
-    """Load a measure of your own, a function ``(item, output) -> dict of numbers``.
+    """Load a measure of your own, a function ``(item, output) -> dict from column to number``.
+
+    The function is not tried: one that returns something else fails in the study. Its values are
+    stored only if it has the attribute ``fingerprint``, such as a version, which you change with
+    its code.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -237,7 +256,7 @@ def load_measure(name: str) -> Measure:
 
 
 def column_title(column: str) -> str:
-    """Return the title, in tables and plots, of a column with scores.
+    """Return the title of a column of scores, as tables and plots show it.
 
     >>> column_title("haspi"), column_title("crest factor")
     ('HASPI', 'crest factor')
@@ -261,24 +280,30 @@ def _measure_lag(item: Item, output: Tensor) -> Values:
 
 
 ALIGNMENT = Measure("alignment", _measure_lag, uses_facts=False, scores=())
-"""Lag of an output behind the clean speech in ms, if the two are similar enough to find it."""
+"""Column ``lag_ms``: lag of an output behind the clean speech in ms, see ``find_lag``.
+
+The column is left out if output and clean speech are not similar enough to find the lag.
+"""
 
 LEVELS = Measure("levels", _measure_levels, uses_facts=False, scores=())
-"""RMS levels of output and clean speech in dB SPL, and the level of RMS 1.0."""
+"""Columns ``level`` and ``clean_level``: RMS levels of output and clean speech in dB SPL.
+
+The column ``full_scale_spl`` has the level in dB SPL of a signal whose RMS is 1.0.
+"""
 
 
 def find_lag(output: Tensor, clean: Tensor) -> int | None:
     """Return by how many samples an output is later than the clean speech.
 
-    The lag is that of the largest cross-correlation.
+    It is the lag at which the magnitude of the cross-correlation of both is largest.
 
     Args:
         output: The output. Shape: (time,).
         clean: Clean speech. Shape: (time,).
 
     Returns:
-        The lag, negative if the output is early, or None if the correlation coefficient at this lag
-        is below 0.2.
+        The lag, negative if the output is early, or None if the magnitude of the correlation
+        coefficient at this lag is not above 0.2.
 
     >>> speech = torch.randn(1000, generator=torch.Generator().manual_seed(0))
     >>> find_lag(torch.nn.functional.pad(speech, (32, 0)), speech)
@@ -297,8 +322,8 @@ def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
 
     Args:
         signal: Signals in pascals. Shape: (..., time).
-        ear: The audiogram.
-        sample_rate: Sample rate in Hz.
+        ear: Audiogram of the ear.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns: The perceived signals in pascals. Shape: (..., time).
 
@@ -325,23 +350,28 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
 
 
 PERCEPTION = Measure("perception", _measure_perception, uses_facts=False, scores=())
-"""Errors of an output as perceived through the exact MSBG, in dB, and its peak in dB SPL.
+"""Errors in dB of what an ear perceives of an output, by the exact MSBG, and the output's peak.
 
-``loudness_error`` is the perceived level minus that of the input, with its noise, for a normal ear.
-``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by the median
-difference of levels in 24 bands, and by ``HearingLossLoss(criterion="bands")``.
+``loudness_error`` is the level that the ear perceives of the output, minus the level that a normal
+ear perceives of the input with its noise. ``band_error`` and ``loss_msbg`` compare the perceived
+output with clean speech as a normal ear perceives it: ``band_error`` is the median over 24 bands
+and all frames of the absolute difference in level, ``loss_msbg`` the value of
+``HearingLossLoss(criterion="bands")``. ``peak`` is the largest magnitude of the output in dB
+relative to 20 micropascals.
 """
 
 
 def network_loss(simulator: nn.Module) -> Measure:
     """Return the measure of the column ``loss_neuro``, the training loss of an aid in dB.
 
-    The loss is ``HearingLossLoss(criterion="bands")`` through a network, for the output and the ear
-    of the item, with the clean speech as a normal ear perceives it. The column ``loss_msbg``
-    of the measure ``PERCEPTION`` has the same loss through the exact MSBG.
+    The loss is that of ``HearingLossLoss(criterion="bands")`` with a network as the simulator: it
+    compares what the ear perceives of the output with what a normal ear perceives of the clean
+    speech. The column ``loss_msbg`` of the measure ``PERCEPTION`` is the same loss with the exact
+    MSBG, so that both show whether an aid exploits errors of the network.
 
     Args:
-        simulator: The network, a Neuro-MSBG for the sample rate of the items.
+        simulator: The network, a Neuro-MSBG for the sample rate of the items and signals in
+            pascals.
 
     >>> network_loss(nn.Identity()).name
     'network loss'
@@ -357,17 +387,18 @@ def network_loss(simulator: nn.Module) -> Measure:
 
 
 def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:
-    """Compute the median absolute difference between the levels of ERB-wide bands, in dB.
+    """Compute the median absolute difference between the levels of two signals in 24 bands, in dB.
 
-    Only those bands and frames are used in which a normal ear finds the reference audible.
+    The median is over all bands and frames of ``band_levels`` in which a normal ear finds the
+    reference audible.
 
     Args:
-        perceived: Output as an ear perceives it, in pascals. Shape: (time,).
+        perceived: Output as the impaired ear perceives it, in pascals. Shape: (time,).
         reference: Clean speech as a normal ear perceives it, in pascals. Shape: (time,).
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: Nothing is audible.
+        ValueError: Nothing of the reference is audible.
     """
     levels = band_levels(perceived, sample_rate)
     reference_levels = band_levels(reference, sample_rate)

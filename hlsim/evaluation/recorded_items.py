@@ -1,4 +1,4 @@
-"""Items that were recorded in files, which folders, a manifest or a table of pandas name.
+"""Items whose outputs were recorded in files, which folders, a manifest or a DataFrame list.
 
 A manifest is a CSV file with one row for each output file::
 
@@ -6,11 +6,11 @@ A manifest is a CSV file with one row for each output file::
     L1,left,unaided,clean/s01.flac,noisy/s01.flac,5,35,35,...,65
     L1,left,NAL-R,clean/s01.flac,nalr/L1-left/s01.flac,5,35,35,...,65
 
-It needs the columns ``condition``, ``clean`` and ``processed``; paths are relative to the root. It
-may have ``listener``, ``ear`` (left or right), ``item`` and ``snr`` (dB). Rows with the same
-listener, ear, clean file, item and SNR form one item. Its audiogram is in columns ``hl_250`` and so
-on, as in tables of ears, in a column ``audiogram`` by its standard name, or in a second file by
-``listener`` and ``ear``.
+It needs the columns ``condition``, ``clean`` and ``processed``, the file of the output; paths are
+relative to the root. It may have ``listener``, ``ear`` (left or right), ``item`` (name of the
+utterance) and ``snr`` (dB). Rows with the same listener, ear, clean file, item and SNR form one
+item. Its audiogram is in columns ``hl_250`` and so on, as in tables of ears, in a column
+``audiogram`` by its standard name, or in a second file by ``listener`` and ``ear``.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 _REQUIRED_COLUMNS = ("condition", "clean", "processed")
-"""Columns that every row of a manifest must fill."""
+"""Columns of a manifest that need a value in every row."""
 
 _COLUMNS = (*_REQUIRED_COLUMNS, "listener", "ear", "item", "snr", "audiogram", "spl")
-"""Columns of a manifest whose meaning is known, beside those of thresholds."""
+"""Columns of a manifest that hlsim understands, beside those of thresholds."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,15 @@ class RecordedItem:
         utterance: Name of the utterance, the same for both ears of a listener.
         clean: File of clean speech.
         outputs: File of the output under each condition, by the name of the condition, or the error
-            because of which there is none.
-        audiogram: The ear.
+            that prevented this output.
+        audiogram: Audiogram of the ear.
         listener: Name of the listener; empty if unknown.
         ear: ``"left"``, ``"right"`` or empty, which selects the channel of a file with two
             channels.
         snr: Signal-to-noise ratio in dB; NaN if unknown, infinite for speech in quiet.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
-        spl: Level of the clean file in dB SPL over all its channels, which replaces
-            ``full_scale_spl``; None uses ``full_scale_spl``.
+        spl: Level of the clean file in dB SPL, over all its channels, from which its full scale and
+            that of its outputs follow. None uses ``full_scale_spl``.
         seed: Seed of the study. The seed of an item depends on this seed and on the contents of its
             clean file.
 
@@ -85,28 +85,31 @@ class RecordedItem:
 
     @property
     def name(self) -> str:
-        """Listener, ear, utterance and SNR, if they are known."""
+        """Name in tables: listener, ear, utterance and SNR, as far as they are known."""
         return join_name(self.listener, self.ear, self.utterance, self.snr)
 
     @property
     def both_ears_name(self) -> str:
-        """Listener, utterance and SNR, if they are known."""
+        """Name without the ear: listener, utterance and SNR, as far as they are known."""
         return join_name(self.listener, self.utterance, self.snr)
 
     @property
     def clean_name(self) -> str:
-        """File and ear of the clean speech, which several listeners may share."""
+        """Path of the clean file with the ear; several listeners may share both."""
         return f"{self.clean} {self.ear}"
 
     @property
     def utterance_key(self) -> tuple[str, str, float | None]:
-        """Listener, utterance and SNR, which both ears share, as a key that equals itself."""
+        """Listener, utterance and SNR, by which the two ears of an utterance are found.
+
+        An unknown SNR is None here, because NaN does not equal itself.
+        """
         snr = None if math.isnan(self.snr) else self.snr
         return self.listener, self.utterance, snr
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Columns of the table that describe the recording, without its name."""
+        """Columns of the table that describe the recording, except its name."""
         return {
             "listener": self.listener,
             "ear": self.ear,
@@ -117,7 +120,12 @@ class RecordedItem:
         }
 
     def digest(self, condition: str) -> str:
-        """Return a hash of both files, the ear, the level and the seed."""
+        """Return a hash of the clean file, the output under a condition, the ear, level and seed.
+
+        Raises:
+            ValueError: There is no output under this condition.
+            OSError: A file cannot be read.
+        """
         files = [_file_hash(self.clean), _file_hash(self._output_file(condition))]
         level = [self.full_scale_spl, self.spl]
         return value_hash([files, level, self.ear, self.audiogram.to_dict(), self.seed])
@@ -126,7 +134,8 @@ class RecordedItem:
         """Read the clean speech. Outputs are read when they are measured.
 
         Raises:
-            ValueError: The file cannot be read.
+            ValueError: The file cannot be read, it is not known which channel is that of the ear,
+                or ``spl`` does not fit the file.
         """
         waveform, rate = read_audio(self.clean)
         clean = self._select_channel(self.clean, waveform)
@@ -169,14 +178,16 @@ class RecordedItem:
         return self._select_channel(path, waveform)
 
     def _select_channel(self, path: Path, waveform: Tensor) -> Tensor:
-        """Return the ear's channel in float64. Shape: (channels, time) -> (time,).
+        """Return the samples of the ear in float64. Shape: (channels, time) -> (time,).
+
+        Of two channels, the first is the left ear. A single channel serves any ear.
 
         Args:
             path: File of the waveform, for the message.
             waveform: Samples of all channels.
 
         Raises:
-            ValueError: It is not known which channel is that of the ear.
+            ValueError: There are more than two channels, or two and no name of the ear.
         """
         channels = len(waveform)
         if channels > 2 or (channels == 2 and not self.ear):
@@ -188,7 +199,10 @@ class RecordedItem:
 
 
 def _file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file, which is read again only if its size or times have changed."""
+    """Return the SHA-256 of a file in hexadecimal.
+
+    The file is read again only if its size or its times have changed.
+    """
     state = path.stat()
     # Copying may set the time of modification, but not that of the change.
     return _hash_of_state(path, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
@@ -200,7 +214,7 @@ def _hash_of_state(path: Path, *state: int) -> str:
 
 
 def join_name(*parts: str | float) -> str:
-    """Join the known parts of an item's name. A number is an SNR in dB.
+    """Join the known parts of an item's name by spaces. A number is an SNR in dB; NaN is unknown.
 
     >>> join_name("L1", "", "s01", 5.0), join_name("s01", math.nan), join_name("s01", math.inf)
     ('L1 s01 5 dB', 's01', 's01 in quiet')
@@ -232,8 +246,8 @@ def read_folders(
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: The names differ, two files of a folder differ only in their extension, or a
-            folder does not exist or has no audio.
+        ValueError: The names of the files differ between folders, two files of a folder differ only
+            in their extension, or a folder does not exist or has no audio.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder, ears = EXAMPLE_FILE.parent, [("L1", "left", Audiogram.standard("N3"))]
@@ -263,13 +277,17 @@ def read_folders(
 def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
     """Return name of the listener, name of the ear and audiogram of each ear of a table.
 
-    A row without a listener is called by its number.
+    The listener of a row without a name is called ``row 3``, by the number of the row.
 
     Args:
         audiograms: Table of ears, see ``read_audiograms``, or Clarity's ``listeners.json``.
 
+    Returns:
+        One tuple (listener, ear, audiogram) per ear, where ``ear`` is ``"left"``, ``"right"`` or
+        empty.
+
     Raises:
-        ValueError: An ear has several rows.
+        ValueError: The table cannot be read, or an ear has several rows.
 
     >>> read_named_ears("standard")[0]
     ('N1', '', Audiogram('N1'))
@@ -294,10 +312,10 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
 
 
 def _files_by_name(folder: str | Path) -> dict[str, Path]:
-    """Return the audio files of a folder by their path below it, without extension.
+    """Return the audio files of a folder, by their path below it without extension.
 
     Raises:
-        ValueError: Two files differ in their extension only.
+        ValueError: Two files differ only in their extension.
     """
     files: dict[str, Path] = {}
     for path in find_audio(folder, by_name=True):
@@ -328,7 +346,8 @@ def read_recordings(
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: A row is not valid; the message names its line.
+        ValueError: A file cannot be read, a required column is missing, or a row is not valid; the
+            message names the line.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -366,7 +385,7 @@ def read_recordings(
 
 
 def _merge(earlier: RecordedItem, recording: RecordedItem) -> RecordedItem:
-    """Return a recording with the outputs of an earlier one of the same item.
+    """Return a recording with its own outputs and those of an earlier one of the same item.
 
     Raises:
         ValueError: Both have an output under one condition, or their ears differ.
@@ -391,14 +410,14 @@ def _read_row(
     audiogram: Audiogram | None,
     settings: Mapping[str, Any],
 ) -> RecordedItem:
-    """Return the recording of a row of a manifest, which has one output.
+    """Return the recording that a row of a manifest describes, with one output.
 
     Args:
         row: Texts by column.
         root: Folder to which the paths are relative.
         listeners: Listeners by their name.
         audiogram: The ear if the row has no audiogram and ``listeners`` does not have its listener.
-        settings: Further arguments of the recording.
+        settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recording.
 
     Raises:
         ValueError: A value is missing or not understood, or the ear is given twice or not at all.
@@ -443,10 +462,10 @@ def _read_row(
 
 
 def _parse_snr(text: str) -> float:
-    """Return the SNR in dB of a text such as "5", "2,5 dB" or "inf" (in quiet); NaN of no text.
+    """Return the SNR in dB of a text such as "5", "2,5 dB" or "inf" (in quiet); NaN if it is empty.
 
     Raises:
-        ValueError: The text is no number.
+        ValueError: The text is not a number, or is NaN or minus infinity.
     """
     number = text.lower().removesuffix("db").strip().replace(",", ".")
     if not number:

@@ -1,4 +1,4 @@
-"""The study of ``haspi-report``: outputs that were recorded in files are scored and compared."""
+"""The study of ``haspi-report``: it scores and compares outputs that were recorded in files."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ LATE_MS = 4.0
 """Lag of an output in ms above which a report warns."""
 
 _INTERAURAL_SECONDS = 0.002
-"""Lag of the speech at one ear behind that at the other above which they are not of one sound."""
+"""Largest lag in seconds between the clean files of both ears if they contain the same sound."""
 
 _EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level")
-"""Columns of the table that describe the item of one ear."""
+"""Columns of the table that describe the item of one ear of a listener."""
 
 
 def haspi_report(
@@ -69,7 +69,7 @@ def haspi_report(
         clean: Folder of clean speech.
         before, after: Folders of the speech before and after a treatment, such as an aid, with
             files of the same names. Without ``before``, there are scores and no comparison.
-        audiogram: The ear of all files, or of those rows of the manifest that have no ear.
+        audiogram: The ear of all files, or of those rows of the manifest that have no audiogram.
         conditions: Folder of the outputs of each condition, instead of ``before`` and ``after``,
             such as ``{"noisy": "noisy", "A": "system-a", "B": "system-b"}``.
         audiograms: Table of ears. With folders, each file is scored for each of these ears, see
@@ -160,10 +160,12 @@ def haspi_report(
 def _read_ears_of_folders(
     audiogram: Audiogram | None, audiograms: Any
 ) -> list[tuple[str, str, Audiogram]]:
-    """Return the ears of files in folders, each with the names of listener and ear.
+    """Return the ears of files in folders, as tuples (listener, ear, audiogram).
+
+    Names of listener and ear may be empty.
 
     Raises:
-        ValueError: There is neither an audiogram nor a table of them, or both.
+        ValueError: There is neither an audiogram nor a table of audiograms, or both.
     """
     if (audiogram is None) == (audiograms is None):
         raise ValueError(
@@ -200,7 +202,7 @@ def score_recordings(
         better_ear: Whether to use the better ear's score of each utterance.
         planned: Planned comparisons; by default that of the first with the last condition by the
             first measure.
-        listen: Number of items with sounds.
+        listen: Number of items with sounds for the players of a page.
         played: Names of the conditions with sounds, by default all.
         running: Argument ``store``, a file of scores or None, and the arguments ``jobs``, ``dask``
             and ``progress`` of ``run_study``.
@@ -209,8 +211,10 @@ def score_recordings(
         The evaluation. With ``better_ear``, its table has one row per utterance and condition.
 
     Raises:
-        ValueError: Nothing could be scored, or ``better_ear`` is set and an utterance lacks an ear
-            or has different speech for both ears.
+        ValueError: There is no such measure or precision, nothing could be scored, or
+            ``better_ear`` is set and an utterance lacks an ear or has different speech for both
+            ears.
+        MissingExtraError: The package of a measure is not installed.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> outputs = {"unaided": EXAMPLE_FILE}
@@ -242,14 +246,17 @@ def score_recordings(
 
 
 def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
-    """Return for each recording the number of its utterance, from 0, which two ears share.
+    """Find the two recordings, one for each ear, of every utterance.
 
     Recordings with the same listener, utterance and SNR belong together. If these are more than
-    two, those with the same clean file do.
+    two, those of them with the same clean file belong together.
+
+    Returns:
+        For each recording, the number of its utterance, from 0, which both ears share.
 
     Raises:
-        ValueError: A group is not one left and one right ear, or the clean files of its ears differ
-            in speech or are shifted by more than 2 ms.
+        ValueError: Recordings that belong together are not one left and one right ear, or their
+            clean files differ in speech or are shifted by more than 2 ms.
     """
     groups: dict[Any, list[RecordedItem]] = {}
     for recording in recordings:
@@ -274,9 +281,10 @@ def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
 
 
 def _check_same_speech(first: RecordedItem, second: RecordedItem) -> None:
-    """Raise ValueError if two ears have clean files of their own with different speech.
+    """Raise ValueError if the two ears of an utterance have clean files with different speech.
 
-    A file that cannot be read is not compared, because its item will be a failure.
+    Nothing is raised if both share one file, or if a file cannot be read, because its item then
+    becomes a failure of the study.
     """
     if first.clean == second.clean:
         return
@@ -294,11 +302,12 @@ def _check_same_speech(first: RecordedItem, second: RecordedItem) -> None:
 
 
 def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[str]) -> DataFrame:
-    """Keep the better ear's score of each utterance and condition.
+    """Merge the rows of both ears of each utterance and condition to one row with the better scores.
 
-    Each score has its own better ear. It is missing if it lacks for one of the ears, because the
-    other one may be the worse ear. Values that are not scores are those of the better ear by the
-    first score that is not missing, and of the left ear if both are equal.
+    Each score is the higher one of both ears, so different scores may come from different ears. A
+    score is missing if one ear lacks it, because the other one may be the worse ear. All other
+    values of the row come from one ear: the better one by the first score that both ears have, and
+    the left one if this score is equal or missing.
 
     Args:
         table: Table of ``run_study`` for recordings of both ears of each utterance.
@@ -306,8 +315,10 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
         scores: Columns of scores.
 
     Returns:
-        The table with one row per utterance and condition. Facts of the item are those of the
-        better ear in the last condition, whose number is in the column ``source``.
+        The table with one row per utterance and condition; ``item`` is the number of the utterance.
+        Facts of the ear, such as ``audiogram``, are the same in all rows of an utterance: those of
+        the better ear under the last condition. Its number in ``table`` is in the column
+        ``source``.
     """
     rows = table.assign(source=table["item"], item=[utterances[i] for i in table["item"]])
     left, right = (
@@ -336,7 +347,7 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
 
 
 def _describe_lags(table: DataFrame) -> list[str]:
-    """Return a sentence about outputs that are late or early, or none if all are aligned."""
+    """Return a list with a note about outputs that are late or early, or an empty list."""
     lags = table.get("lag_ms", [])
     late = table[[abs(lag) > LATE_MS for lag in lags]] if len(lags) else table[:0]
     if late.empty:

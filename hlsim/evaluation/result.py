@@ -1,4 +1,4 @@
-"""An evaluation: it runs a study, and holds its table, the comparisons and the settings."""
+"""An evaluation: results of a study, with its table, comparisons and settings."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ class ItemSounds:
 
     Attributes:
         name: Name of the item.
-        ear: The audiogram.
+        ear: Audiogram of the ear.
         sample_rate: Sample rate in Hz.
-        groups: Signals by label, for each group by its heading, which may be empty. Shape of each
-            signal: (time,).
-        failures: Reason for each label without a sound.
-        change: Change of the score between the two conditions of the headline comparison; None if
+        groups: Signals as a dict from the heading of a group, which may be empty, to a dict from
+            label to signal. Shape of each signal: (time,).
+        failures: Reason why there is no sound, by label.
+        change: Change of the score between the two conditions of ``Evaluation.headline``; None if
             items are not ranked by it.
-        rank: Place of the item in the order of the changes, from 1, and the number of items.
+        rank: Place of the item when all items are sorted by ``change``, from 1 for the largest
+            rise, and the number of items; (0, 0) if items are not ranked.
 
     >>> import torch
     >>> signals = {"tone": torch.ones(8)}
@@ -55,7 +56,7 @@ class ItemSounds:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A finished study.
+    """Results of a study, with all that a page or a JSON file shows.
 
     Attributes:
         items: Items of the study: speech, the input of the aid, and an audiogram each.
@@ -68,8 +69,7 @@ class Evaluation:
         notes: Sentences with which the page of the evaluation begins.
         details: Further results for ``report.json`` and the page, such as gain curves, each under
             its name.
-        groups: The same evaluation for a part of the items, such as noisy speech, by the name of
-            the part.
+        groups: Evaluations of parts of the items, such as noisy speech, by the name of the part.
         sounds: Sounds of some items, for the players of a page.
 
     >>> import pandas
@@ -113,7 +113,9 @@ class Evaluation:
             running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
         Raises:
-            ValueError: No output could be scored.
+            ValueError: No output could be scored, or an argument is not valid, see ``run_study``.
+            OSError: The store cannot be read or written.
+            MissingExtraError: A package is not installed.
         """
         table, measures = run_measures(items, conditions, measures, ScoreStore(store), **running)
         evaluation = cls(items, conditions, measures, table, settings=settings)
@@ -121,7 +123,10 @@ class Evaluation:
         return evaluation
 
     def check_scores(self) -> None:
-        """Raise ValueError, with the reason for the first item, if the table has no score."""
+        """Raise ValueError if the table has no score at all.
+
+        The message has the reason for the first item.
+        """
         if self.table.reindex(columns=self.scores).isna().all(axis=None):
             if self.failures.empty:
                 raise ValueError("the measures returned no score; return one or more numbers")
@@ -133,12 +138,15 @@ class Evaluation:
 
     @property
     def names(self) -> list[str]:
-        """Names of the conditions."""
+        """Names of the conditions, in their order."""
         return [condition.name for condition in self.conditions]
 
     @property
     def aids(self) -> list[str]:
-        """Names of the aids: conditions of the kind ``aid``, which are compared with the others."""
+        """Names of the conditions of the kind ``aid``: the aids under test.
+
+        Conditions of other kinds, such as ``unaided``, are those that the aids are compared with.
+        """
         return [condition.name for condition in self.conditions if condition.kind == "aid"]
 
     @property
@@ -158,30 +166,34 @@ class Evaluation:
 
     @property
     def failures(self) -> DataFrame:
-        """Rows of the table that lack values, with the reason in the column ``failure``."""
+        """Rows of the table that lack values; the column ``failure`` has the reason."""
         return self.table[self.table["failure"].notna()]
 
     @property
     def versions(self) -> dict[str, str]:
-        """Installed versions of hlsim, of SciPy and of the packages that the measures use."""
+        """Installed versions of hlsim, SciPy and the packages that the measures use, by name."""
         packages = {package for measure in self.measures for package in measure.packages}
         versions = {package: metadata.version(package) for package in sorted(packages | {"scipy"})}
         return {"hlsim": __version__, **versions}
 
     def wide(self, column: str) -> DataFrame:
-        """Return a column of the table, such as ``"haspi"``, by item and condition.
+        """Return a column of the table, such as ``"haspi"``, with one column per condition.
 
-        The result has one row per item and one column per condition, and NaN where a value is
-        missing.
+        The result has one row per item, and NaN where a value is missing.
         """
         table = self.table.pivot(index="item", columns="condition", values=column)
         return table.reindex(columns=self.names)
 
     def words(self, before: str, after: str) -> WordsChange:
-        """Predict from HASPI how many words a listener understands under two conditions.
+        """Predict from HASPI which share of words a new listener understands under two conditions.
+
+        Only items with HASPI under both conditions are used.
 
         Args:
             before, after: Names of the conditions, which may be the same.
+
+        Returns:
+            Both shares of words, 0 to 1, and their difference with its interval.
         """
         scores = self.wide("haspi").dropna(subset=[before, after]).clip(0.0, 1.0)
         return words_change(scores[before].to_numpy(), scores[after].to_numpy())
@@ -189,9 +201,9 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``report.json``, with None in place of NaN and infinity.
 
-        The keys are the attributes ``settings`` and ``notes``, ``versions`` of packages,
-        ``conditions``, ``comparisons``, ``groups`` with comparisons of parts of the items, the keys
-        of ``details``, and ``rows``, one dictionary per row of ``table``.
+        The keys are ``settings``, ``versions`` and ``notes`` (the attributes), ``conditions``,
+        ``comparisons``, ``groups`` (a list of comparisons for each part of the items), the keys of
+        ``details``, and ``rows``, one dict per row of ``table``.
         """
         fields = ("name", "kind", "of")
         conditions = [{name: getattr(c, name) for name in fields} for c in self.conditions]
@@ -214,7 +226,7 @@ class Evaluation:
 
 
 def _replace_nonfinite(value: Any) -> Any:
-    """Return a value for JSON, with None in place of numbers that JSON cannot represent."""
+    """Return a nested value for JSON, with None in place of NaN and infinity."""
     if isinstance(value, Mapping):
         return {key: _replace_nonfinite(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -70,11 +70,12 @@ def evaluate_simulators(
         measures: Further measures, ``package.module:name``.
         items: Number of items, each of which is measured for each of ``inputs``.
         seconds: Length of an item in seconds; PESQ and STOI need 2 or more.
-        levels: Levels of the input in dB SPL that the items have in turn.
+        levels: Levels of the input in dB SPL, through which the items cycle.
         inputs: Names of ways to process the input before the simulator: ``"as-is"``, ``"louder"``
             (by 20 dB), ``"nal-r"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
-        compensator: Module of the treatment ``"compensated"``.
+        compensator: Aid of the treatment ``"compensated"``, which is called with a waveform and an
+            ear.
         seed: Seed of all random draws.
         listen: Whether (1) or not (0) an item has sounds for the player of a page.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
@@ -82,13 +83,13 @@ def evaluate_simulators(
             and of all scores.
 
     Returns:
-        The evaluation with one group per name in ``inputs``. The SNR of a simulator is that of the
-        teacher's output relative to the simulator's error. In each group, the SNR of every
-        simulator is compared with that of the first one in ``simulators``.
+        The evaluation with one group per name in ``inputs``. The column ``snr`` of its table is the
+        power of the teacher's output over that of the simulator's error, in dB. In each group, the
+        SNR of every simulator is compared with that of the first one in ``simulators``.
 
     Raises:
         ValueError: Data or settings are not valid, or no item has a value.
-        MissingExtraError: pandas is not installed. Without pesq, that measure is left out.
+        MissingExtraError: pandas or pystoi is not installed. Without pesq, PESQ is left out.
 
     >>> from hlsim import MSBG
     >>> from hlsim.data.bundled import EXAMPLE_FILE
@@ -135,12 +136,16 @@ def _teacher_output(teacher: nn.Module, item: Item) -> Tensor:
 def _fidelity_to(teacher_name: str) -> Measure:
     """Return the measure that compares a simulator's output with that of a teacher.
 
-    Its values are the SNR, the scaled mean squared error, the error of third-octave bands, and STOI
-    and PESQ of teacher and simulator against the clean speech, if they are defined. PESQ is left
-    out if pesq is not installed.
+    Its columns are ``snr`` (dB), ``raw_mse`` and ``band_error`` (dB, over third octaves), and
+    ``stoi_teacher``, ``stoi_simulator``, ``pesq_teacher`` and ``pesq_simulator``: STOI and PESQ of
+    both outputs against the clean speech. STOI and PESQ are left out where they are not defined,
+    and PESQ also if pesq is not installed.
 
     Args:
         teacher_name: Name of the teacher, see ``evaluate_simulators``.
+
+    Raises:
+        ValueError: There is no such teacher.
     """
     teacher = load_simulator(teacher_name)
     packages = ["pystoi"]
@@ -169,7 +174,7 @@ def _fidelity_to(teacher_name: str) -> Measure:
 
 
 def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
-    """Compute how well the scores of a simulator's outputs agree with those of the teacher's.
+    """Compute how well scores of a simulator's outputs agree with those of the teacher's outputs.
 
     Args:
         rows: Rows of the table of ``evaluate_simulators`` for one simulator.
@@ -195,9 +200,9 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
 
 
 def _example_sounds(evaluation: Evaluation) -> ItemSounds:
-    """Return the sounds of an item: input, and outputs of the teacher and of the simulators.
+    """Return the sounds of one item: its input, and the outputs of the teacher and all simulators.
 
-    The item has the first treatment and, of the items with this treatment, the highest level.
+    It is the item with the highest level among those of the first treatment.
     """
     rows = next(iter(evaluation.groups.values())).table.dropna(subset="snr")
     item = evaluation.items[rows["item"][rows["input_level"].idxmax()]].load()

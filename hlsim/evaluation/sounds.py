@@ -1,4 +1,4 @@
-"""Sounds of a study that a page plays: items of several conditions as an ear perceives them."""
+"""Sounds of a study for the players of a page: outputs of conditions, as an ear perceives them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NORMAL_EAR = "normal ear (the goal)"
 """Label of clean speech as a normal ear perceives it."""
 
 _LONGEST_SECONDS = 8.0
-"""Length in seconds after which the sounds of an item are cut."""
+"""Length in seconds to which the sounds of an item are cut."""
 
 
 def perceive_items(
@@ -27,14 +27,14 @@ def perceive_items(
 ) -> list[ItemSounds]:
     """Return the sounds of some items as their ear perceives them, by the exact MSBG.
 
-    Items are ranked by how much their score changes between the two conditions of the evaluation's
-    headline comparison, largest gain first. The items are evenly spaced in this ranking. Their
-    sounds are what a normal ear perceives of the clean speech, and what the impaired ear perceives
-    under each condition.
+    Items are ranked by how much their score changes between the two conditions of
+    ``evaluation.headline``, the largest rise first. The returned items are evenly spaced in this
+    ranking. The sounds of an item are what a normal ear perceives of the clean speech, and what the
+    impaired ear perceives of the output of each condition.
 
     Args:
-        evaluation: The evaluation.
-        count: Number of items.
+        evaluation: Evaluation with comparisons.
+        count: Number of items to return, if there are as many.
         conditions: Names of the conditions with sounds; all of them if empty.
 
     Returns: The sounds, or an empty list if there is no comparison.
@@ -84,9 +84,15 @@ def perceive_items(
 def _perceive(
     item: Item, conditions: Sequence[Condition]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return the perceived signals of an item by label, and the reasons of failures.
+    """Return the perceived signals of an item by label, and the reasons of failures by condition.
 
-    Shape of each signal: (time,), at most 8 s.
+    Args:
+        item: The item.
+        conditions: Conditions whose outputs are perceived.
+
+    Returns:
+        Signals in pascals, each with shape (time,) and at most 8 s long; and the reasons why others
+        are missing.
     """
     gain, end = gain_to_pascals(item.full_scale_spl), int(_LONGEST_SECONDS * item.sample_rate)
     clean = item.clean[:end].float() * gain
@@ -103,14 +109,14 @@ def _perceive(
 def try_conditions(
     conditions: Sequence[Condition], process: Callable[[Condition], Tensor]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Compute a sound under each condition, without gradients.
+    """Compute a sound under each condition, without gradients; an error does not end the others.
 
     Args:
         conditions: The conditions.
         process: Function that returns the sound of a condition. Shape: (time,).
 
     Returns:
-        The sounds, and for conditions without one the reason, each by the name of the condition.
+        By the name of the condition, the sounds, and for conditions without one the reason.
 
     >>> try_conditions([Condition("a")], lambda condition: torch.ones(2))[0]
     {'a': tensor([1., 1.])}

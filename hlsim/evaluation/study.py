@@ -39,19 +39,19 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Values = Mapping[str, float | str]
-"""Values that a measure returns for one output, by the column of the table."""
+"""Values that a measure returns for one output: a dict from column of the table to value."""
 
 _Results = dict[tuple[int, str, str], Values | str]
-"""Values, or the reason why there are none, by number of item, condition and measure."""
+"""Values, or the reason why there are none, under (number of the item, condition, measure)."""
 
 _RESERVED_COLUMNS = ("item", "name", "condition", "failure", "source", "gap", "combined")
 """Columns of the table that hlsim writes, so that a measure may not return them."""
 
 
 class ItemSource(Protocol):
-    """An item that is loaded only when it is measured, such as recorded files.
+    """Protocol of an item whose signals are loaded only when it is measured, such as from files.
 
-    An ``Item`` is its own source.
+    An ``Item``, whose signals are in memory, follows the protocol, too.
 
     >>> source: ItemSource = Item("item 1", torch.ones(8), torch.ones(8), Audiogram.standard("N3"))
     >>> source.load().name
@@ -66,15 +66,15 @@ class ItemSource(Protocol):
 
     @property
     def clean_name(self) -> str:
-        """Name of the clean signal; items with the same name are measured after each other.
+        """Name of the clean signal. A study measures items with the same name one after another.
 
-        Measures prepare a clean signal once for such items.
+        Measures can then prepare this clean signal once for all of these items.
         """
 
     def digest(self, condition: str) -> str:
         """Return a hash of all data of the item on which its scores under a condition depend.
 
-        The name and the facts do not count: few measures use them.
+        The name and the facts are not part of it, because few measures use them.
         """
 
     def load(self) -> Item: ...
@@ -88,12 +88,13 @@ class Item:
         name: Name in tables.
         clean: Clean speech, with which measures compare an output. Shape: (time,).
         signal: Input of the conditions, such as noisy speech. Shape: (time,).
-        ear: The audiogram.
-        sample_rate: Sample rate in Hz.
+        ear: Audiogram of the ear.
+        sample_rate: Sample rate of both signals in Hz.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
         seed: Seed of the random numbers that a measure draws.
         facts: Further columns of the table that describe the item, such as ``listener`` or ``snr``.
-        recorded: Function that reads the output that was recorded under the name of a condition.
+        recorded: Function from the name of a condition to the output that was recorded under it;
+            None if conditions compute their outputs.
 
     >>> clean = torch.ones(8)
     >>> Item("item 1", clean, clean, Audiogram.standard("N3")).sample_rate
@@ -113,24 +114,28 @@ class Item:
 
     @property
     def clean_name(self) -> str:
-        """Empty, so that items are measured in their order."""
+        """Empty text for every item, so that a study measures items in their order."""
         return ""
 
     def load(self) -> Item:
-        """Return a copy without the values that ``once`` has computed, which need memory."""
+        """Return a copy without the values that ``once`` has stored, which need memory."""
         return replace(self)
 
     def digest(self, condition: str) -> str:
-        """Return a hash of samples, ear, rate, level and seed, which decide all scores."""
+        """Return a hash of samples, ear, sample rate, full scale and seed.
+
+        It is the same under every condition, because the input is.
+        """
         settings = [self.sample_rate, self.full_scale_spl, self.seed]
         return value_hash([self.clean, self.signal, self.ear.to_dict(), settings])
 
     def once(self, name: str, compute: Callable[[], Any]) -> Any:
-        """Compute a value that does not depend on the condition, once for all conditions.
+        """Compute a value that is the same under all conditions, or return it from memory.
 
         Args:
             name: Name of the value, such as ``"reference"``.
-            compute: Function that computes it when the name is used for the first time.
+            compute: Function without arguments that computes the value. Only the first call with a
+                name calls it, and the item stores the result.
         """
         if name not in self._computed:
             self._computed[name] = compute()
@@ -144,10 +149,13 @@ class Condition:
     Args:
         name: Name in tables.
         process: Function ``(signal, ear) -> output``, for a signal with shape (time,) and an
-            ``Audiogram``; None if the outputs were recorded. A module is set to evaluation mode. If
-            its attribute ``may_crash`` is True, a study of one item runs in another process, too.
-        kind: Role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
-        of: Name of the condition to which this one belongs, such as the aid whose level it has.
+            ``Audiogram``; None if the outputs were recorded. A module is set to evaluation mode.
+            If it has the attribute ``may_crash = True``, its compiled code may end the process, so
+            even a study of one item runs in another process, unless ``jobs`` is 1.
+        kind: Role in the study, such as ``"unaided"``, ``"prescription"``, ``"aid"`` or
+            ``"equaliser"``.
+        of: Name of the condition to which this one belongs, such as the aid whose level it has;
+            empty if it belongs to none.
 
     >>> Condition("unaided", lambda signal, ear: signal, "unaided").of
     ''
@@ -164,11 +172,14 @@ class Condition:
 
     @cached_property
     def fingerprint(self) -> str | None:
-        """Fingerprint of the processing. If it is None, unknown, scores are not stored."""
+        """Hash of the code and settings of the processing, or None if unknown.
+
+        Scores are stored only if it is known.
+        """
         return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
-        """Process an item, or read its recorded output."""
+        """Process the input of an item, or read its recorded output. Shape: (time,)."""
         if self.process is None:
             assert item.recorded is not None
             return item.recorded(self.name)
@@ -178,21 +189,21 @@ class Condition:
 
 @dataclass(frozen=True)
 class Measure:
-    """A function that scores the output of a condition, and what decides its values.
+    """A function that scores outputs, with a description of what its values depend on.
 
     Args:
-        name: Name in options and files. If the measure has one value, it is also its column.
-        compute: Function ``(item, output) -> values by column``, for an ``Item`` and an output with
-            shape (time,). The function raises ValueError if there are no values.
-        packages: Packages whose versions decide the values.
-        settings: Fingerprint of all else that decides the values, such as a network or a version
-            of the function; None if it is unknown.
+        name: Name in options and files.
+        compute: Function ``(item, output) -> dict from column to value``, for an ``Item`` and an
+            output with shape (time,). It raises ValueError if a value is not defined.
+        packages: Packages on whose installed versions the values depend.
+        settings: Text that names all else on which the values depend, such as the hash of a network
+            or a version of the function; None if this is unknown. Values are then not stored.
         uses_facts: Whether the values may depend on the name and the facts of an item, such as
             the words that were spoken.
-        scores: Columns of the values that are scores, by which conditions are compared; None if
-            all columns are.
-        may_crash: Whether compiled code of the measure may end the process, which therefore is
-            never that of the caller.
+        scores: Columns that are scores, by which conditions are compared; None if all columns are.
+            Other columns, such as levels, only describe an output.
+        may_crash: Whether compiled code of the measure may end its process. Such a measure never
+            runs in the process of the caller.
 
     >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).name
     'peak'
@@ -208,14 +219,24 @@ class Measure:
 
     @cached_property
     def fingerprint(self) -> str | None:
-        """Fingerprint of everything that decides the values. If it is None, none is stored."""
+        """Hash of the packages' versions and of ``settings``, or None if the settings are unknown.
+
+        Values are stored only if it is known.
+        """
         if self.settings is None:
             return None
         return value_hash([[metadata.version(name) for name in self.packages], self.settings])
 
 
 class _Task(NamedTuple):
-    """One item with its missing scores: condition, measure, and key in the store."""
+    """One item with those of its scores that the store lacks.
+
+    Attributes:
+        number: Number of the item in the study, from 0.
+        source: The item.
+        missing: Condition, measure and store key of each missing score. The key is empty if the
+            score cannot be stored.
+    """
 
     number: int
     source: ItemSource
@@ -235,8 +256,8 @@ def run_study(
     """Measure the output of every condition for every item.
 
     Items are measured in parallel, and the values do not depend on the number of processes. An
-    error ends only the measure, output or item in which it occurs. It becomes the reason in the
-    column ``failure``, and a later run tries again.
+    error in one item, output or measure does not end the study: only the values that depend on it
+    are missing, its text is in the column ``failure``, and a later run tries again.
 
     Args:
         items: Items, or sources that load them.
@@ -244,21 +265,23 @@ def run_study(
         measures: Measures that score each output.
         store: Scores of earlier runs, to which new scores are added. A score is computed again only
             if samples, ear, condition, measure or the code of hlsim have changed, if the measure
-            uses facts and these have changed, or if a fingerprint is unknown.
+            uses facts and these have changed, or if the fingerprint of the condition or of the
+            measure is unknown.
         jobs: Number of processes; all cores by default. With 1, your own code runs in this process,
             as debuggers need it, and a crash of its compiled parts ends the process.
         dask: Address of a Dask scheduler, whose workers replace the processes.
-        progress: Function that is called with the numbers of finished scores and of all scores, one
-            for each item, condition and measure.
+        progress: Function that is called with the number of finished scores and the number of all
+            scores. There is one for each combination of an item, a condition and a measure.
 
     Returns:
         One row per item and condition: ``item`` (its number), ``name``, the item's facts,
-        ``condition``, one column per measured value, and ``failure``, which is missing if every
+        ``condition``, one column per measured value, and ``failure``, the reason why values are
         measure has its values.
 
     Raises:
         ValueError: There are no items, conditions or measures; two conditions or measures have the
-            same name; a fact or a measure has the name of another column; or no scheduler answers.
+            same name; a fact or a measured value has the name of another column; or no scheduler
+            answers.
         OSError: The store cannot be written.
         MissingExtraError: A package is not installed.
 
@@ -280,11 +303,18 @@ def run_measures(
     progress: Progress | None = None,
     **running: Any,
 ) -> tuple[DataFrame, list[Measure]]:
-    """Run a study, and return its table and its measures with the columns of their scores.
+    """Run a study, and return its table and which columns of it are scores.
 
     Args:
         items, conditions, measures, store, progress: See ``run_study``.
         running: Arguments ``jobs`` and ``dask`` of ``run_study``.
+
+    Returns:
+        The table of ``run_study``, and copies of the measures. Where ``scores`` of a measure is
+        None, that of its copy lists all columns that the measure has returned.
+
+    Raises:
+        ValueError, OSError, MissingExtraError: See ``run_study``.
 
     >>> speech = 0.02 * torch.ones(16000)
     >>> item = Item("item 0", speech, speech, Audiogram.standard("N3"))
@@ -302,7 +332,7 @@ def run_measures(
         raise ValueError("expected items, got none; add some")
     _check_different("condition", [condition.name for condition in conditions])
     _check_different("measure", [measure.name for measure in measures])
-    _check_different("column of the table", [*_RESERVED_COLUMNS, *facts])
+    _check_different("table column", [*_RESERVED_COLUMNS, *facts])
     owners = dict.fromkeys([*_RESERVED_COLUMNS, *facts], "")
     results: _Results = {}
     tasks = []
@@ -364,15 +394,16 @@ def _check_different(noun: str, names: Sequence[str]) -> None:
 
 
 def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> None:
-    """Note the measure that returns each of some columns.
+    """Add the columns that a measure has returned to ``owners``.
 
     Args:
-        owners: Name of the measure of each column; empty if no measure may return it.
+        owners: Name of the measure that returns each column; empty for the columns of items and of
+            hlsim. It is changed in place.
         measure: The measure.
-        values: Values that it has returned.
+        values: Values that the measure has returned, by column.
 
     Raises:
-        ValueError: A column exists already.
+        ValueError: A column belongs to another measure, to the items or to hlsim.
     """
     for column in values:
         if owners.setdefault(column, measure.name) != measure.name:
@@ -383,7 +414,11 @@ def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> 
 
 
 def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure]) -> list[str]:
-    """Return the key of the stored values of each measure, empty if they cannot be stored."""
+    """Return the keys under which the values of an item under a condition are stored.
+
+    Returns:
+        One key per measure; an empty text if the values of this measure cannot be stored.
+    """
     try:
         digest = source.digest(condition.name)
     except (OSError, ValueError):  # Loading the item or its output fails for the same reason.
@@ -405,7 +440,12 @@ def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure])
 @one_thread()
 @torch.no_grad()
 def _measure_item(task: _Task) -> list[Values | str]:
-    """Compute the missing values of one item; a failure gives its reason instead."""
+    """Compute the missing values of one item.
+
+    Returns:
+        For each member of ``task.missing``, the values by column, or the text of the error because
+        of which there are none.
+    """
     try:
         item = task.source.load()
         check_waveform(item.clean, "clean speech", full_scale_spl=item.full_scale_spl)
@@ -437,7 +477,12 @@ def _measure_item(task: _Task) -> list[Values | str]:
 
 
 def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
-    """Process an item, and cut the item and its output to the shorter length."""
+    """Process an item, and cut its signals and the output to the length of the shorter one.
+
+    Raises:
+        ValueError: The output has another shape, differs in length by more than 0.1 s, or is not
+            finite.
+    """
     output = cut_output(condition.output(item), item.clean, item.sample_rate)
     samples = output.shape[-1]
     if samples < item.clean.shape[-1]:
@@ -448,13 +493,16 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
 def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
     """Validate the output of an aid, and cut it to the length of its input if it is longer.
 
+    A shorter output is returned whole. A difference in length causes a warning.
+
     Args:
         output: The output. Shape: (..., time), where ``time`` may differ by 0.1 s.
         signal: The input. Shape: (..., time).
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The output has another shape, or samples that are not finite.
+        ValueError: The output has other leading dimensions, differs in length by more than 0.1 s,
+            or has samples that are not finite.
 
     >>> cut_output(torch.ones(1601), torch.ones(1600), 16000).shape
     torch.Size([1600])
@@ -475,7 +523,7 @@ def _make_rows(
     measures: Sequence[Measure],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the rows of the table of a study, see ``run_study``."""
+    """Return the rows of the table of ``run_study``, one dict per item and condition."""
     rows = []
     for (number, source), condition in product(enumerate(items), conditions):
         row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}
