@@ -302,12 +302,13 @@ def _check_same_speech(first: RecordedItem, second: RecordedItem) -> None:
 
 
 def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[str]) -> DataFrame:
-    """Merge the rows of both ears of each utterance and condition to one row with the better scores.
+    """Merge the rows of both ears of each utterance and condition to one with the better scores.
 
     Each score is the higher one of both ears, so different scores may come from different ears. A
-    score is missing if one ear lacks it, because the other one may be the worse ear. All other
-    values of the row come from one ear: the better one by the first score that both ears have, and
-    the left one if this score is equal or missing.
+    score is missing if one ear lacks it, because the other one may be the worse ear; the column
+    ``failure`` then has the reasons of both ears. All other values of the row come from one ear:
+    the better one by the first score that both ears have, or the left one if this score is equal or
+    there is none.
 
     Args:
         table: Table of ``run_study`` for recordings of both ears of each utterance.

@@ -1,4 +1,4 @@
-"""A digits-in-noise test that a simulated ear takes, and its speech reception threshold."""
+"""A digits-in-noise test of a simulated ear, which measures its speech reception threshold."""
 
 from hlsim.evaluation.digits.listener import DigitListener, load_listener
 from hlsim.evaluation.digits.psychometric import Estimate

@@ -1,4 +1,4 @@
-"""The listener of the digits-in-noise test: a small network that recognises perceived digits."""
+"""The simulated listener of the digits-in-noise test: a small network that recognises digits."""
 
 from __future__ import annotations
 
@@ -24,10 +24,13 @@ _LOWEST_HZ, _HIGHEST_HZ = 80.0, 7800.0
 """Lower edge of the lowest band and upper edge of the highest one in Hz."""
 
 _MARGIN_FRAMES = 5
-"""Frames of 10 ms before and after the slot of a digit that the network gets."""
+"""Number of frames of 10 ms that the network gets before and after the slot of a digit."""
 
 _POWER_FLOOR = 1e-14
-"""Power that is added before the logarithm, below that of the noise of a normal ear."""
+"""Power in the units of the spectrum that is added before the logarithm.
+
+It is below that of the noise of a normal ear.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,11 @@ class DigitListenerConfig(ModelConfig):
 
 
 class DigitListener(nn.Module):
-    """Recogniser of digits, which gets what an ear perceives and knows when each digit begins.
+    """Recogniser of digits in what an ear perceives, which knows when each digit begins.
 
-    Levels in bands become a picture per digit, without its mean, so that the overall level says
-    nothing. Three convolutions and a linear layer compute a score per digit.
+    It computes the level over time in frequency bands. The part of each digit, a picture of bands
+    by frames, loses its mean, so that the overall level has no influence. Three convolutions and a
+    linear layer compute from a picture one score for each of the ten digits.
 
     Args:
         config: Sizes of the network; by default ``DigitListenerConfig()``.
@@ -92,12 +96,12 @@ class DigitListener(nn.Module):
         self.network = nn.Sequential(*layers, nn.Flatten(), nn.Dropout(0.2), nn.Linear(size, 10))
 
     def forward(self, perceived: Tensor) -> Tensor:
-        """Compute a score per digit, whose softmax is its probability.
+        """Compute ten scores for each spoken digit, whose softmax are probabilities of 0 to 9.
 
         Shape: (triplets, time) -> (triplets, 3, 10).
 
         Args:
-            perceived: Perceived triplets in pascals at 16 kHz.
+            perceived: Perceived triplets in pascals at 16 kHz, of 3 s each: 48000 samples.
         """
         powers = power(self.stft.analyse(perceived)) @ self.bands
         levels = (powers + _POWER_FLOOR).log10().mT
@@ -107,7 +111,10 @@ class DigitListener(nn.Module):
         return scores.reshape(-1, DIGITS_PER_TRIPLET, 10)
 
     def _band_weights(self) -> Tensor:
-        """Compute triangular weights of the spectrum's powers, (frequencies, bands)."""
+        """Compute the weights that turn powers of a spectrum into powers in triangular bands.
+
+        Shape: (frequencies, bands).
+        """
         count = self.config.bands
         lowest, highest = erb_number(np.array([_LOWEST_HZ, _HIGHEST_HZ]))
         edges = erb_frequency(np.linspace(lowest, highest, count + 2))
@@ -118,7 +125,9 @@ class DigitListener(nn.Module):
 
 @cache
 def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
-    """Load a trained listener, in evaluation mode and with weights that are not trained further.
+    """Load a trained listener, in evaluation mode and without gradients of its weights.
+
+    Later calls with the same name return the same object.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.

@@ -1,4 +1,4 @@
-"""Sounds of the digits-in-noise test: triplets of digits, noise, and the noise of the ear."""
+"""Sounds of the digits-in-noise test: triplets of digits, masking noise, and noise of the ear."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from hlsim.metrics.sii import INTERNAL_NOISE, SII_BANDS
 DIGITS_PER_TRIPLET = 3
 
 LEAD_SAMPLES = NEURO_RATE // 2
-"""Samples of noise before the first digit, in which an aid settles."""
+"""Number of samples of noise before the first digit, during which the gains of an aid settle."""
 
 TAIL_SAMPLES = NEURO_RATE // 4
-"""Samples of noise after the slot of the last digit."""
+"""Number of samples of noise after the slot of the last digit."""
 
 TRIPLET_SAMPLES = LEAD_SAMPLES + DIGITS_PER_TRIPLET * SLOT_SAMPLES + TAIL_SAMPLES
 """Length of a triplet, 3 s, in samples at 16 kHz."""
@@ -33,20 +33,20 @@ INTERNAL_NOISE_HZ = (50, 100, *SII_BANDS)
 """Frequencies in Hz of ``INTERNAL_NOISE_DB``: third octaves, and 50 and 100 Hz."""
 
 INTERNAL_NOISE_DB = (4.0, 2.0, *INTERNAL_NOISE)
-"""Spectrum level in dB SPL per Hz of the internal noise of a normal ear.
+"""Spectrum level in dB SPL per Hz of the internal noise of a normal ear, at ``INTERNAL_NOISE_HZ``.
 
 Source: ANSI S3.5-1997, table 3, from 160 Hz; below, an extrapolation.
 """
 
 
 class Triplets(NamedTuple):
-    """Triplets of digits with their noises, for all ears the same.
+    """Triplets of digits with their noises, which all ears and aids of a test share.
 
     Attributes:
-        speech: Digits with RMS 1 each, without noise, (triplets, time).
-        noise: Noise with RMS 1 and the long-term spectrum of the digits, (triplets, time).
-        internal: Noise of a normal ear in pascals, (triplets, time).
-        digits: Spoken digits, (triplets, 3).
+        speech: Digits without noise, each with RMS 1, (triplets, time).
+        noise: Masking noise with RMS 1 and the long-term spectrum of the digits, (triplets, time).
+        internal: Internal noise of a normal ear in pascals, (triplets, time).
+        digits: Spoken digits, 0 to 9, (triplets, 3).
 
     >>> draw_triplets(2, torch.Generator().manual_seed(0)).speech.shape
     torch.Size([2, 48000])
@@ -60,7 +60,7 @@ class Triplets(NamedTuple):
 
 @cache
 def load_digits() -> Tensor:
-    """Load the bundled digits, with RMS 1.
+    """Load the bundled digits, each scaled to RMS 1.
 
     Returns:
         Samples at 16 kHz, (voices, 10, SLOT_SAMPLES).
@@ -74,7 +74,7 @@ def load_digits() -> Tensor:
 
 
 def draw_triplets(count: int, generator: torch.Generator) -> Triplets:
-    """Draw triplets of digits, each spoken by one voice, with noises.
+    """Draw triplets of digits with noises. One voice speaks all digits of a triplet.
 
     Args:
         count: Number of triplets.
@@ -93,7 +93,7 @@ def draw_triplets(count: int, generator: torch.Generator) -> Triplets:
 
 
 def present(triplets: Triplets, snr: Tensor, noise_spl: float | Tensor) -> Tensor:
-    """Add the noise at a level, and the digits at a signal-to-noise ratio.
+    """Mix the digits with the masking noise, at a level and a signal-to-noise ratio.
 
     Args:
         triplets: Digits and noises.
@@ -113,17 +113,20 @@ def present(triplets: Triplets, snr: Tensor, noise_spl: float | Tensor) -> Tenso
 
 
 def perceive(signals: Tensor, thresholds: Tensor, simulator: nn.Module, internal: Tensor) -> Tensor:
-    """Simulate what ears perceive of signals, and add the noise of a normal ear.
+    """Simulate what ears perceive of signals, and add the internal noise of a normal ear.
 
-    Without a loss, the noise of the ear masks what is below the normal threshold. A simulator makes
-    sounds as soft for a normal ear as they are for the impaired one, so the same noise also masks
-    what is below the threshold of the impaired ear.
+    For a normal ear, this noise masks what is below its threshold. A simulator makes a sound as
+    soft as it is for the impaired ear, so the same noise also masks what is below the threshold of
+    that ear.
 
     Args:
         signals: Signals in pascals at 16 kHz, (triplets, time).
-        thresholds: Ears in dB HL, (triplets, 8).
-        simulator: Simulator of the hearing loss.
-        internal: Noise of the ear in pascals, (triplets, time).
+        thresholds: Thresholds of the ears in dB HL, (triplets, 8), or (8,) for one ear.
+        simulator: Simulator of the hearing loss, which is called with signals and thresholds.
+        internal: Internal noise of a normal ear in pascals, (triplets, time).
+
+    Returns:
+        Perceived signals with the internal noise in pascals, (triplets, time).
 
     >>> from hlsim.simulators import load_simulator
     >>> triplets = draw_triplets(1, torch.Generator().manual_seed(0))
@@ -137,14 +140,25 @@ def perceive(signals: Tensor, thresholds: Tensor, simulator: nn.Module, internal
 
 
 def _draw_noise(count: int, amplitudes: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw Gaussian noise with an amplitude per frequency, (count, TRIPLET_SAMPLES)."""
+    """Draw Gaussian noise whose spectrum is shaped by a factor per frequency.
+
+    Args:
+        count: Number of signals.
+        amplitudes: Factors at the frequencies of the Fourier transform of a triplet.
+        generator: Source of the random numbers.
+
+    Returns: Samples, (count, TRIPLET_SAMPLES).
+    """
     white = torch.randn(count, TRIPLET_SAMPLES, generator=generator)
     return torch.fft.irfft(torch.fft.rfft(white) * amplitudes, TRIPLET_SAMPLES)
 
 
 @cache
 def _speech_amplitudes() -> Tensor:
-    """Compute the amplitudes of the digits' long-term spectrum at the frequencies of a triplet."""
+    """Compute the long-term magnitude spectrum of all digits, on any scale.
+
+    Returns: Magnitudes at the frequencies of the Fourier transform of a triplet.
+    """
     words = load_digits().double()
     speech = words[words != 0.0]
     frames = speech[: len(speech) // _SPECTRUM_SAMPLES * _SPECTRUM_SAMPLES]
@@ -155,7 +169,10 @@ def _speech_amplitudes() -> Tensor:
 
 @cache
 def _internal_amplitudes() -> Tensor:
-    """Compute the factors by which white noise of RMS 1 becomes the internal noise in pascals."""
+    """Compute the factors that turn white noise of RMS 1 into the internal noise in pascals.
+
+    Returns: Factors at the frequencies of the Fourier transform of a triplet.
+    """
     root_density = 10.0 ** ((np.array(INTERNAL_NOISE_DB) - PASCAL_SPL) / 20.0)
     return _interpolate(
         root_density * np.sqrt(NEURO_RATE / 2.0), np.array(INTERNAL_NOISE_HZ, float)

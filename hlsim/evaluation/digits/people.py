@@ -1,8 +1,9 @@
-"""Thresholds in noise of people by their mean hearing loss, to stand beside those of hlsim.
+"""Measured speech reception thresholds of people by their mean hearing loss.
 
-The figures are a fit to 279 people (docs/digits.md): two lines over the pure-tone average of the
-better ear, and the standard deviation around them in four groups. The test of the people was that
-of digit triplets, unaided, with both ears in the free field, in noise of 65 dB SPL.
+They show how far the simulated listener is from people. The numbers are a fit to 279 people
+(docs/digits.md): two lines over the pure-tone average of the better ear, and the standard deviation
+around them in four groups. The test of the people was that of digit triplets, unaided, with both
+ears in the free field, in noise of 65 dB SPL.
 
 Source: Oldenburg Hearing Health Record, Jafri et al. 2025, doi 10.5281/zenodo.16919812, CC BY 4.0.
 """
@@ -31,10 +32,14 @@ _DEVIATIONS = (0.88, 1.37, 1.97, 3.20)
 
 
 def people_threshold(pta: ArrayLike) -> Estimate:
-    """Return the unaided threshold in noise of people with a mean loss, and the range of 95 %.
+    """Return the mean unaided threshold in noise of people with a hearing loss, and their range.
 
     Args:
-        pta: Pure-tone average in dB HL. People had -5 to 79 dB HL.
+        pta: Pure-tone average in dB HL, a number or an array. The people had -5 to 79 dB HL.
+
+    Returns:
+        The mean signal-to-noise ratio at threshold in dB, and the limits between which 95 % of the
+        people lie, in the shape of ``pta``.
 
     >>> print(*(x.round(1) for x in people_threshold(30.0)))
     -6.2 -9.2 -3.3

@@ -1,8 +1,8 @@
-"""Speech reception threshold from right and wrong digits, with its uncertainty.
+"""Speech reception threshold from numbers of right digits, with its uncertainty.
 
 The share of digits that a listener recognises rises with the signal-to-noise ratio along a logistic
-function from a tenth, by guessing, to nearly 1. Threshold, slope and upper end are fitted on a grid
-with a flat prior, so that each quantile of the threshold is known.
+function, from a tenth, by guessing, to nearly 1. A grid of possible thresholds, slopes and upper
+ends, all equally likely beforehand, gives the probability of each threshold after the test.
 
 Source: Schuett, Harmeling, Macke and Wichmann (2016), Vision Research 122, doi
 10.1016/j.visres.2016.02.002 (the method); Smits, Kapteyn and Houtgast (2004), International Journal
@@ -23,13 +23,13 @@ LOWEST_SNR, HIGHEST_SNR = -22.0, 32.0
 """Range of the signal-to-noise ratios of the test in dB."""
 
 TARGET = 0.5 ** (1.0 / 3.0)
-"""Share of digits at the threshold, where half of the triplets have three right digits."""
+"""Share of right digits at the threshold, where half of the triplets have three right digits."""
 
 _GUESS = 0.1
 
 _THRESHOLDS = np.arange(LOWEST_SNR - 5.0, HIGHEST_SNR + 5.0, 0.2)
 _SLOPES = np.geomspace(0.12, 1.0, 8)
-"""Factors on the signal-to-noise ratio in dB in the logit."""
+"""Slopes of the logistic function per dB of signal-to-noise ratio."""
 
 _LAPSES = np.array([0.005, 0.03, 0.1])
 """Shares of digits that are missed at the best signal-to-noise ratio."""
@@ -58,13 +58,14 @@ def estimate_threshold(snr: Array, right: Array, asked: int = 3) -> Estimate:
     """Estimate the signal-to-noise ratio at which half of the triplets are understood.
 
     Args:
-        snr: Signal-to-noise ratio of each triplet in dB.
-        right: Number of right digits of each triplet.
+        snr: Signal-to-noise ratio of each triplet in dB, (triplets,).
+        right: Number of digits of each triplet that were recognised, (triplets,).
         asked: Number of digits per triplet.
 
     Returns:
-        The mean of the posterior distribution and its quantiles. They are infinite if the mean is
-        above 32 dB, the highest signal-to-noise ratio of the test.
+        The threshold in dB, the mean of its posterior distribution, with its 95 % interval. All
+        three are infinite if the mean is above 32 dB, the highest signal-to-noise ratio of the
+        test.
 
     >>> snr = np.linspace(-20.0, 20.0, 200)
     >>> estimate = estimate_threshold(snr, np.where(snr > 0.0, 3.0, 0.0))
@@ -88,7 +89,9 @@ def estimate_threshold(snr: Array, right: Array, asked: int = 3) -> Estimate:
 
 
 def subtract(first: Estimate, second: Estimate) -> Estimate:
-    """Subtract estimates whose errors are independent.
+    """Subtract the second estimate from the first one, as if their errors were independent.
+
+    The difference of two infinite estimates is NaN.
 
     >>> print(*subtract(Estimate(5.0, 4.7, 5.3), Estimate(1.0, 0.6, 1.4)))
     4.0 3.5 4.5

@@ -55,7 +55,7 @@ _ROUND_ENDS = (0.2, 0.6)
 """Shares of the triplets that are presented before the second and before the third round."""
 
 _AROUND_DB = 4.0
-"""Largest distance in dB from the threshold so far, in all rounds but the first."""
+"""Largest distance in dB from the latest estimate of the threshold, in the last two rounds."""
 
 _AIDED_AT_ONCE = 8
 """Number of triplets that an aid gets at once. Networks round differently in other batches."""
@@ -98,12 +98,12 @@ class ReceptionThreshold:
 
 @dataclass(frozen=True)
 class DigitTest:
-    """Digit test behind a simulated ear, with the same triplets for all ears and aids.
+    """Digits-in-noise test of simulated ears, with the same triplets for all ears and aids.
 
     Attributes:
-        material: Triplets of the test.
+        material: Triplets of digits with their noises.
         simulator: Simulator of the hearing loss.
-        listener: Recogniser of the digits.
+        listener: Network that recognises the digits in what an ear perceives.
         noise_spl: Level of the noise in dB SPL.
 
     >>> test = DigitTest.draw(30, simulator="attenuation")
@@ -126,7 +126,14 @@ class DigitTest:
         noise_spl: float = NOISE_SPL,
         seed: int = 0,
     ) -> DigitTest:
-        """Draw the triplets of a test, as ``reception_threshold`` does with these arguments."""
+        """Draw the triplets of a test, and load its simulator and its listener.
+
+        Args:
+            triplets, simulator, listener, noise_spl, seed: See ``reception_threshold``.
+
+        Raises:
+            ValueError: There is no such simulator or listener.
+        """
         return cls(
             draw_triplets(triplets, torch.Generator().manual_seed(seed)),
             load_simulator(simulator),
@@ -139,12 +146,15 @@ class DigitTest:
     def measure(
         self, ear: Tensor, aid: AidFunction | None = None, *, aid_in_threads: bool = False
     ) -> Estimate:
-        """Measure the threshold of one ear.
+        """Measure the speech reception threshold of one ear, in dB.
 
         Args:
-            ear: Thresholds at the eight frequencies in dB HL, (8,).
-            aid: Function of signals and the ear; None for no aid.
+            ear: Hearing thresholds at the eight frequencies in dB HL, (8,).
+            aid: Function of signals and the ear, see ``AidFunction``; None for no aid.
             aid_in_threads: Whether several threads may call the aid at once.
+
+        Raises:
+            ValueError: The output of the aid has another shape, or is not finite.
         """
         count = len(self.material.digits)
         snr, right = np.zeros(count), np.zeros(count)
@@ -170,7 +180,15 @@ class DigitTest:
         aid: AidFunction | None,
         aid_in_threads: bool,
     ) -> Array:
-        """Present some of the triplets, and count the right digits of each."""
+        """Present some of the triplets, and count the digits of each that are recognised.
+
+        Args:
+            part: Indices of the triplets in ``material``, (triplets,).
+            snr: Signal-to-noise ratio of each in dB, (triplets,).
+            ear, aid, aid_in_threads: See ``measure``.
+
+        Returns: Numbers of right digits, 0 to 3, (triplets,).
+        """
         triplets = Triplets(*(values[part] for values in self.material))
         signals = present(triplets, torch.from_numpy(snr).float(), self.noise_spl)
 
@@ -190,12 +208,14 @@ class DigitTest:
 
 
 def _portions(count: int, size: int) -> list[slice]:
-    """Divide a number of triplets into portions of a size, the last of which may be smaller."""
+    """Return slices of ``size`` triplets that cover ``count`` triplets; the last may be shorter."""
     return [slice(start, start + size) for start in range(0, count, size)]
 
 
 def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) -> Tensor:
-    """Compute the outputs of an aid for a portion of signals, and check them.
+    """Compute the outputs of an aid for a portion of the signals, and validate them.
+
+    Shape: (triplets, time), (8,) -> (triplets of the portion, time).
 
     Raises:
         ValueError: The outputs have another shape, or samples that are not finite.
@@ -225,8 +245,8 @@ def reception_threshold(
 ) -> ReceptionThreshold:
     """Measure the speech reception threshold in noise of simulated ears by a digit test.
 
-    A small network behind the simulated ear recognises triplets of digits. It has a skill of its
-    own, so compare thresholds with each other; those of people differ by a constant
+    A small network recognises triplets of digits in what the simulated ear perceives. Its skill is
+    not that of people, so compare thresholds with each other; those of people differ by a constant
     (docs/digits.md). Each ear is tested alone, on the CPU, and each one, without and with the aid,
     gets the same triplets and noises. The same call therefore returns the same bits.
 
@@ -241,8 +261,9 @@ def reception_threshold(
         noise_spl: Level of the noise in dB SPL, 40 to 90.
         triplets: Number of triplets per ear, without and with the aid, 30 to 3000.
         seed: Seed of digits, voices and noises.
-        show: Function of the numbers of finished and of all tests, which shows the progress.
-        sliders: Further arguments of the aid, such as ``noise_reduction=0.0``.
+        show: Function that is called with the number of finished tests and the number of all tests,
+            to show the progress.
+        sliders: Further arguments with which the aid is called, such as ``noise_reduction=0.0``.
 
     Returns:
         Thresholds in dB with their 95 % intervals. A threshold above 32 dB is infinite.

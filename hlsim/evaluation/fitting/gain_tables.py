@@ -1,7 +1,8 @@
-"""Export of an aid's fitted gains to other programs.
+"""Export of the gains of an aid that is fitted to an ear, as files of other programs.
 
-Two formats hold gains at many levels: a CSV table, and the gain table of openMHA's compressor
-``dc``. CamillaDSP and Equalizer APO are linear: a file holds the gains for speech at one level.
+Two formats hold gains for speech at many levels: a CSV table, and the gain table of openMHA's
+compressor ``dc``. CamillaDSP and Equalizer APO are linear: a file holds the gains for speech at one
+level.
 """
 
 from __future__ import annotations
@@ -25,21 +26,24 @@ from hlsim.checks import check_number
 Array = NDArray[np.float64]
 
 LEVELS = tuple(float(level) for level in range(20, 121, 5))
-"""Levels of speech in dB SPL at which the gains of tables are measured."""
+"""Levels of speech in dB SPL for which tables have gains."""
 
 BAND_LEVELS = tuple(float(level) for level in range(0, 121, 3))
-"""Levels in dB SPL of a band of openMHA for which its table has gains."""
+"""Levels in dB SPL of one band for which openMHA's table has gains."""
 
 TAPS = 1023
-"""Coefficients of the filter for CamillaDSP up to ``TAPS_RATE``, in Hz; faster ones have more."""
+"""Number of coefficients of the filter for CamillaDSP, up to a sample rate of ``TAPS_RATE`` in Hz.
+
+At higher rates it is larger, so that the filter lasts as long.
+"""
 
 TAPS_RATE = 48000
 
 _HERTZ = np.arange(1, RATE // 2 + 1)
-"""Frequencies of ``speech_density``, and those at which filters are designed."""
+"""Frequencies in Hz of ``speech_density`` and of the gains for the design of filters, (8000,)."""
 
 _FIT_STEPS = 10
-"""Steps of the fit of an equaliser, after which its gains are within .01 dB of the aid's."""
+"""Number of steps of ``_equaliser_points``, after which gains are within .01 dB of the aid's."""
 
 
 class _Fitting(NamedTuple):
@@ -48,7 +52,7 @@ class _Fitting(NamedTuple):
     Attributes:
         aid: Aid with the method ``gains``.
         ear: Audiogram of one ear.
-        level: Level of speech in dB SPL, for formats that hold the gains at one level.
+        level: Level of speech in dB SPL, for formats that hold the gains for one level.
         sample_rate: Sample rate in Hz of the other program.
     """
 
@@ -58,7 +62,9 @@ class _Fitting(NamedTuple):
     sample_rate: int
 
     def gains(self, level: float) -> Array:
-        """Measure the insertion gains in dB for speech at a level in dB SPL, (8,).
+        """Measure the insertion gains for speech at a level in dB SPL.
+
+        Shape: -> (8,) in dB, at ``FREQUENCIES``.
 
         Raises:
             ValueError: The aid has several ears.
@@ -69,7 +75,7 @@ class _Fitting(NamedTuple):
         return gains
 
     def gain_table(self) -> Array:
-        """Measure the insertion gains in dB for speech at all ``LEVELS``, (levels, frequencies).
+        """Measure the insertion gains in dB for speech at all ``LEVELS``, (levels, 8).
 
         Raises:
             ValueError: The aid has several ears.
@@ -80,7 +86,7 @@ class _Fitting(NamedTuple):
 def export_gains(
     aid: Aid, ear: Any, program: str, level: float = 65.0, sample_rate: int = NEURO_RATE
 ) -> str:
-    """Write the gains of an aid for an ear as a configuration of another program.
+    """Return the gains of an aid for an ear as the text of a file for another program.
 
     Args:
         aid: Aid, such as ``NALR()`` or one from ``load_compensator``.
@@ -106,13 +112,17 @@ def export_gains(
 
 
 def _equaliser_points(gains: Array) -> Array:
-    """Return the gains of an equaliser that amplifies thirds of an octave as an aid does.
+    """Compute the points of an equaliser's gain curve that amplifies as an aid does.
 
-    Between ``FREQUENCIES``, the equaliser's gain in dB is a straight line over log frequency. In a
-    third of an octave, it therefore amplifies the noise of ``Aid.gains`` otherwise than at the
-    centre, by up to 2 dB where gains are steep.
+    The gains of an aid are those for noise in a third of an octave around each of the eight
+    ``FREQUENCIES``, see ``Aid.gains``. An equaliser's gain in dB is a straight line over log
+    frequency between its points at these frequencies. Over a third of an octave, it amplifies the
+    noise by up to 2 dB more or less than at the centre, so its points are fitted in a few steps.
 
-    Shape: (8,) -> (8,) in dB.
+    Args:
+        gains: Gains of the aid in dB, (8,).
+
+    Returns: Gains of the equaliser in dB at the points, (8,).
     """
     in_third = thirds_of_octave()[1:]
     density = speech_density(RATE)
@@ -125,12 +135,12 @@ def _equaliser_points(gains: Array) -> Array:
 
 
 def _interpolate(points: Array) -> Array:
-    """Return the equaliser's gains in dB at whole frequencies to 8 kHz. Shape: (8,) -> (8000,)."""
+    """Return the equaliser's gains in dB at 1, 2, ..., 8000 Hz. Shape: (8,) -> (8000,)."""
     return np.interp(np.log(_HERTZ), np.log(FREQUENCIES), points)
 
 
 def _write_csv(fitting: _Fitting) -> str:
-    """Write a table with a row per frequency, and a column per level of speech in dB SPL."""
+    """Return a CSV table with a row per frequency, and a column per level of speech in dB SPL."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frequency_hz", *(f"gain_db_at_{level:g}" for level in LEVELS)])
@@ -140,14 +150,14 @@ def _write_csv(fitting: _Fitting) -> str:
 
 
 def _write_equalizer_apo(fitting: _Fitting) -> str:
-    """Write the configuration of Equalizer APO: gains that follow lines over log frequency."""
+    """Return the configuration of Equalizer APO: gains in dB at the eight frequencies."""
     points = _equaliser_points(fitting.gains(fitting.level))
     pairs = [f"{hz:g} {gain:.2f}" for hz, gain in zip(FREQUENCIES, points, strict=True)]
     return f"# Gains for speech at {fitting.level:g} dB SPL\nGraphicEQ: {'; '.join(pairs)}\n"
 
 
 def _write_camilladsp(fitting: _Fitting) -> str:
-    """Write the configuration of CamillaDSP 3: a minimum-phase filter, from stdin to stdout."""
+    """Return the configuration of CamillaDSP 3: a minimum-phase filter, from stdin to stdout."""
     points = _equaliser_points(fitting.gains(fitting.level))
     hertz = np.array([0, *_HERTZ, *[fitting.sample_rate / 2][: fitting.sample_rate > RATE]])
     response = 10.0 ** (np.interp(hertz, _HERTZ, _interpolate(points)) / 20.0)
@@ -173,10 +183,11 @@ pipeline:
 
 
 def _write_openmha(fitting: _Fitting) -> str:
-    """Write the part of openMHA's configuration for its filter bank and its compressor ``dc``.
+    """Return the part of openMHA's configuration for its filter bank and its compressor ``dc``.
 
-    The compressor looks up the gain of a band by the level of this band. The aid's gains are
-    measured with speech, whose level is that of all bands together.
+    The compressor looks up the gain of a band by the level in this band. The aid's gains are
+    measured by the overall level of speech, so each is entered at the level that the band has in
+    average speech of this overall level.
     """
     edges = np.sqrt(np.multiply(FREQUENCIES[1:], FREQUENCIES[:-1]))
     powers = np.bincount(np.searchsorted(edges, _HERTZ), speech_density(RATE))
@@ -210,4 +221,4 @@ PROGRAMS: dict[str, Callable[[_Fitting], str]] = {
     "openmha": _write_openmha,
     "csv": _write_csv,
 }
-"""Function that writes the configuration of each program, by its name."""
+"""Functions from a fitting to the text of a program's file, by the name of the format."""

@@ -1,7 +1,7 @@
 """Verification of a hearing aid from two recordings, its input and its output.
 
-A clinic measures the same at a person's ear: percentiles of speech in third octaves (IEC 60118-15),
-insertion gains beside their targets, and the audible share of speech (ANSI S3.5).
+A clinic measures the same at a person's ear: percentiles of the level of speech in third octaves
+(IEC 60118-15), insertion gains beside their targets, and the audible share of speech (ANSI S3.5).
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from hlsim.metrics.sii import SII_BANDS, sii
 Array = NDArray[np.float64]
 
 PERCENTILES = (30, 65, 99)
-"""Shares in percent of the sections that are at most as loud as a level: valleys, middle, peaks."""
+"""Percentiles of the levels of speech sections: the valleys, the middle and the peaks of speech."""
 
 SECTION_SECONDS = 0.125
-"""Length of the sections of which each has a level; they overlap by half."""
+"""Duration of the sections in which levels are measured. They overlap by half."""
 
 MIN_SECONDS = 1.0
-"""Shortest recording, in which the 99 % percentile is the loudest section."""
+"""Shortest recording in seconds. In so short a one, the 99 % percentile is the loudest section."""
 
 TARGET_STEP = 5.0
-"""Distance in dB of the levels of speech at which a prescription is asked for its gains."""
+"""Largest distance in dB between levels of speech at which a prescription's gains are computed."""
 
 UNCOMFORTABLE_LEVEL = (88.8, 0.25)
 """Level in dB HL from which a tone is uncomfortable for a normal ear, and its rise per dB of loss.
@@ -47,18 +47,20 @@ The line is fitted to 276 persons at 500 Hz to 4 kHz (docs/people.md); its devia
 
 @dataclass(frozen=True)
 class Verification:
-    """Levels, gains and targets of an aid in third octaves, and audible shares.
+    """Levels, gains and targets of an aid in third octaves, and audible shares of speech.
+
+    There are 18 bands, 160 to 8000 Hz.
 
     Attributes:
-        hertz: Centres of the third octaves, (bands,).
-        input_levels: Levels of the input in dB SPL at the ``PERCENTILES``, (3, bands).
-        output_levels: Levels of the output, (3, bands).
+        hertz: Centres of the third octaves in Hz, (18,).
+        input_levels: Levels of the input in dB SPL at the ``PERCENTILES``, (3, 18).
+        output_levels: Levels of the output in dB SPL at the ``PERCENTILES``, (3, 18).
         targets: Insertion gains in dB that the prescription gives at each percentile of the input,
-            (3, bands); equal at all three where the prescription is linear.
-        thresholds: Thresholds of the ear in dB SPL, (bands,).
-        uncomfortable: Uncomfortable levels in dB SPL as a line predicts them, (bands,).
-        unaided_sii: Audible share of the input, 0 to 1.
-        aided_sii: Audible share of the output.
+            (3, 18); equal at all three if the prescription is linear.
+        thresholds: Hearing thresholds of the ear in dB SPL, (18,).
+        uncomfortable: Predicted levels in dB SPL from which a tone is uncomfortable, (18,).
+        unaided_sii: Speech intelligibility index of the input: its audible share, 0 to 1.
+        aided_sii: Speech intelligibility index of the output.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()
@@ -81,7 +83,12 @@ class Verification:
         return self.output_levels - self.input_levels
 
     def rows(self) -> list[dict[str, float]]:
-        """Return a row per third octave, with levels in dB SPL and gains in dB by name."""
+        """Return one dict per third octave, with values by column, rounded to 0.1.
+
+        The columns are ``hertz``; ``input``, ``output``, ``gain`` and ``target`` at each
+        percentile, such as ``input_30``; ``threshold``; and ``uncomfortable``. Levels are in dB
+        SPL, gains and targets in dB.
+        """
         columns: dict[str, Array] = {"hertz": self.hertz}
         tables = {
             "input": self.input_levels,
@@ -110,14 +117,14 @@ def verify(
 ) -> Verification:
     """Measure the gains of an aid from its input and output, beside the targets for an ear.
 
-    Both are cut to the sound that they share, so that results do not depend on a delay, or on
-    silence before or after the sound of one recording. The input should be at least 15 s of speech
-    without noise; with shorter ones, valleys and peaks are less certain.
+    Both recordings are cut to the sound that they share, so that results do not depend on a delay,
+    or on silence before or after the sound of one recording. The input should be at least 15 s of
+    speech without noise; in shorter ones, the levels of valleys and peaks are less certain.
 
     Args:
-        input_: Input of the aid, (time,).
-        output: Output at the same scale, of the same length or up to 1 s longer or shorter, and up
-            to 1 s later or earlier.
+        input_: Recorded input of the aid, (time,), 1 s or more.
+        output: Recorded output at the same scale, (time,), which may be up to 1 s longer or
+            shorter, and up to 1 s later or earlier.
         ear: Audiogram of the ear.
         sample_rate: Sample rate of both in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
@@ -179,7 +186,8 @@ def verify(
 def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Tensor, Tensor]:
     """Cut two recordings to the sound that both have, in CPU memory and without a gradient.
 
-    If they are not similar enough to find the lag of the output, it is taken as 0.
+    If they are not similar enough to find the lag of the output, a lag of 0 is assumed. Shape:
+    (time,), (time,) -> (samples,), (samples,).
 
     Raises:
         ValueError: The output is later or earlier by more than 1 s, or less than 1 s is common.
@@ -201,19 +209,23 @@ def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Ten
 
 
 def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Array:
-    """Compute the insertion gains of an aid for levels in third octaves.
+    """Compute the insertion gains of an aid for levels of speech in third octaves.
 
-    Each band stands for itself: its gain is that for average speech of the overall level at which
-    this band has its level. The gain is the static one: an aid that adapts slowly gives soft and
-    loud sections gains that lie closer together.
+    Bands are independent: the gain of a band is the aid's gain for average speech, at the overall
+    level of speech whose level in this band is that of ``band_levels``. These are gains for speech
+    of a constant level. In speech whose level changes, an aid that adapts slowly gives soft and
+    loud sections more similar gains.
 
     Args:
         aid: Aid, linear or compressive.
         audiogram: Audiogram of the ear.
-        band_levels: Levels in dB SPL, (..., 18).
+        band_levels: Levels in dB SPL in the third octaves ``SII_BANDS``, (..., 18).
 
     Returns:
         Gains in dB, (..., 18).
+
+    Raises:
+        ValueError: The aid does not accept the ear.
 
     >>> import hlsim
     >>> from hlsim import Audiogram, NALR, WDRC
@@ -242,8 +254,8 @@ def section_powers(signal: Tensor, sample_rate: int) -> Array:
     """Compute the power of a signal in third octaves, in each section of 125 ms.
 
     Sections overlap by half, and have a Hann window whose loss of power is compensated. Samples
-    after the last whole section are left out. Of a band that ends above the Nyquist frequency, the
-    part below it stands for the whole one.
+    after the last whole section are left out. If a band ends above the Nyquist frequency, the power
+    of its part below this frequency is scaled to the whole width of the band.
 
     Args:
         signal: Samples in pascals, (time,), of 125 ms or more.
@@ -273,16 +285,19 @@ def section_powers(signal: Tensor, sample_rate: int) -> Array:
 
 
 def _bandwidth_db() -> Array:
-    """Return the level in dB of the width of each third octave in Hz, (18,)."""
+    """Return 10 log10 of each third octave's width in Hz, (18,): its level above that per Hz."""
     width = 2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0)
     return 10.0 * np.log10(width * np.array(SII_BANDS))
 
 
 def _level(power: Array) -> Array:
-    """Return levels in dB SPL of powers in Pa^2."""
+    """Convert powers in Pa^2 to levels in dB SPL, element by element."""
     return PASCAL_SPL + 10.0 * np.log10(np.maximum(power, POWER_FLOOR))
 
 
 def _interpolate(values: Any, frequencies: Any) -> Array:
-    """Return values at the bands, interpolated over log frequency and constant beyond the ends."""
+    """Interpolate values at frequencies in Hz to the third octaves ``SII_BANDS``, (18,).
+
+    The interpolation is linear over log frequency, and constant below and above the frequencies.
+    """
     return np.interp(np.log(SII_BANDS), np.log(frequencies), np.asarray(values, dtype=float))

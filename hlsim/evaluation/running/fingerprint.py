@@ -1,6 +1,6 @@
 """Fingerprints: hashes that show whether a stored score is still valid.
 
-A fingerprint covers everything that decides the outputs of a module: class names, settings and
+The fingerprint of a module covers everything on which its outputs depend: class names, settings and
 tensors and, for a class outside hlsim and torch, the file with its source code. The code of hlsim
 has a hash of its own, ``code_version``, which is part of the key of each stored score. Authors of
 modules outside hlsim may add an attribute ``fingerprint``, such as a version, which they change
@@ -25,7 +25,7 @@ from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
-"""Attributes of every module, which say nothing about its outputs."""
+"""Attributes that every ``nn.Module`` has, which do not describe its outputs."""
 
 _ROOMS_WITHOUT_SCORES = frozenset({"cli", "report", "training"})
 """Packages of hlsim that no score depends on: commands, pages and training."""
@@ -68,14 +68,16 @@ def fingerprint(processing: Any) -> str | None:
 
     Args:
         processing: Function or ``torch.nn.Module``. If it has an attribute ``fingerprint``, its
-            name and this attribute decide. Otherwise, the classes, the attributes and the tensors
-            of a module and its submodules do, without private attributes of hlsim and torch.
+            name and this attribute are hashed. Otherwise, the classes, the attributes and the
+            tensors of a module and its submodules are, without private attributes of modules of
+            hlsim and torch, and for other classes their source files.
 
     Returns:
-        The SHA-256 in hexadecimal, or None if the outputs could change without notice: for a
-        function without the attribute, for a module outside hlsim without tensors and ``config``,
-        for a class without a source file, for a module with an attribute that cannot be described,
-        such as a lambda, and for a module of hlsim that contains one of these.
+        The SHA-256 in hexadecimal, or None if the outputs could change while the hash does not:
+        for a function without the attribute ``fingerprint``, for a module outside hlsim with
+        neither tensors nor an attribute ``config``, for a class without a source file, for a module
+        with an attribute that cannot be hashed, such as a lambda, and for a module of hlsim that
+        contains one of these.
 
     >>> fingerprint(nn.Linear(2, 2)) == fingerprint(nn.Linear(2, 2))  # random weights
     False
@@ -117,8 +119,8 @@ def value_hash(value: Any) -> str:
     """Compute the SHA-256 of a value in hexadecimal, the same in every process.
 
     Args:
-        value: Texts, numbers, lists and dictionaries (in any order), tensors, arrays, paths,
-            dataclasses, and modules with a fingerprint.
+        value: Text, number, list or dict, whose order does not matter, nested as you like, with
+            tensors, arrays, dataclasses, functions with a name, and modules with a fingerprint.
 
     Raises:
         TypeError: The value contains something else, such as a lambda.
@@ -144,10 +146,10 @@ _hash_source = cache(source_hash)
 
 
 def _attributes(module: nn.Module) -> dict[str, Any]:
-    """Return the attributes of a module without those that every module has.
+    """Return the attributes of a module without those that every ``nn.Module`` has.
 
-    Private attributes are left out if the class belongs to hlsim, torch or Python, because calls
-    have computed them. Parameters, buffers and submodules are not included.
+    Parameters, buffers and submodules are not included. Private attributes are left out if the
+    class belongs to hlsim, torch or Python, because calls have computed them.
     """
     return {
         name: value
@@ -157,16 +159,16 @@ def _attributes(module: nn.Module) -> dict[str, Any]:
 
 
 def _name(thing: Any) -> str:
-    """Return the name of a function, of a class, or of the class of another object."""
+    """Return the qualified name of a function or class, or of the class of another object."""
     kind = thing if hasattr(thing, "__qualname__") else type(thing)
     return str(kind.__qualname__)
 
 
 def _describe(value: Any) -> Any:
-    """Convert an object that JSON cannot represent to one that it can.
+    """Convert an object that JSON cannot represent to values that it can, for ``value_hash``.
 
     Raises:
-        TypeError: The object cannot be described.
+        TypeError: The object has no description that would change with its contents.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()

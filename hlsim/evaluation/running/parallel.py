@@ -14,7 +14,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 Progress = Callable[[int, int], None]
-"""Function of the number of finished tasks and of all tasks."""
+"""Function that is called with the number of finished tasks and the number of all tasks."""
 
 CONNECTION_TIMEOUT = 10.0
 """Time in seconds in which a Dask scheduler has to answer."""
@@ -26,7 +26,10 @@ CRASH = "the process ended, after a crash in compiled code or because memory ran
 """Reason why a task has no result after a ``Crash``."""
 
 _TASKS_IN_FLIGHT = 8
-"""Number of tasks per process among which is the one whose process ended."""
+"""Number of tasks per process that are repeated one by one after a process has ended.
+
+The task that ended it is among them.
+"""
 
 
 class Crash:
@@ -51,7 +54,7 @@ def describe_error(error: Exception) -> str:
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread in a ``with`` block or a decorated function.
 
-    In small tasks, several threads wait for each other.
+    For small tasks, waiting for other threads takes longer than the work itself.
 
     >>> with one_thread():
     ...     torch.get_num_threads()
@@ -75,15 +78,15 @@ def run_parallel(
 ) -> Iterator[tuple[Task, Result | Crash]]:
     """Call a function for each task, and yield the tasks with their results, in the same order.
 
-    If a process ends, the next tasks are repeated one by one, so that the result of the task that
-    ended it is a ``Crash`` and all others have their results.
+    If a process crashes, the next tasks are repeated one by one in another process, so that only
+    the result of the task that crashes is a ``Crash``.
 
     Args:
         function: Function of a task, which can be pickled. An exception that it raises ends the
             run.
         tasks: Arguments of the function.
-        jobs: Number of processes; all cores by default. With 1, and for a single task, tasks run in
-            this process, which a crash ends.
+        jobs: Number of processes; by default one per core. With 1, and for a single task, tasks run
+            in this process, which a crash ends, unless ``in_processes`` is true.
         dask: Address of a Dask scheduler, whose workers replace the processes. The workers must be
             able to import hlsim and to read the same files.
         in_processes: Whether tasks run in another process even if ``jobs`` is 1.

@@ -1,6 +1,7 @@
 """Scores on disk: each is appended when it is known, so that an interrupted run can be continued.
 
-The file holds one JSON object per line, so that two runs can share it and people can read it.
+The file holds one JSON object per line. Two runs can append to it at the same time, and people can
+read it.
 """
 
 from __future__ import annotations
@@ -13,16 +14,20 @@ from pathlib import Path
 
 
 class ScoreStore:
-    """Stored scores, by a hash of everything that decides a score.
+    """Stored scores, each under a key: a hash of everything on which the score depends.
 
     The file has one line ``{"key": ..., "values": ...}`` per score, and only grows. The last line
     with a key counts. A line that an interruption cut short is ignored.
 
     Args:
-        path: File of scores, which is created with the first one. None keeps them in memory.
+        path: File of scores, which is read if it exists and is created with the first score. None
+            keeps scores in memory.
 
     Attributes:
-        scores: Measured values by column, under the key of each score.
+        scores: Dict from key to measured values, by column.
+
+    Raises:
+        OSError: The file cannot be read.
 
     >>> store = ScoreStore()
     >>> store.append("abc", {"haspi": 0.5})
@@ -45,11 +50,12 @@ class ScoreStore:
         """Store a score under a key. The file, if any, has the score when this method returns.
 
         Args:
-            key: Hash of everything that decides the score.
+            key: Hash of everything on which the score depends.
             values: Measured values by column.
 
         Raises:
-            ValueError: JSON cannot represent the values.
+            ValueError: A value is NaN or infinite.
+            OSError: The file cannot be written.
         """
         score = {"key": key, "values": values}
         line = json.dumps(score, ensure_ascii=False, allow_nan=False)
