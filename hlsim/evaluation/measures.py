@@ -36,7 +36,7 @@ from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
 from hlsim.torchtools import compute_once
 
-_CORRELATION_FLOOR = 0.2
+CORRELATION_FLOOR = 0.2
 """Largest magnitude of the correlation coefficient at which the lag of an output is unknown."""
 
 NORMAL = Audiogram.standard("NH")
@@ -309,12 +309,32 @@ def find_lag(output: Tensor, clean: Tensor) -> int | None:
     >>> find_lag(torch.nn.functional.pad(speech, (32, 0)), speech)
     32
     """
+    lag, coefficient = correlate(output, clean)
+    return lag if coefficient > CORRELATION_FLOOR else None
+
+
+def correlate(output: Tensor, clean: Tensor) -> tuple[int, float]:
+    """Return the lag of the largest cross-correlation of two signals, and its coefficient.
+
+    Args:
+        output: The output. Shape: (time,).
+        clean: Clean speech. Shape: (time,).
+
+    Returns:
+        The number of samples by which the output is later, and the absolute coefficient, 0 to 1,
+        which is 0 if a signal is constant.
+
+    >>> speech = torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    >>> lag, coefficient = correlate(torch.nn.functional.pad(-speech, (32, 0)), speech)
+    >>> lag, round(coefficient, 3)
+    (32, 1.0)
+    """
     signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
     correlation = np.abs(scipy.signal.correlate(*signals, method="fft"))
     peak = correlation.argmax()
-    lowest = _CORRELATION_FLOOR * np.prod([np.linalg.norm(signal) for signal in signals])
     lags = scipy.signal.correlation_lags(len(output), len(clean))
-    return int(lags[peak]) if correlation[peak] > lowest else None
+    scale = np.prod([np.linalg.norm(signal) for signal in signals])
+    return int(lags[peak]), float(correlation[peak] / scale) if scale else 0.0
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:

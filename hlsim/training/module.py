@@ -182,10 +182,10 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
         simulator: Name, folder or module, see ``load_simulator``.
 
     Returns:
-        The name of the simulator, or its class with its settings, under ``role``. For a network, a
-        hash of its weights follows under ``role`` with ``_sha256``, because a folder may contain
-        another network when the training resumes. For your own code without an attribute
-        ``fingerprint``, a hash of its file follows under ``role`` with ``_code_sha256``.
+        The name of the simulator, or its class with its settings, under ``role``. For a network,
+        and for a module of your own, a hash of its weights follows under ``role`` with ``_sha256``,
+        because a file may contain others when the training resumes. For your own code without an
+        attribute ``fingerprint``, a hash of its file follows under ``role`` with ``_code_sha256``.
 
     Raises:
         ValueError: There is no such simulator.
@@ -195,25 +195,28 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     """
     loaded = load_simulator(simulator)
     if isinstance(loaded, PluginSimulator):
-        return {role: str(loaded), **_hash_code(role, loaded.plugin.function)}
+        return {role: str(loaded), **_hash_own(role, loaded.plugin.function)}
     if isinstance(simulator, nn.Module):
-        state = {name: tensor.cpu().contiguous() for name, tensor in loaded.state_dict().items()}
-        digest = hashlib.sha256(safetensors.torch.save(state)).hexdigest()
         name = f"{type(simulator).__name__}({simulator.extra_repr()})"
-        return {role: name, f"{role}_sha256": digest, **_hash_code(role, simulator)}
+        return {role: name, **_hash_own(role, simulator)}
     if str(simulator) in BUILT_IN:
         return {role: str(simulator)}
     return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}
 
 
-def _hash_code(role: str, code: Any) -> dict[str, str]:
-    """Return the hash of the file with the source code of a function or module of your own.
+def _hash_own(role: str, code: Any) -> dict[str, str]:
+    """Return hashes of a function or module: of its weights, and of the file of its source code.
 
-    It is empty for code of hlsim and torch, with an attribute ``fingerprint``, or without a file.
+    That of the weights is missing for a function. That of the file is missing for code of hlsim and
+    torch, with an attribute ``fingerprint``, or without a file.
     """
+    hashes = {}
+    if isinstance(code, nn.Module):
+        state = {name: tensor.cpu().contiguous() for name, tensor in code.state_dict().items()}
+        hashes[f"{role}_sha256"] = hashlib.sha256(safetensors.torch.save(state)).hexdigest()
     owner = code if inspect.isroutine(code) else type(code)
     package = str(getattr(owner, "__module__", "")).partition(".")[0]
-    if package in ("hlsim", "torch") or hasattr(code, "fingerprint"):
-        return {}
     digest = source_hash(owner)
-    return {} if digest is None else {f"{role}_code_sha256": digest}
+    if digest and package not in ("hlsim", "torch") and not hasattr(code, "fingerprint"):
+        hashes[f"{role}_code_sha256"] = digest
+    return hashes

@@ -117,7 +117,8 @@ def test_the_program_amplifies_as_the_aid_does(program: str, ear: str) -> None:
     text = ""
     for level in (50.0, 65.0, 80.0):
         if not text or program in ("equalizer-apo", "camilladsp"):
-            text = export_gains(aid, ear, program, level, 48000)
+            one_level = {"level": level} if program in ("equalizer-apo", "camilladsp") else {}
+            text = export_gains(aid, ear, program, **one_level)
         error = APPLY[program](text, level) - aid.gains(ear, level).double().numpy()
         assert np.abs(error).max() < TOLERANCE_DB
 
@@ -157,3 +158,20 @@ def test_other_formats_several_ears_and_low_rates_are_refused() -> None:
         export_gains(WDRC(), ["N3", "N4"], "csv")
     with pytest.raises(ValueError, match="sample_rate"):
         export_gains(WDRC(), "N3", "camilladsp", sample_rate=8000)
+
+
+@pytest.mark.parametrize(
+    ("program", "option"),
+    [
+        ("csv", "--level"),
+        ("openmha", "--level"),
+        ("csv", "--sample-rate"),
+        ("equalizer-apo", "--sample-rate"),
+    ],
+)
+def test_an_option_without_effect_is_refused(
+    program: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export-gains", "--audiogram", "N3", "--compensator", "nalr", "--to", program]
+    assert main([*command, option, "80" if option == "--level" else "44100"]) == 2
+    assert f"({option}) has no effect on the format {program}" in capsys.readouterr().err

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 import hlsim
-from compensators import NALR, WDRC
+from compensators import NALR, WDRC, load_compensator
 from compensators.filter_bank import SPEECH_SPECTRUM, speech_density
 from hlsim.audio import write_audio
-from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
+from hlsim.data.bundled import SPEECH
 from hlsim.evaluation.fitting.verification import prescribed_gains, section_powers, verify
 from hlsim.metrics.sii import INTERNAL_NOISE, SII_BANDS, sii
 
@@ -122,8 +123,26 @@ def test_recordings_that_do_not_belong_together_are_refused() -> None:
         verify(speech, speech * torch.nan, "N3", RATE)
     with pytest.raises(ValueError, match="input_ is silent"):
         verify(torch.zeros_like(speech), speech, "N3", RATE)
+    with pytest.raises(ValueError, match="output is silent"):
+        verify(speech, torch.zeros_like(speech), "N3", RATE)
+    other_speech = hlsim.load_audio(SPEECH / "train/flite-slt-01.flac", sample_rate=RATE)[
+        0
+    ].flatten()
+    samples = min(len(speech), len(other_speech))
+    with pytest.raises(ValueError, match=r"not similar \(correlation 0\.\d+, expected 0\.4"):
+        verify(speech[:samples], other_speech[:samples], "N3", RATE)
     with pytest.raises(ValueError, match="expected input_ to be a floating-point tensor"):
         verify((1000.0 * speech).short(), speech, "N3", RATE)
+
+
+@pytest.mark.parametrize("aid", ["wdrc", "compensator-general"])
+def test_the_output_of_an_aid_in_noise_belongs_to_its_input(aid: str) -> None:
+    speech = hlsim.example_speech()
+    noise = torch.from_numpy(np.random.default_rng(0).standard_normal(len(speech))).float()
+    noisy = speech + 0.03 * noise
+    with torch.no_grad():
+        output = load_compensator(aid)(noisy, Audiogram.standard("N6"))
+    assert verify(noisy, output, "N6", RATE).gains[1, 8] > 20.0  # at 1 kHz
 
 
 def test_command_prints_a_table_and_writes_it_with_a_plot(

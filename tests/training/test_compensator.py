@@ -111,6 +111,28 @@ def test_a_training_does_not_continue_with_an_edited_simulator(
     assert record == {"simulator": f"{code}:half (version 1)"}
 
 
+def test_a_training_does_not_continue_with_other_weights_of_a_simulator_of_your_own(
+    data: TrainingData, tmp_path: Path
+) -> None:
+    weights = tmp_path / "weights.pt"
+    code = tmp_path / "gain.py"
+    code.write_text(f"""import torch
+
+class Gain(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.load({str(weights)!r}))
+
+    def forward(self, waveform, audiogram):
+        return self.gain * waveform
+""")
+    torch.save(torch.tensor(0.5), weights)
+    train(data, SMALL, tmp_path / "out", simulator=f"{code}:Gain")
+    torch.save(torch.tensor(0.1), weights)
+    with pytest.raises(ValueError, match="differs in simulator_sha256;"):
+        train(data, SMALL, tmp_path / "out", simulator=f"{code}:Gain")
+
+
 @pytest.mark.parametrize("simulator", ["attenuation", "hlsim:MSBG"])
 def test_a_simulator_without_a_checkpoint_trains(
     simulator: str, data: TrainingData, tmp_path: Path

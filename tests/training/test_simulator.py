@@ -128,7 +128,9 @@ def test_another_teacher_is_recorded_and_needs_another_folder(
     teacher = f"{Path(__file__).parents[2]}/examples/training/dead_region.py:DeadRegion"
     folder = train_simulator(data, recipe, out=tmp_path, teacher=teacher, accelerator="cpu")
     assert read_record(folder)["about"]["teacher"] == teacher
-    with pytest.raises(ValueError, match="differs in teacher, teacher_code_sha256;"):
+    with pytest.raises(
+        ValueError, match="differs in teacher, teacher_code_sha256, teacher_sha256;"
+    ):
         train_simulator(data, recipe, out=tmp_path)
 
 

@@ -25,10 +25,11 @@ def export_gains(parser: Parser) -> None:
     option("--compensator", str, text, "hearing-aid")
     text = (
         "level of speech in dB SPL for which camilladsp and equalizer-apo amplify; the other "
-        "formats have gains at many levels"
+        "formats have gains at many levels (default: 65)"
     )
-    option("--level", sound_level, text, 65.0)
-    option("--sample-rate", count, "sample rate in Hz of camilladsp or openmha", 48000)
+    option("--level", sound_level, text)
+    text = "sample rate in Hz of camilladsp or openmha (default: 48000)"
+    option("--sample-rate", count, text)
     option("--out", Path, "file to write; without it, the text is printed")
     parser.set_defaults(full_scale_spl=94.0)  # for the aid, whose signals are in pascals
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from compensators.aid import Aid, thirds_of_octave
 from compensators.filter_bank import RATE, speech_density
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_number
 
 Array = NDArray[np.float64]
@@ -38,6 +37,14 @@ At higher rates it is larger, so that the filter lasts as long.
 """
 
 TAPS_RATE = 48000
+
+_SETTINGS = {
+    "camilladsp": ("level", "sample_rate"),
+    "equalizer-apo": ("level",),
+    "openmha": ("sample_rate",),
+    "csv": (),
+}
+"""Settings of ``export_gains`` that change each format."""
 
 _HERTZ = np.arange(1, RATE // 2 + 1)
 """Frequencies in Hz of ``speech_density`` and of the gains for the design of filters, (8000,)."""
@@ -84,7 +91,11 @@ class _Fitting(NamedTuple):
 
 
 def export_gains(
-    aid: Aid, ear: Any, program: str, level: float = 65.0, sample_rate: int = NEURO_RATE
+    aid: Aid,
+    ear: Any,
+    program: str,
+    level: float | None = None,
+    sample_rate: int | None = None,
 ) -> str:
     """Return the gains of an aid for an ear as the text of a file for another program.
 
@@ -92,14 +103,16 @@ def export_gains(
         aid: Aid, such as ``NALR()`` or one from ``load_compensator``.
         ear: Audiogram of one ear.
         program: Name of the format: ``camilladsp``, ``equalizer-apo``, ``openmha`` or ``csv``.
-        level: Level of speech in dB SPL, 0 to 120, for ``camilladsp`` and ``equalizer-apo``.
-        sample_rate: Sample rate in Hz of CamillaDSP or openMHA, 16000 to 192000.
+        level: Level of speech in dB SPL, 0 to 120, for ``camilladsp`` and ``equalizer-apo``; 65 by
+            default. The other formats have gains at many levels.
+        sample_rate: Sample rate in Hz of CamillaDSP or openMHA, 16000 to 192000; 48000 by default.
 
     Returns:
         Text of the configuration file.
 
     Raises:
-        ValueError: There is no such format, or an ear or a number is not valid.
+        ValueError: There is no such format, an ear or a number is not valid, or a setting has no
+            effect on the format.
 
     >>> from compensators import NALR
     >>> print(export_gains(NALR(), "N3", "equalizer-apo").splitlines()[-1][:33])
@@ -107,8 +120,15 @@ def export_gains(
     """
     if program not in PROGRAMS:
         raise ValueError(f"no format {program!r}; expected one of {', '.join(PROGRAMS)}")
-    check_number("sample_rate", sample_rate, RATE, 192000)
-    return PROGRAMS[program](_Fitting(aid, ear, level, sample_rate))
+    for name, value in {"level": level, "sample_rate": sample_rate}.items():
+        if value is not None and name not in _SETTINGS[program]:
+            option = "--" + name.replace("_", "-")
+            raise ValueError(
+                f"{name} ({option}) has no effect on the format {program}; leave it out"
+            )
+    rate = TAPS_RATE if sample_rate is None else sample_rate
+    check_number("sample_rate", rate, RATE, 192000)
+    return PROGRAMS[program](_Fitting(aid, ear, 65.0 if level is None else level, rate))
 
 
 def _equaliser_points(gains: Array) -> Array:

@@ -19,7 +19,7 @@ from compensators.filter_bank import SPEECH_SPECTRUM
 from hlsim.audiogram import FREQUENCIES, Audiogram, as_audiogram
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
-from hlsim.evaluation.measures import find_lag
+from hlsim.evaluation.measures import CORRELATION_FLOOR, correlate
 from hlsim.metrics.band_levels import normal_threshold
 from hlsim.metrics.pair import check_finite
 from hlsim.metrics.sii import SII_BANDS, sii
@@ -37,6 +37,13 @@ MIN_SECONDS = 1.0
 
 TARGET_STEP = 5.0
 """Largest distance in dB between levels of speech at which a prescription's gains are computed."""
+
+SIMILARITY_FLOOR = 0.4
+"""Correlation of input and output, by waveforms or levels, below which they are other sounds.
+
+Of the bundled recordings, two different ones reach 0.27. The outputs of the bundled aids, also in
+noise, have at least 0.69.
+"""
 
 UNCOMFORTABLE_LEVEL = (88.8, 0.25)
 """Level in dB HL from which a tone is uncomfortable for a normal ear, and its rise per dB of loss.
@@ -131,8 +138,9 @@ def verify(
         prescription: Aid whose gains are the targets: ``nalr``, ``wdrc``, or a checkpoint.
 
     Raises:
-        ValueError: A signal has several channels, NaN or infinity, or is too short; the input is
-            silent; the lengths do not fit; or an argument is not valid.
+        ValueError: A signal has several channels, NaN or infinity, or is too short; one of them is
+            silent; the two are not recordings of the same sound; the lengths do not fit; or an
+            argument is not valid.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()
@@ -151,6 +159,8 @@ def verify(
         check_finite(name, check_waveform(signal, name, full_scale_spl=full_scale_spl)[None])
     if not bool(input_.any()):
         raise ValueError("input_ is silent; pass the sound that the aid received")
+    if not bool(output.any()):
+        raise ValueError("output is silent; pass the sound that the aid produced")
     if min(len(input_), len(output)) < MIN_SECONDS * rate:
         raise ValueError("expected at least 1 s of sound; 15 s of speech and more are better")
     if abs(len(input_) - len(output)) > rate:
@@ -158,10 +168,11 @@ def verify(
             f"input and output differ in length by more than 1 s, {len(input_)} and "
             f"{len(output)} samples; expected recordings of the same sound"
         )
-    input_, output = _cut_to_common_sound(input_, output, rate)
+    input_, output, correlation = _cut_to_common_sound(input_, output, rate)
     hertz = np.array(SII_BANDS, dtype=float)
     gain = gain_to_pascals(full_scale_spl)
     powers = [section_powers(gain * signal, rate) for signal in (input_, output)]
+    _check_related(correlation, *powers)
     input_levels, output_levels = (
         np.percentile(_level(power), PERCENTILES, axis=0) for power in powers
     )
@@ -183,17 +194,21 @@ def verify(
     )
 
 
-def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Tensor, Tensor]:
+def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Tensor, Tensor, float]:
     """Cut two recordings to the sound that both have, in CPU memory and without a gradient.
 
     If they are not similar enough to find the lag of the output, a lag of 0 is assumed. Shape:
     (time,), (time,) -> (samples,), (samples,).
 
+    Returns:
+        The input, the output, and the coefficient of their cross-correlation at the best lag.
+
     Raises:
         ValueError: The output is later or earlier by more than 1 s, or less than 1 s is common.
     """
     input_, output = input_.detach().cpu(), output.detach().cpu()
-    lag = find_lag(output, input_) or 0
+    best_lag, correlation = correlate(output, input_)
+    lag = best_lag if correlation > CORRELATION_FLOOR else 0
     if abs(lag) > rate:
         raise ValueError(
             f"the output is {lag / rate:.1f} s later than the input (earlier, if negative); cut "
@@ -205,7 +220,28 @@ def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Ten
         raise ValueError(
             f"input and output have only {samples / rate:.1f} s in common; expected 1 s or more"
         )
-    return input_[:samples], output[:samples]
+    return input_[:samples], output[:samples], correlation
+
+
+def _check_related(correlation: float, input_powers: Array, output_powers: Array) -> None:
+    """Raise ValueError if two recordings are not those of the same sound.
+
+    An aid changes the waveform or the levels of sections, but not both altogether.
+
+    Args:
+        correlation: Coefficient of the cross-correlation of the waveforms at the best lag.
+        input_powers: Powers of sections in third octaves, (sections, 18).
+        output_powers: Those of the output.
+    """
+    levels = [_level(powers) for powers in (input_powers, output_powers)]
+    changes = [(level - level.mean(0)).ravel() for level in levels]
+    scale = np.linalg.norm(changes[0]) * np.linalg.norm(changes[1])
+    similarity = max(correlation, float(np.dot(*changes) / scale) if scale else 0.0)
+    if similarity < SIMILARITY_FLOOR:
+        raise ValueError(
+            f"input and output are not similar (correlation {similarity:.2f}, expected "
+            f"{SIMILARITY_FLOOR} or more); pass two recordings of the same sound"
+        )
 
 
 def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Array:
