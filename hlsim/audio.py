@@ -73,10 +73,10 @@ def read_audio(path: str | Path) -> tuple[Tensor, int]:
 
 @dataclass(frozen=True)
 class AudioInfo:
-    """Properties of an audio file, found without keeping its samples in memory.
+    """Properties of an audio file, from ``scan_audio``.
 
     Attributes:
-        path: The file.
+        path: Path of the file.
         sample_rate: Sample rate in Hz.
         channels: Number of channels.
         samples: Number of samples per channel.
@@ -96,11 +96,13 @@ class AudioInfo:
 def scan_audio(path: str | Path) -> AudioInfo:
     """Read an audio file once, a part at a time, and return its properties.
 
+    The samples are not kept in memory. A truncated file is read up to its end, with a warning.
+
     Args:
         path: Audio file with a sample rate of 16 kHz or more.
 
     Raises:
-        ValueError: ``read_audio`` would reject the file.
+        ValueError: The file is one that ``read_audio`` rejects.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> recording = scan_audio(EXAMPLE_FILE)
@@ -120,10 +122,10 @@ def scan_audio(path: str | Path) -> AudioInfo:
 
 
 def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Iterator[Tensor]:
-    """Yield parts of a recording, each of them read when it is needed.
+    """Yield parts of a recording, each of which is read only when it is needed.
 
     Args:
-        recording: AudioInfo from ``scan_audio``.
+        recording: Properties of the recording, from ``scan_audio``.
         bounds: Half-open range of samples of each part, in ascending order. Parts may overlap, and
             have no gap between them.
 
@@ -131,7 +133,7 @@ def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Itera
         Samples in float32, (channels, time), where 1.0 is full scale.
 
     Raises:
-        ValueError: The file has become shorter since it was scanned.
+        ValueError: The file is missing, cannot be read, or is shorter than when it was scanned.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> parts = read_parts(scan_audio(EXAMPLE_FILE), [(0, 1000), (900, 2000)])
@@ -153,9 +155,10 @@ def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Itera
 
 @contextmanager
 def _open_audio(path: str | Path) -> Iterator[soundfile.SoundFile]:
-    """Open an audio file.
+    """Open an audio file for a ``with`` block.
 
-    A missing file raises ValueError, and each exception in the ``with`` block becomes one.
+    Raises:
+        ValueError: There is no such file, or an exception was raised in the block.
     """
     if not Path(path).is_file():
         raise ValueError(f"{path}: there is no such audio file; correct the path")
@@ -201,7 +204,7 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
 
     Raises:
         ValueError: The extension is not .wav, the shape or the sample rate is not supported, or
-            samples are NaN or infinite.
+            samples are NaN, infinite or above 1e9, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -231,7 +234,7 @@ def write_parts(
 
     Raises:
         ValueError: The extension is not .wav, the sample rate is not supported, the signal is too
-            long for a WAV file (4 GB), or samples are NaN or infinite.
+            long for a WAV file (4 GB), samples are NaN or infinite, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -277,7 +280,7 @@ def encode_wav(waveform: Tensor, sample_rate: int) -> bytes:
     at some positions, and stops.
 
     Args:
-        waveform: Samples from -1 to 1, (time,) or (channels, time).
+        waveform: Samples from -1 to 1, (time,) or (channels, time). Larger ones are clipped.
         sample_rate: Sample rate in Hz.
 
     Returns:
@@ -295,16 +298,16 @@ def encode_wav(waveform: Tensor, sample_rate: int) -> bytes:
 def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
     """Find all audio files in a folder and its subfolders, except hidden ones, sorted by path.
 
-    Links to files and folders are followed. A file that is found several times, because links lead
-    to it or to a folder that contains it, is listed once, where it lies or else under one of its
-    paths, and a warning counts the links that are left out. Links may form a circle. Files are
-    audio if their names have one of the ``EXTENSIONS``. Audio in formats that libsndfile does not
-    read, such as M4A, causes a warning.
+    Links to files and folders are followed, even if they form a circle. A file that is found
+    several times, because links lead to it or to a folder that contains it, is listed once: under
+    its own path if that is in the folder, or else under the path of one link. A warning counts the
+    links that are left out. Files are audio if their names have one of the ``EXTENSIONS``. Audio in
+    formats that libsndfile does not read, such as M4A, causes a warning.
 
     Args:
         folder: Folder to search.
-        by_name: Whether to list a file under each of the names of links to it, because names
-            matter: those of two outputs may lead to one file of clean speech.
+        by_name: Whether to list a file under the names of all links to it. This is needed where
+            names have a meaning, for example if the clean speech of two outputs is one file.
 
     Raises:
         ValueError: There is no such folder, a folder in it cannot be read, there is no audio in it,
@@ -357,9 +360,10 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
 
 
 def _visible_files(folder: str | Path) -> Iterator[tuple[Path, str]]:
-    """Yield the paths and the real paths of files and repeated folders that are not hidden.
+    """Yield the path and the real path of each file, and of each link to a searched folder.
 
-    Every folder is searched once: first all that are no links, then those to which links lead.
+    Hidden files and folders are left out. Every folder is searched once: first the folders that are
+    no links, then those to which links lead.
 
     Args:
         folder: Folder to search.

@@ -16,7 +16,7 @@ PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
 
 NEURO_RATE = 16000
-"""Sample rate in Hz at which the networks work, and default rate of every function."""
+"""Sample rate in Hz at which the networks work, and default rate of all modules and functions."""
 
 LOWEST_SPL, HIGHEST_SPL = -20.0, 140.0
 """Range of levels in dB SPL of recordings: from inaudible to a level that damages ears at once."""
@@ -90,7 +90,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
         waveform: Samples.
         spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
             dimensions, from the level of silence (-106 at the default scale) to 140 dB SPL. A
-            tensor on a GPU is not validated, because that would make the CPU wait.
+            tensor on a GPU is not validated, because that would synchronise with the GPU.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
@@ -144,9 +144,10 @@ def dbfs(waveform: Tensor) -> Tensor:
 
 
 def _check_levels(levels: Tensor, full_scale_spl: float) -> None:
-    """Raise ValueError unless levels are those of sounds or of silence.
+    """Raise ValueError unless levels in dB SPL are from that of silence to 140.
 
-    A gain of thousands of dB would give zeros, NaN or infinity without an error.
+    A gain of thousands of dB would give zeros, NaN or infinity without an error. Levels on a GPU
+    and in compiled programs are not validated.
     """
     if levels.device.type != "cpu" or torch.compiler.is_compiling():
         return

@@ -5,7 +5,7 @@ A folder has three files: the weights (``model.safetensors``), the settings of t
 exists while a model replaces an older one. The weights are those whose hash is in ``config.json``,
 so that one of the two models can be loaded at any time. No pickles are read or written, so that
 loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or
-``hearing-aid``, says which class of model it holds.
+``hearing-aid``, names the class of the saved model.
 """
 
 import hashlib
@@ -39,26 +39,29 @@ _WITHOUT_CHECKPOINT = ("msbg", "msbg-unsmeared", "attenuation", "nalr", "wdrc")
 CARD = "README.md"
 
 _REPLACED = {"neuro-msbg-light": "; neuro-msbg replaced it, which has its structure"}
-"""Reason why a name of an earlier version has no checkpoint."""
+"""Hint for an error message, by name of a checkpoint that existed in an earlier version."""
 
 SIMULATOR = "neuro-msbg"
 """Kind of the checkpoints of simulators."""
 
 DIGIT_LISTENER = "digit-listener"
-"""Kind of the checkpoints of listeners of the digit test. All other kinds are compensators."""
+"""Kind of the checkpoints of listeners of the digit test.
+
+All kinds other than this one and ``SIMULATOR`` are compensators.
+"""
 
 _LISTENER_LOADER = "hlsim.evaluation.digits.load_listener"
 
 _LOADERS = {SIMULATOR: "load_pretrained", DIGIT_LISTENER: _LISTENER_LOADER}
-"""Function that loads a checkpoint by its kind, unless ``load_compensator`` does."""
+"""Name of the function that loads a checkpoint, by kind. Other kinds: ``load_compensator``."""
 
 
 def list_pretrained() -> dict[str, str]:
     """List the simulators and aids that ship with hlsim as checkpoints.
 
     Returns:
-        Name of the function that loads it (``load_pretrained`` for a simulator,
-        ``load_compensator`` for an aid), by name of the checkpoint.
+        Dict from the name of each checkpoint to the name of the function that loads it:
+        ``load_pretrained`` for a simulator, ``load_compensator`` for an aid.
 
     >>> list_pretrained()["neuro-msbg"]
     'load_pretrained'
@@ -77,16 +80,15 @@ def read_checkpoint(
     kinds: Mapping[str, Callable[[Settings], Config]],
     build: Callable[[Config], Model],
 ) -> Model:
-    """Load a model from a checkpoint. The model is on torch's default device, or else on the CPU.
+    """Load a model from a checkpoint onto torch's default device.
 
-    The device ``meta``, on which models are built before their weights are loaded, is no place for
-    a model that has its weights.
+    If the default device is ``meta``, which stores no values, the model is loaded onto the CPU.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
-        kinds: Accepted kinds of checkpoints. The value of each is a function from the settings in
-            ``config.json`` to the object with which the model is built.
-        build: Function from this object to the model, whose weights are then loaded.
+        kinds: Accepted kinds of checkpoints. The value of each kind is a function that converts the
+            settings in ``config.json`` to the argument of ``build``.
+        build: Function that builds the model, whose weights are then loaded.
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, or its kind is not accepted.
@@ -124,7 +126,7 @@ def read_checkpoint(
 
 
 def read_weights(folder: str | Path) -> bytes:
-    """Read the weights of a checkpoint in safetensors' format.
+    """Read the weights of a checkpoint as bytes in safetensors' format.
 
     Args:
         folder: Folder of the checkpoint.
@@ -149,7 +151,13 @@ def read_weights(folder: str | Path) -> bytes:
 
 
 def _check_hash(file: Path, digest: str, recorded: Any) -> None:
-    """Raise ValueError if the hash of a file is not the recorded one."""
+    """Raise ValueError unless the hash of a file is the recorded one.
+
+    Args:
+        file: File, for the message.
+        digest: SHA-256 of the file or of the part that is validated.
+        recorded: SHA-256 in ``config.json``.
+    """
     if digest != recorded:
         raise ValueError(
             f"{file}: the file is damaged or was changed after saving, because its SHA-256 is not "
@@ -158,14 +166,15 @@ def _check_hash(file: Path, digest: str, recorded: Any) -> None:
 
 
 def read_record(name: str | Path) -> dict[str, Any]:
-    """Read what ``config.json`` records of a checkpoint of any kind.
+    """Read the record of a checkpoint of any kind, the contents of its ``config.json``.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
 
     Returns:
-        Among others ``kind``; ``sha256``, which identifies the weights; and ``about``, which says
-        how the model was trained: data, seed, command, time, measures and version.
+        Dict with, among others, ``kind``; ``config``, the settings of the model; ``sha256``, which
+        identifies the weights; and ``about``, the record of the training: data, seed, command,
+        time, measures and version.
 
     Raises:
         ValueError: There is no such checkpoint, or the file cannot be read.
@@ -181,7 +190,11 @@ def read_record(name: str | Path) -> dict[str, Any]:
 
 
 def _find_folder(name: str | Path) -> Path:
-    """Return the folder of a checkpoint, also if the name is that of the folder of a training.
+    """Return the folder of a checkpoint.
+
+    Args:
+        name: Folder of the checkpoint, folder of a training run, whose subfolder ``checkpoint`` is
+            then the checkpoint, or name of a checkpoint that ships with hlsim.
 
     Raises:
         ValueError: There is no such checkpoint.
@@ -202,7 +215,7 @@ def _find_folder(name: str | Path) -> Path:
 def checkpoints_folder() -> Path:
     """Return the folder of the checkpoints that ship with hlsim.
 
-    It is inside an installed package, and beside the package in a source tree.
+    The folder is inside an installed package, and beside the package in a source tree.
 
     >>> checkpoints_folder().name
     'checkpoints'
@@ -223,8 +236,8 @@ def save_checkpoint(
     """Save a model as a checkpoint, in place of an older one in the same folder.
 
     If writing fails, or the process is killed, the older checkpoint or the new one can be loaded.
-    Other files in the folder always stay, and so does a card that somebody wrote; otherwise, a card
-    is written that lists ``about``.
+    Other files in the folder stay. A card that lists ``about`` is written, unless the folder
+    contains a card that was not written by this function.
 
     Args:
         folder: Folder to write.
@@ -232,7 +245,7 @@ def save_checkpoint(
         model: Model whose state dict is saved.
         config: Settings with which the model can be built again, as JSON values.
         about: Record of the training: data, seed, command, time, measures and version.
-        card: Metadata of the card beside those of every card, such as ``{"license": "mit"}``.
+        card: Further metadata of the card, such as ``{"license": "mit"}``.
 
     Raises:
         ValueError: The folder cannot be written.
@@ -265,9 +278,15 @@ def save_checkpoint(
 
 
 def _write_card(folder: Path, kind: str, about: Settings, metadata: Settings) -> None:
-    """Write a card with a table of ``about``, unless there is a card that somebody else wrote.
+    """Write a card with a table of ``about``, unless there is a card that a person wrote.
 
-    It begins with the metadata by which the Hugging Face Hub lists models.
+    The card begins with the metadata by which the Hugging Face Hub lists models.
+
+    Args:
+        folder: Folder of the checkpoint.
+        kind: Kind of the checkpoint.
+        about: Record of the training.
+        metadata: Further metadata, such as the licence.
     """
     path, table_head = folder / CARD, "| record | value |\n|---|---|"
     if path.exists() and table_head not in path.read_text(encoding="utf-8"):
@@ -288,17 +307,18 @@ def _write_card(folder: Path, kind: str, about: Settings, metadata: Settings) ->
 
 
 def _digest(config: Any) -> str:
-    """Compute the SHA-256 of a configuration, independent of the order of its settings."""
+    """Compute the SHA-256 of a configuration, which does not depend on the order of settings."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
 class HubModel:
-    """Methods with which a simulator or an aid is saved, loaded and shared, as on Hugging Face.
+    """Base class with methods that save, load and share a simulator or an aid.
 
-    A repository of the Hub is a folder as ``save_checkpoint`` writes it. Only ``push_to_hub``, and
-    ``from_pretrained`` of a repository that is no local folder, use the network; they need the
-    extra ``hub``. The names are those of ``huggingface_hub.PyTorchModelHubMixin``, which is no base
-    class here because hlsim works without this package.
+    A repository of the Hugging Face Hub is a folder as ``save_checkpoint`` writes it. Only
+    ``push_to_hub``, and ``from_pretrained`` of a repository that is no local folder, use the
+    network; they need the extra ``hub``. The names of the methods are those of
+    ``huggingface_hub.PyTorchModelHubMixin``, which is no base class here because hlsim works
+    without this package.
 
     >>> import hlsim
     >>> with TemporaryDirectory() as folder:
@@ -349,7 +369,7 @@ class HubModel:
         token: str | bool | None = None,
         **settings: Any,
     ) -> Self:
-        """Load a model in evaluation mode, with weights that are not trained further.
+        """Load a model in evaluation mode, whose weights do not require a gradient.
 
         Args:
             name: Folder of a checkpoint, name of one that ships with hlsim, or ``user/name`` of a
@@ -360,7 +380,8 @@ class HubModel:
             settings: Arguments of the class, such as ``sample_rate``.
 
         Raises:
-            ValueError: There is no such checkpoint, it is damaged, or of another kind.
+            ValueError: There is no such checkpoint, it is damaged or of another kind, or a setting
+                is out of range.
             MissingExtraError: A repository is to be downloaded, and the extra ``hub`` is missing.
         """
         try:

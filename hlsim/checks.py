@@ -24,10 +24,10 @@ HIGHEST_SAMPLE = 1e9
 """Largest accepted sample. From 1e14 on, products of powers exceed the range of float32."""
 
 LOUDEST_SPL = 120.0
-"""RMS level in dB SPL above which the first waveform causes a warning."""
+"""RMS level in dB SPL above which a warning is given, once per process."""
 
 MOST_CHANNELS = 8
-"""A last dimension of at most this many values behind a longer one holds channels, not time."""
+"""Largest last dimension that, behind a longer dimension, is taken as channels instead of time."""
 
 Lengths = Tensor | Sequence[int]
 """Number of samples of each item of a padded batch, in the shape of the leading dimensions."""
@@ -53,7 +53,9 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
 
 
 def check_attributes(thing: Any, noun: str, **expected: Any) -> None:
-    """Raise ValueError unless those attributes of an object that exist have the expected values.
+    """Raise ValueError if an object has an attribute with another value than expected.
+
+    An object without the attribute is accepted.
 
     Args:
         thing: Object to validate.
@@ -111,7 +113,9 @@ def check_number(
 
 
 def reject_duplicates(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the members of a JSON object, of which Python would take the last one of equal keys.
+    """Convert the members of a JSON object to a dict, and reject keys that occur twice.
+
+    Without this function, ``json`` would use the last value of such a key.
 
     Args:
         pairs: Keys and values, as ``json.loads`` passes them to its ``object_pairs_hook``.
@@ -210,8 +214,8 @@ def check_waveform(
 ) -> Tensor:
     """Validate that a tensor is a waveform, and return it.
 
-    NaN and infinity pass, and make their item's results NaN. The values are not validated on a GPU,
-    for which the CPU would have to wait, nor in a compiled program.
+    NaN and infinity pass, and make the results of their item NaN. The values are not validated on a
+    GPU, because that would synchronise with the GPU, nor in a compiled program.
 
     Args:
         waveform: Tensor of shape (..., time).
@@ -220,8 +224,8 @@ def check_waveform(
             whose level is above 120 dB SPL causes a warning.
 
     Raises:
-        ValueError: It is not a floating-point tensor with time last, has no samples, or has a
-            sample whose magnitude is above 1e9 (unless another one is NaN or infinite).
+        ValueError: The value is not a floating-point tensor with time last, has no samples, or has
+            a sample whose magnitude is above 1e9 (unless another one is NaN or infinite).
 
     >>> check_waveform(torch.zeros(2, 16000)).shape
     torch.Size([2, 16000])
@@ -288,7 +292,14 @@ _has_warned_of_level = False
 
 
 def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: float) -> None:
-    """Warn once per process of an item whose level is above ``LOUDEST_SPL``."""
+    """Warn, once per process, of a waveform with an item whose level is above ``LOUDEST_SPL``.
+
+    Args:
+        waveform: Signals, (..., time).
+        name: Name of the argument, for the message.
+        peak: Largest magnitude of a sample.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
+    """
     global _has_warned_of_level
     highest_rms = 10.0 ** ((LOUDEST_SPL - full_scale_spl) / 20.0)
     # No RMS is above the peak, so that the level of other waveforms need not be computed.

@@ -62,10 +62,10 @@ TOLERANCE = 1e-4
 """Largest error of an ONNX file, relative to the peak of the output."""
 
 EAR = torch.linspace(20.0, 90.0, len(FREQUENCIES))
-"""Thresholds in dB HL with which ONNX files are checked."""
+"""Thresholds in dB HL of the ear for which ONNX files are validated."""
 
 CHECKED_CALLS = 16
-"""Number of calls, with successive noise, with which the program of an aid is checked."""
+"""Number of calls, with successive parts of noise, by which the program of an aid is validated."""
 
 STATELESS_INPUTS = ("samples", "fitted", "sliders")
 """Names of the inputs of an aid's program that are not part of its state."""
@@ -77,10 +77,10 @@ def export_program(
     """Convert a Neuro-MSBG to a ``torch.export`` program for a fixed number and length of signals.
 
     ``program.module()`` is a function of ``waveform`` (items, time), whose RMS of 1.0 is
-    ``simulator.full_scale_spl`` dB SPL, and ``thresholds`` (items, 8) in dB HL. It returns a
-    dictionary with ``perceived`` (items, time), what the ears perceive, in the scale of
-    ``waveform``. The program does not validate its inputs. All tensors have the dtype and device of
-    the simulator's weights.
+    ``simulator.full_scale_spl`` dB SPL, and ``thresholds`` (items, 8) in dB HL. It returns a dict
+    with ``perceived`` (items, time), the perceived signals on the scale of ``waveform``. The
+    program does not validate its inputs. All tensors have the dtype and device of the simulator's
+    weights.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
@@ -118,8 +118,9 @@ def export_onnx(
 ) -> None:
     """Write a Neuro-MSBG as an ONNX file for signals of a fixed length.
 
-    Its inputs are ``waveform`` (items, time) and ``thresholds`` (items, 8) in dB HL, its output is
-    ``perceived`` (items, time). Networks with Mamba blocks take minutes.
+    The file has the inputs ``waveform`` (items, time) and ``thresholds`` (items, 8) in dB HL, and
+    the output ``perceived`` (items, time), as in ``export_program``. Networks with Mamba blocks
+    take minutes. If an error is raised, no file is written.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
@@ -148,10 +149,10 @@ def export_onnx(
 def first_inputs(
     aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, hops: int = 1
 ) -> dict[str, Tensor]:
-    """Return the inputs with which the first call of an aid's program is made.
+    """Return the inputs for the first call of an aid's program.
 
-    Replace ``samples``, which are silence, by those of the signal. The sliders are those of
-    ``aid.SLIDERS``.
+    Replace ``samples``, which are silence, by those of the signal. The sliders have the default
+    values of ``aid.SLIDERS``.
 
     Args:
         aid: Aid at 16 kHz.
@@ -160,7 +161,7 @@ def first_inputs(
         hops: Number of hops of 64 samples per call.
 
     Returns:
-        Tensors by the names of inputs that the module's docstring lists.
+        Dict of the input tensors, whose names and shapes the module's docstring lists.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, or it rejects the ear.
@@ -212,7 +213,7 @@ def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export
 def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1) -> None:
     """Write a wearable aid as an ONNX file that processes a few ms per call.
 
-    Its inputs and outputs are those of ``hop_program``.
+    The inputs and outputs are those of ``hop_program``. If an error is raised, no file is written.
 
     Args:
         aid: Aid at 16 kHz.
@@ -221,8 +222,9 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
         hops: Number of hops of 64 samples (4 ms) per call.
 
     Raises:
-        ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
-            differs by more than 1e-4 of its peak in the last of 16 calls with noise at 64 dB SPL.
+        ValueError: The aid's sample rate is not 16000 Hz; ONNX lacks an operation; or an output or
+            state of onnxruntime differs by more than 1e-4 of its peak in the last of 16 calls with
+            noise at 64 dB SPL.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
@@ -242,8 +244,9 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
 def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     """Write an ONNX file that computes the parameters of a wearable aid from an audiogram.
 
-    Its input is ``thresholds`` (items, 8), in dB HL at ``hlsim.audiogram.FREQUENCIES``. Its output
-    is ``fitted`` (items, n), an input of the file that ``export_aid`` writes.
+    The file has the input ``thresholds`` (items, 8), in dB HL at ``hlsim.audiogram.FREQUENCIES``,
+    and the output ``fitted`` (items, n), an input of the file that ``export_aid`` writes. If an
+    error is raised, no file is written.
 
     Args:
         aid: Aid at any sample rate.
@@ -251,8 +254,8 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
         items: Number of ears per call.
 
     Raises:
-        ValueError: The output of onnxruntime differs from that of torch by more than 1e-4 of its
-            peak.
+        ValueError: ONNX lacks an operation, or the output of onnxruntime differs from that of torch
+            by more than 1e-4 of its peak.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
@@ -263,7 +266,7 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
 
 
 class _Call(nn.Module):
-    """A function of a model and of named tensors as a module, which ``torch.export`` expects."""
+    """Module that calls a function of a model and named tensors, as ``torch.export`` needs it."""
 
     def __init__(self, model: nn.Module, function: Callable[..., dict[str, Tensor]]) -> None:
         super().__init__()
@@ -275,7 +278,7 @@ class _Call(nn.Module):
 
 
 def _simulate(simulator: NeuroMSBG, waveform: Tensor, thresholds: Tensor) -> dict[str, Tensor]:
-    """Call a simulator without its validation, which reads the values of tensors."""
+    """Call a simulator without its validation, which would read the values of tensors."""
     gain = gain_to_pascals(simulator.full_scale_spl)
     return {"perceived": simulator.process_items(waveform * gain, thresholds) / gain}
 
@@ -300,7 +303,7 @@ def _process_hops(aid: Wearable, **inputs: Tensor) -> dict[str, Tensor]:
 def _to_program(
     model: nn.Module, function: Callable[..., dict[str, Tensor]], inputs: dict[str, Tensor]
 ) -> torch.export.ExportedProgram:
-    """Export a function of a model for inputs of the same names and shapes."""
+    """Export a function of a model for inputs with the names and shapes of ``inputs``."""
     with torch.no_grad(), warnings.catch_warnings():
         # torch.export warns of the list of weights in nn.LSTM, which does no harm.
         warnings.filterwarnings("ignore", r"The tensor attributes .*_flat_weights")
@@ -308,7 +311,7 @@ def _to_program(
 
 
 def _draw_noise(model: Any, *shape: int) -> Tensor:
-    """Draw noise at 64 dB SPL with which the file of a model is checked."""
+    """Draw noise at 64 dB SPL, on the model's scale, with which a model's file is validated."""
     gain = gain_to_pascals(model.full_scale_spl)
     return 0.03 / gain * torch.randn(*shape, generator=torch.Generator().manual_seed(0))
 
@@ -316,7 +319,18 @@ def _draw_noise(model: Any, *shape: int) -> Tensor:
 def _write_onnx(
     program: torch.export.ExportedProgram, path: str | Path, inputs: dict[str, Tensor]
 ) -> None:
-    """Write a program, and raise ValueError if onnxruntime computes other outputs than torch."""
+    """Write a program as an ONNX file, unless onnxruntime computes other outputs than torch.
+
+    Args:
+        program: Program to write.
+        path: File to write.
+        inputs: Inputs for which the outputs are compared.
+
+    Raises:
+        ValueError: ONNX lacks an operation, an output differs by more than ``TOLERANCE`` of its
+            peak, or the file cannot be written.
+        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+    """
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, "onnx")
     with torch.no_grad():

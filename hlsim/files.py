@@ -1,4 +1,4 @@
-"""Writing of files all at once, hashes of files, and reading of tables."""
+"""Atomic writing of files, locks on folders, hashes of files, and reading of tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ else:
 Result = TypeVar("Result")
 
 _LOCK = ".lock"
-"""Name of the file by which processes keep each other out of a folder."""
+"""Name of the file that a process locks to keep other processes out of a folder."""
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     block raises, ``path`` stays as it was.
 
     Args:
-        path: File to write. Its folder is made if there is none.
+        path: File to write. Its folder is created if there is none.
 
     Yields:
         The temporary path.
@@ -69,7 +69,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     process is killed.
 
     Args:
-        folder: Folder, which is made if there is none.
+        folder: Folder to lock, which is created if there is none.
 
     Raises:
         ValueError: Another process has locked the folder, or the folder cannot be written.
@@ -172,7 +172,7 @@ def sha256(path: Path) -> str:
 def source_hash(code: Any) -> str | None:
     """Compute the SHA-256 of the file with the source code of a class or function.
 
-    It is None if there is no such file, as for code in a notebook.
+    The result is None if there is no such file, as for code in a notebook.
 
     >>> source_hash(len) is None
     True
@@ -249,7 +249,7 @@ def warn_of_unused(columns: Collection[str], contents: str, known_columns: Colle
 
     Args:
         columns: Names of the columns.
-        contents: Description of the table.
+        contents: Description of the table for the message.
         known_columns: Names of columns that are read.
 
     >>> warn_of_unused([], "the manifest", ["path"])
@@ -263,7 +263,11 @@ def warn_of_unused(columns: Collection[str], contents: str, known_columns: Colle
 
 
 def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns of a file, and the number and the texts of each line.
+    """Return the names of the columns of a CSV file, and the number and the texts of each line.
+
+    Args:
+        path: File with commas, semicolons or tabs.
+        contents: Description of the contents for error messages.
 
     Raises:
         ValueError: The file cannot be read, or has another encoding.
@@ -285,7 +289,7 @@ def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, lis
 
 
 def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
-    """Call a function, and put a place in a file before the message of a ValueError that it raises.
+    """Call a function, and put a place in a file in front of the message of its ValueError.
 
     Args:
         place: Place for the message, such as ``ears.csv, line 2``.
@@ -294,6 +298,9 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
 
     Returns:
         The result of the function.
+
+    Raises:
+        ValueError: The function raised one.
 
     >>> convert_at("ears.csv, line 2", float, "20")
     20.0

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 MAX_DELAY_SECONDS = 2e-3
-"""Largest delay of a plug-in that must be time-aligned."""
+"""Largest delay in seconds of a plug-in that must be time-aligned."""
 
 _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 """Names of plug-ins: a module or a file, and one of its attributes."""
@@ -30,12 +30,15 @@ _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 def load_plugin(name: str, kind: str) -> Any:
     """Import a function, a PyTorch module or another callable of your own code by its name.
 
-    A class is called without arguments, and the object is returned. From then on, Python searches
-    for modules in the working directory or, for a file, in its folder first.
+    A class is called without arguments, and its object is returned. As a side effect, Python from
+    then on searches for modules in the working directory first, or for a file in its folder.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
         kind: Noun for the object in error messages, such as ``"simulator"``.
+
+    Returns:
+        The function, module or other callable object.
 
     Raises:
         ValueError: The name has another form, the import fails, or the object does not exist or
@@ -72,16 +75,15 @@ def load_plugin(name: str, kind: str) -> Any:
 class WaveformPlugin:
     """Your own function or ``nn.Module`` from waveform to waveform, with validated outputs.
 
-    A module is set to evaluation mode and moved to the device of its
-    input.
+    A module is set to evaluation mode, and moved to the device of its input.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
         kind: Noun for the plug-in in error messages: ``"simulator"``, ``"enhancer"`` or ``"aid"``.
 
     Attributes:
-        function: The function or module that was loaded. Its author changes its attribute
-            ``fingerprint`` when its outputs change, so that stored results are computed again.
+        function: The function or module that was loaded. If it has an attribute ``fingerprint``,
+            change the value whenever its outputs change, so that stored results are computed again.
 
     Raises:
         ValueError: The plug-in cannot be loaded or called.
@@ -122,9 +124,9 @@ class WaveformPlugin:
             arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: The plug-in fails, its output is not a real tensor of this shape, or samples
-                are NaN or infinite. Samples of an output with a gradient may be, so that a gradient
-                scaler can detect them.
+            ValueError: The plug-in fails, its output is not a real tensor of this shape, or the
+                output contains NaN or infinity. These are accepted in an output with a gradient,
+                so that a gradient scaler can detect them.
         """
         if isinstance(self.function, nn.Module):
             self.function.to(waveform.device)
@@ -206,7 +208,7 @@ def _import_file(path: Path) -> ModuleType:
     """Import a file, which can import modules from its folder.
 
     Raises:
-        ImportError: Python has no loader for the file.
+        ImportError: Python has no loader for the file. Errors of the file itself are raised, too.
     """
     sys.path.insert(0, str(path.parent))
     spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)

@@ -1,4 +1,4 @@
-"""Progress of long work, and the time when it will end, on stderr."""
+"""Display of the progress of long work, and of the time when it will end, on stderr."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ _LINE_INTERVAL = 10.0
 """Longest time in seconds between two lines, if stderr is not a terminal."""
 
 _TICK = 1.0
-"""Time in seconds between two looks at the clock."""
+"""Time in seconds between two updates of the line."""
 
 
 Part = TypeVar("Part")
 
 _active_lines: list[ProgressLine] = []
-"""Lines of which the last one is shown."""
+"""Lines of work in progress, the innermost last. Only the last one is shown."""
 
 
 class ProgressLine:
-    """Line about the progress of long work on stderr, at least every 10 seconds.
+    """Line about the progress of long work, which is shown on stderr at least every 10 seconds.
 
     Use it in a ``with`` block, and call it after each unit of work with the number of finished
     units, their total number and, optionally, a text to append. A terminal shows one line, which is
-    overwritten every second. Before the first call and after the last one, the line says what is
-    done meanwhile, and since when.
+    overwritten every second. Before the first call and after the last one, the line shows
+    ``before`` or ``after``, and for how many seconds this stage has run.
 
-    The time of the end is estimated from the pace since the first call, without the work of an
-    earlier run.
+    The end is estimated from the pace since the first call, so that units that an earlier run
+    finished have no influence.
 
     Args:
         unit: Plural noun for what is counted, such as "scores".
@@ -92,7 +92,7 @@ class ProgressLine:
             self._last_line = time.time()
 
     def _watch(self) -> None:
-        """Show that the work goes on, until it has ended."""
+        """Update the line every second until the work has ended. Runs in a thread of its own."""
         while not self._ended.wait(_TICK):
             if _active_lines[-1] is not self:
                 continue  # The line of a part of the work, such as a training, says more.
@@ -107,7 +107,7 @@ class ProgressLine:
                 self._show(text, now)
 
     def _count(self, now: float) -> str:
-        """Return a line with the finished work and the time when all of it will be finished."""
+        """Return a text with the number of finished units and the estimated time of the end."""
         done, total = self._counts
         text = f"{int(done)} of {total:g} {self.unit} ({done / total:.0%})"
         first_done, start = self._first or (done, now)
@@ -118,16 +118,16 @@ class ProgressLine:
         return text + self._details
 
     def _show(self, text: str, now: float, is_due: bool = False) -> None:
-        """Print a line if it is due, or if the last one is too old."""
+        """Print a line if it is due, if stderr is a terminal, or if the last line is 10 s old."""
         if is_due or sys.stderr.isatty() or now - self._last_line >= _LINE_INTERVAL:
             self._last_line = now
             show_line(text, sys.stderr)
 
 
 def track(parts: Iterable[Part], unit: str, total: int) -> Iterator[Part]:
-    """Yield the parts of a stage of long work, which the line that is shown, if any, counts.
+    """Yield the parts of a stage of long work, and count them in the current progress line, if any.
 
-    Before and after the stage, the line shows what it showed before.
+    After the stage, the line shows the same numbers as before.
 
     Args:
         parts: Parts of the work.

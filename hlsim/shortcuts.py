@@ -36,6 +36,7 @@ EXAMPLE_SPL = 65.0
 """Level of conversational speech in dB SPL."""
 
 _REPORTED_PACKAGES = ("torch", "numpy", "scipy", "soundfile", "safetensors", "lightning", "pandas")
+"""Packages whose versions ``info`` lists."""
 
 
 def load_audio(
@@ -45,8 +46,8 @@ def load_audio(
 
     Args:
         path: A file that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
-        spl: RMS level over all channels in dB SPL to which the recording is scaled, with one gain.
-            ``None`` takes the file's samples as pascals already.
+        spl: RMS level over all channels in dB SPL to which the recording is scaled, with one gain
+            for all channels. With ``None`` nothing is scaled: the file's samples are pascals.
         sample_rate: Rate in Hz to which the recording is resampled, 16000 to 48000; by default the
             file's rate.
 
@@ -193,8 +194,9 @@ def listen(
         A player that a notebook displays; its ``save`` method writes a page for a browser.
 
     Raises:
-        ValueError: There is no signal, all signals are silent, one has another shape, or the
-            sample rate or a level is not valid.
+        ValueError: There is no signal, all signals are silent, one has another shape or samples
+            that are NaN or infinite, or the sample rate or the level is not valid.
+        MissingExtraError: matplotlib is not installed.
 
     Example:
         >>> import hlsim
@@ -222,9 +224,9 @@ def listen(
 
 
 def info() -> str:
-    """Return versions for a bug report: hlsim, Python, operating system, packages, CUDA; threads.
+    """Return versions of hlsim, Python, packages and others for a bug report, one per line.
 
-    Each stands on a line of its own.
+    Among them are the operating system, CUDA and torch's number of threads.
 
     Example:
         >>> import hlsim
@@ -244,7 +246,7 @@ def info() -> str:
 
 
 def _as_finite_tensor(audio: Samples) -> Tensor:
-    """Return the samples as a tensor, without NaN and infinity.
+    """Convert samples to a tensor, and reject NaN and infinity.
 
     Raises:
         ValueError: A sample is NaN or infinite.

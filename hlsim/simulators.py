@@ -1,4 +1,4 @@
-"""The door to all simulators: MSBG, trained networks, a linear ear, and simulators of your own."""
+"""Loading of all simulators: MSBG, trained networks, a linear ear, and simulators of your own."""
 
 from __future__ import annotations
 
@@ -44,24 +44,28 @@ UNSMEARED = "msbg-unsmeared"
 """Name of the exact MSBG without spectral smearing."""
 
 _HALF_LENGTH_SECONDS = 0.064
-"""Time in seconds that the filter of ``Attenuation`` covers before and after time 0."""
+"""Time in seconds that the filter of ``Attenuation`` covers before time 0, and after it."""
 
 
 class Attenuation(nn.Module):
     """Linear ear: each frequency is attenuated by the hearing loss, and nothing else happens.
 
-    The gain at a frequency is the threshold times -1, in dB. Thresholds are interpolated linearly
-    over frequency, and stay constant below 250 Hz and above 8 kHz. There is neither recruitment nor
-    smearing nor delay. Use it beside MSBG to see whether a result depends on these.
+    The gain in dB at a frequency is the threshold in dB HL times -1. Thresholds are interpolated
+    linearly over frequency, and constant below 250 Hz and above 8 kHz. There is neither recruitment
+    nor smearing nor delay. Use this ear beside MSBG to see whether a result depends on these.
 
     Args:
-        audiogram: Ear or ears; may be passed to each call instead.
+        audiogram: Ear or ears; they may be passed with each call instead.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, for the warning about loud
-            signals.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0. It has no influence on the
+            output, but on the warning about loud signals.
+
+    Attributes:
+        reach: Number of samples before and after an output sample that influence it.
+        thresholds: Thresholds of the constructor's ears in dB HL, (..., 8), or None.
 
     Raises:
-        ValueError: The rate or the level is out of range, or the audiogram is invalid.
+        ValueError: The rate or the level is out of range, or the audiogram is not valid.
 
     >>> ear = Attenuation([20.0] * 8)
     >>> tone = torch.sin(0.1 * torch.arange(16000))
@@ -92,8 +96,9 @@ class Attenuation(nn.Module):
 
         Args:
             waveform: Input signals.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) in dB HL broadcasts
-                over the leading dimensions of the waveform; by default those of the constructor.
+            audiogram: One ear for all signals, or ears whose thresholds in dB HL, (..., 8),
+                broadcast over the leading dimensions of the waveform; by default those of the
+                constructor.
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes do
@@ -120,14 +125,15 @@ BUILT_IN: dict[str, Callable[..., nn.Module]] = {
 
 
 class PluginSimulator(nn.Module):
-    """Simulator of hearing loss of your own, loaded by its name.
+    """Simulator of hearing loss from your own code, loaded by its name.
 
     Your simulator is a function ``(waveform, audiogram) -> waveform``, or a class whose objects can
     be called in this way and which is constructed without arguments. It receives signals in pascals
     with shape (items, time) and thresholds in dB HL with shape (items, 8), and returns the
-    perceived signals, time-aligned with its input. Gradients pass through it if it has any. Its
-    sample rate is its attribute ``sample_rate``, or else 16000 Hz. It may have the attributes
-    ``emulates_msbg``, ``highest_frequency`` and ``needs_exact_lengths``, see ``HearingLossLoss``.
+    perceived signals, time-aligned with its input. Gradients pass through it if it is
+    differentiable; its parameters do not require a gradient. Its sample rate is its attribute
+    ``sample_rate``, or else 16000 Hz. It may have the attributes ``emulates_msbg``,
+    ``highest_frequency`` and ``needs_exact_lengths``, see ``HearingLossLoss``.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -136,8 +142,8 @@ class PluginSimulator(nn.Module):
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: There is no such simulator, or its output for half a second of noise has another
-            shape, is delayed or is not finite.
+        ValueError: There is no such simulator, its attribute ``full_scale_spl`` is not 94, or its
+            output for half a second of noise has another shape, is delayed, silent or not finite.
 
     >>> simulator = PluginSimulator("hlsim:MSBG")
     >>> simulator(torch.randn(1, 16000), "N3").shape
@@ -181,9 +187,9 @@ class PluginSimulator(nn.Module):
         Shape: (..., time) -> (..., time).
 
         Args:
-            waveform: Input signals.
-            audiogram: One ear for all signals, or ears whose shape (..., 8) in dB HL broadcasts
-                over the leading dimensions of the waveform.
+            waveform: Input signals, where RMS 1.0 has the level ``full_scale_spl``.
+            audiogram: One ear for all signals, or ears whose thresholds in dB HL, (..., 8),
+                broadcast over the leading dimensions of the waveform.
 
         Raises:
             ValueError: A threshold is outside -10 to 100 dB HL, shapes do not broadcast, or your
@@ -212,14 +218,14 @@ def load_simulator(
             spectral smearing; ``"attenuation"``, a linear ear; the name of a checkpoint that ships
             with hlsim, such as ``"neuro-msbg"``, or the folder of a checkpoint;
             ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
-            (``PluginSimulator``); or a module, which is returned. Those of its attributes
-            ``sample_rate``, ``full_scale_spl`` and ``aligned`` that exist are validated.
+            (``PluginSimulator``); or a module, which is returned. If a module has an attribute
+            ``sample_rate``, ``full_scale_spl`` or ``aligned``, it is validated.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: There is no such simulator, or the module was built for another rate or level,
-            or delays its output.
+        ValueError: There is no such simulator, the rate or the level is out of range, or the module
+            was built for another rate or level, or with ``aligned=False``.
 
     >>> load_simulator("msbg")
     MSBG(sample_rate=16000, full_scale_spl=94, aligned=True, rescale_active=False, smearing=True)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 def suggest(name: str, names: Iterable[str]) -> str:
-    """Return a question for an error message about a name, or nothing if no name is similar.
+    """Return a question for an error message about a name, or "" if no name is similar.
 
     Args:
         name: Name that does not exist.

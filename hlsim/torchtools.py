@@ -1,4 +1,4 @@
-"""Tools around torch: what is computed once, batches, and functions that are not compiled.
+"""Tools around torch: stored constants, conversion of arrays, batches, and copies on a GPU.
 
 A *constant* is a tensor that a function designs from its arguments, such as the taps of a filter.
 It is computed once for each type and device, and then comes from a store. Thresholds are copied
@@ -23,13 +23,13 @@ P = ParamSpec("P")
 Result = TypeVar("Result")
 Values = TypeVar("Values")
 Samples = Tensor | NDArray[Any]
-"""Signal that functions of signals accept."""
+"""Samples of a signal as a tensor or as an array."""
 
 Audio = TypeVar("Audio", Tensor, NDArray[Any])
-"""Type of a signal and of the result, which is an array if the signal is one."""
+"""Type of a signal and of a result: both are tensors, or both are arrays."""
 
 STORE_BYTES = 2**28
-"""Size of the store of constants. MSBG's filters take 5 MiB per second of signal."""
+"""Largest size in bytes of the stored constants. MSBG's take 5 MiB per second of signal."""
 
 _HOST = torch.device("cpu")
 
@@ -37,8 +37,8 @@ _HOST = torch.device("cpu")
 def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a function that ``torch.compile`` must not compile.
 
-    The compiled graph breaks there. ``torch.compiler.disable`` does the same, but as a decorator it
-    imports the compiler, which takes longer than importing hlsim.
+    The compiled graph breaks at a call of the function. ``torch.compiler.disable`` does the same,
+    but as a decorator it imports the compiler, which takes longer than importing hlsim.
 
     >>> @not_compiled
     ... def square(x):
@@ -57,7 +57,7 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def built_in_float32(construct: Callable[P, None]) -> Callable[P, None]:
-    """Decorate a constructor so that it uses float32, whatever torch's default type.
+    """Decorate a constructor so that it uses float32 instead of torch's default dtype.
 
     The networks compute with complex numbers, which torch does not have in half precision.
 
@@ -106,12 +106,12 @@ def without_modes(
 
 
 class constant(Generic[P, Values]):
-    """Decorator of a function that designs a constant, and computes it once.
+    """Decorator of a function that designs a constant, whose tensors are computed once and stored.
 
-    With ``like``, a call returns the values as a tensor in the precision and on the device of
-    another tensor. It comes from a store, so it must not be changed in place, and the other
-    arguments must be hashable. Without ``like``, a call returns the values as the function computes
-    them.
+    With the additional argument ``like``, a call returns the values as a tensor in the precision
+    and on the device of the tensor ``like``. This tensor comes from a store, so it must not be
+    changed in place, and the other arguments must be hashable. Without ``like``, a call returns the
+    values as the function computes them.
 
     Args:
         design: Function at the top level of a module, which returns an array or numbers.
@@ -189,13 +189,13 @@ def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def as_samples(signal: Samples) -> Tensor:
-    """Return samples as a tensor. Arrays are copied.
+    """Convert samples to a tensor. Arrays are copied.
 
     Args:
         signal: Tensor, which is returned as it is, or array of floating-point numbers.
 
     Raises:
-        ValueError: The signal is neither.
+        ValueError: The signal is neither a tensor nor such an array.
 
     >>> as_samples(np.ones(2, np.float32)[::-1])
     tensor([1., 1.])
@@ -222,7 +222,11 @@ def as_samples(signal: Samples) -> Tensor:
 
 
 def as_type_of(signal: Audio, result: Tensor) -> Audio:
-    """Return a result as a tensor or as an array, depending on the type of the signal.
+    """Convert a result to an array if the signal is an array, and otherwise return the tensor.
+
+    Args:
+        signal: Signal from which the result was computed.
+        result: Tensor, on the CPU and without a gradient if the signal is an array.
 
     >>> as_type_of(np.ones(2), torch.tensor(0.5))
     np.float32(0.5)
@@ -302,7 +306,7 @@ class _DifferentiableOnce(torch.autograd.Function):
 
 
 def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
-    """Return the shape to which tensors of some shapes broadcast.
+    """Compute the shape to which tensors with some shapes broadcast.
 
     ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third
     of a second.
@@ -311,7 +315,7 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
         shapes: Shapes of the tensors.
 
     Raises:
-        RuntimeError: The shapes do not fit.
+        RuntimeError: The shapes do not broadcast.
 
     >>> broadcast_shape((3, 1), (2,))
     torch.Size([3, 2])
@@ -351,16 +355,16 @@ def _design_tensor(
 # -- copies of thresholds on the CPU and on a GPU --------------------------------------------------
 
 _COPIES = WeakTensorKeyDictionary()
-"""Copies by original and device, each with the number of changes of the original at that time.
+"""Copies by original and device, each with the version number of the original when it was copied.
 
-Copying a tensor to a GPU, or back, makes the CPU wait until the GPU has finished all queued
-operations. Therefore each copy is made once, and remembered in both directions as long as the
-original exists and nobody writes into it.
+Copying a tensor to a GPU, or back, synchronises with the GPU: the CPU waits until the GPU has
+finished all queued operations. Therefore each copy is made once, and remembered in both directions
+as long as the original exists and nobody writes into it.
 """
 
 
 def on_device(values: Tensor, device: torch.device) -> Tensor:
-    """Return a tensor on a device, without synchronising if it is a constant on the CPU.
+    """Return a tensor on a device, without synchronising if it is on the CPU and has no gradient.
 
     The original is remembered, so that ``on_host`` need not synchronise either.
 
@@ -384,7 +388,9 @@ def on_device(values: Tensor, device: torch.device) -> Tensor:
 
 
 def on_host(values: Tensor) -> Tensor:
-    """Return a tensor on the CPU, which synchronises with a GPU unless the values are known.
+    """Return a tensor without a gradient on the CPU.
+
+    This synchronises with a GPU unless a copy of the values on the CPU is known.
 
     Args:
         values: Tensor of any shape on any device.
@@ -400,7 +406,7 @@ def on_host(values: Tensor) -> Tensor:
 
 
 def known_on_host(values: Tensor) -> Tensor | None:
-    """Return a tensor on the CPU if its values are known there, else None.
+    """Return a tensor without a gradient on the CPU if its values are known there, else None.
 
     Args:
         values: Tensor of any shape on any device.
@@ -412,7 +418,7 @@ def known_on_host(values: Tensor) -> Tensor | None:
 
 
 def _find_copy(tensor: Tensor, device: torch.device) -> Tensor | None:
-    """Return the copy on a device, or None if there is none or the original has changed."""
+    """Return the copy of a tensor on a device; None if there is none or the tensor has changed."""
     if not _can_be_remembered(tensor):
         return None
     version, copy = _COPIES.get(tensor, {}).get(device, (None, None))
@@ -433,7 +439,11 @@ def _can_be_remembered(tensor: Tensor) -> bool:
 
 
 class _Store:
-    """Results by function and arguments, up to a number of bytes and at least the latest one."""
+    """Results by function and arguments, in order of use.
+
+    The results that were not used for the longest time are dropped beyond a number of bytes, but
+    never the latest result.
+    """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit

@@ -1,3 +1,3 @@
-"""The version of hlsim, which the package metadata and the checkpoints state, too."""
+"""The version of hlsim, for the package metadata and for checkpoints."""
 
 __version__ = "0.1.0"

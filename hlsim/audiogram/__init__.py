@@ -1,7 +1,9 @@
 """Hearing thresholds of ears: as values, as tensors, in tables and as plots.
 
-A threshold is the level in dB HL (relative to normal hearing) from which an ear hears a tone of a
-frequency; a higher threshold is a greater loss. An *ear* is one audiogram, a *listener* has two.
+A threshold is the lowest level in dB HL (relative to normal hearing) at which an ear hears a tone
+of a frequency; a higher threshold is a greater loss. An *ear* is one audiogram, a *listener* has
+two.
+
 Wherever an ear is expected, an ``Audiogram``, a name such as ``"N3"``, eight thresholds or a dict
 of frequencies to thresholds will do.
 """

@@ -1,4 +1,4 @@
-"""Columns of thresholds in a table, by the names that spreadsheets and clinics use."""
+"""Columns of thresholds in a table, recognised by names that spreadsheets and clinics use."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ _USUAL_HZ = {
     *(125, 250, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000, 8000),
     *(9000, 10000, 11200, 12000, 12500, 14000, 15000, 16000, 18000, 20000),
 }
-"""Frequencies of audiometry, which may stand alone in the name of a column."""
+"""Frequencies of audiometry in Hz. The name of a column may be such a number alone."""
 
 _KNOWN_WORDS = {
     *EAR_NAMES,
     *("ac", "air", "conduction", "ear", "freq", "frequency", "hl", "htl", "hz"),
     *("pt", "t", "thr", "thresh", "threshold", "thresholds"),
 }
+"""Words that the name of a column of thresholds may contain besides the frequency."""
 
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}
 """Words of columns that do not hold measured thresholds of air conduction."""
@@ -39,12 +40,12 @@ _FREQUENCY = re.compile(r"(?P<number>\d+(?:[.,]\d+)?) ?(?P<kilo>k?)(?:hz)?[lr]?(
 
 
 class ThresholdColumn(NamedTuple):
-    """Meaning of a column about thresholds.
+    """Meaning of a column of thresholds, or of a column of remarks on thresholds.
 
     Attributes:
         ear: Ear that the column's name mentions, or None.
         hz: Frequency in Hz.
-        is_remark: Whether the column holds a remark on another column of this frequency.
+        is_remark: Whether the column contains remarks on another column of this frequency.
 
     >>> ThresholdColumn("left", 500.0).is_remark
     False
@@ -63,7 +64,7 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     ``hl_250_masked`` are remarks on ``hl_250``. Columns with another word before a frequency of
     audiometry, such as ``aided 250``, ``bone 250`` and ``masked left 250``, and those of
     extrapolated levels, are left out with a warning that names them. Columns that do not look like
-    thresholds are left out without one.
+    thresholds are left out without a warning.
 
     Args:
         columns: Names of all columns.
@@ -73,7 +74,8 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
 
     Raises:
         ValueError: A name looks like that of thresholds, but is not understood or has a frequency
-            below 100 or above 20000 Hz, or two columns have the same frequency and ear.
+            below 100 or above 20000 Hz; a remark has no column of thresholds; or two columns have
+            the same frequency and ear.
 
     >>> threshold_columns(["name", "R 1k"])
     {'R 1k': ThresholdColumn(ear='right', hz=1000.0, is_remark=False)}
@@ -115,7 +117,7 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
 
 
 def _read_name(column: str, name: str) -> ThresholdColumn | None:
-    """Return the meaning of a column of thresholds or of a remark on one, or None for another one.
+    """Return the meaning of a column of thresholds or of remarks, or None for any other column.
 
     Args:
         column: Name of the column, for messages.
@@ -157,7 +159,12 @@ def _read_name(column: str, name: str) -> ThresholdColumn | None:
 
 
 def _read_hz(number: str, kilo: str) -> float:
-    """Convert the text of a frequency, and a "k" or nothing, into a number in Hz."""
+    """Convert the text of a frequency to Hz.
+
+    Args:
+        number: Digits, perhaps with a decimal comma or with separated thousands.
+        kilo: ``"k"`` if the number is in kHz, otherwise an empty text.
+    """
     if kilo:
         return 1000.0 * float(number.replace(" ", "").replace(",", "."))
     if re.fullmatch(r"\d{1,3}([ ,.']\d{3})+", number):

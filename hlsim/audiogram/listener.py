@@ -19,9 +19,9 @@ class Listener:
 
     Args:
         left: Audiogram of the left ear, in any form in which an ear is accepted (a name such as
-            ``"N3"``, thresholds, a dictionary), or ``None`` if it is unknown, as in some files.
-            Models, losses and metrics need both ears.
-        right: Audiogram of the right ear, likewise.
+            ``"N3"``, thresholds, a dict), or ``None`` if it is unknown, as in some files. Models,
+            losses and metrics need both ears.
+        right: Audiogram of the right ear, in the same forms.
 
     Raises:
         ValueError: Both ears are ``None``, or one is not valid.
@@ -78,7 +78,7 @@ class Listener:
             source: pyclarity's ``Listener``, or an entry of Clarity's ``listeners.json``.
 
         Raises:
-            ValueError: An ear is missing or not valid.
+            ValueError: An entry lacks an ear, no ear is found, or an ear is not valid.
         """
         if isinstance(source, Mapping):
             frequencies: Any = source.get("audiogram_cfs")

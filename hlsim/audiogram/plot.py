@@ -12,7 +12,7 @@ EAR_STYLES: dict[EarName | None, dict[str, Any]] = {
     "left": {"marker": "x", "color": "tab:blue"},
     "right": {"marker": "o", "color": "tab:red", "fillstyle": "none"},
 }
-"""Matplotlib's properties of the line of an ear, as audiologists draw it."""
+"""Matplotlib properties of the line for each ear, as audiologists draw it."""
 
 
 def frequency_axis(axes: Any, ticks: Sequence[float]) -> None:

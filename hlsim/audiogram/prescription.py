@@ -11,11 +11,11 @@ from hlsim.torchtools import constant
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
-    """Return the gains that NAL-R prescribes at the eight frequencies of an audiogram.
+    """Compute the gains that NAL-R prescribes at the eight frequencies of an audiogram.
 
-    The formula is for 250, 500, 1000, 2000, 4000 and 6000 Hz. As in pyclarity, the gain is a
-    straight line from 2 to 4 kHz and constant above 6 kHz, so that the thresholds at 3 and 8 kHz do
-    not count. An ear without any loss has no gain.
+    The formula is for 250, 500, 1000, 2000, 4000 and 6000 Hz. As in pyclarity, the gain at 3 kHz is
+    the mean of those at 2 and 4 kHz, and that at 8 kHz is the gain at 6 kHz, so that the thresholds
+    at 3 and 8 kHz have no influence. An ear without any loss has no gain.
 
     Args:
         thresholds: Thresholds in dB HL at ``hlsim.audiogram.FREQUENCIES``.

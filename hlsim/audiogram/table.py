@@ -19,10 +19,10 @@ from hlsim.checks import reject_duplicates
 from hlsim.files import convert_at, read_table
 
 _Builders = Mapping[str, Callable[[], Listener]]
-"""Functions that build listeners, under the names of the listeners."""
+"""Functions without arguments that build listeners, under the names of the listeners."""
 
 _Row = tuple[str, dict[str, str]]
-"""The place of a row for messages, and its texts by column."""
+"""A row of a table: its place in the file, for messages, and its texts by column."""
 
 
 def read_audiograms(
@@ -110,6 +110,8 @@ def read_listeners(
 def _read_entries(path: str | Path) -> _Builders:
     """Read Clarity's ``listeners.json``, and return functions that build the listeners.
 
+    The functions raise ValueError if an ear is missing or not valid.
+
     Raises:
         ValueError: The file is no JSON, or has another structure.
     """
@@ -129,8 +131,10 @@ def _read_entries(path: str | Path) -> _Builders:
 def _group_rows(path: str | Path | Any) -> _Builders:
     """Read the rows of a table, and return functions that build the listeners.
 
+    The functions raise the errors of ``_join_ears``.
+
     Raises:
-        ValueError: A row has no name of a listener, or an error of ``_read_ears``.
+        ValueError: The table cannot be read, or a row has no name of a listener.
     """
     rows: dict[str, list[_Row]] = {}
     for place, row in _read_rows(path):
@@ -147,9 +151,9 @@ def _group_rows(path: str | Path | Any) -> _Builders:
 
 
 def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
-    """Return the listener of one row with both ears, or of a row per ear.
+    """Build a listener from one row with both ears, or from one row per ear.
 
-    An ear without thresholds is missing from the listener.
+    An ear without thresholds is None in the listener.
 
     Args:
         listener: Name of the listener, for messages.
@@ -178,11 +182,17 @@ def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
 def _read_ears(
     row: Mapping[str, str], highest: float = HIGHEST_LEVEL
 ) -> dict[EarName | None, Audiogram]:
-    """Return the audiograms of a row by ear, which its columns or its column ``ear`` name.
+    """Convert a row into audiograms, under ``"left"``, ``"right"``, or None for an unknown ear.
+
+    Either the columns of thresholds name the ear, such as L500, or the column ``ear`` does.
+
+    Args:
+        row: Texts by column.
+        highest: Highest level allowed, in dB HL.
 
     Raises:
-        ValueError: The column ``ear`` has another word than left, right or both, or columns name
-            the ear as well.
+        ValueError: The thresholds are not valid (see ``ears_in_row``), the column ``ear`` contains
+            no name of an ear, or both the columns of thresholds and the column ``ear`` name it.
     """
     ears = ears_in_row(row, highest)
     text = row.get("ear", "")
@@ -200,10 +210,14 @@ def _read_ears(
 
 
 def _read_rows(table: str | Path | Any) -> list[_Row]:
-    """Read the rows of a table of ears, and join those of a long one.
+    """Read the rows of a table of ears, and join the rows of a table with one threshold per row.
+
+    Returns:
+        Rows with one or two ears each.
 
     Raises:
-        ValueError: Columns contradict each other.
+        ValueError: The table cannot be read, its columns contradict each other, or a row is not
+            valid, see ``_widen``.
     """
     rows = read_table(table, "audiograms", ("listener", "ear"))
     columns: dict[str, str] = {}
@@ -240,9 +254,12 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         frequency: Name of the column of frequencies in Hz.
         threshold: Name of the column of thresholds in dB HL.
 
+    Returns:
+        One row per ear, whose columns are the listener, the ear and one column per frequency.
+
     Raises:
-        ValueError: A column is missing, a frequency is no number, an ear has two thresholds at one
-            frequency, or a row lacks the listener or the ear that other rows have.
+        ValueError: A column is missing, a frequency is not understood, an ear has two thresholds at
+            one frequency, or a row lacks the listener or the ear that other rows have.
     """
     names = [column for column in rows[0][1] if column not in (frequency, threshold)]
     has_ears = {"listener", "ear"} <= set(names)

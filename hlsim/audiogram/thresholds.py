@@ -1,4 +1,4 @@
-"""Thresholds as tensors, at eight frequencies: converted, validated and stored."""
+"""Conversion of ears into tensors of thresholds at eight frequencies, and their validation."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from hlsim.torchtools import broadcast_shape, known_on_host, on_device, on_host
 torch.serialization.add_safe_globals([Audiogram, Listener])
 
 AudiogramLike = EarLike | Listener | Sequence[EarLike] | Sequence[Listener]
-"""One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
-item, or a tensor or an array of thresholds in dB HL at the eight ``FREQUENCIES``, (..., 8)."""
+"""One or more ears, in any form.
+
+One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
+item, or a tensor or an array of thresholds in dB HL at the eight ``FREQUENCIES``, (..., 8).
+"""
 
 
 def as_thresholds(
@@ -34,8 +37,8 @@ def as_thresholds(
     the ``FREQUENCIES``. An ``Audiogram`` with other frequencies is interpolated over log frequency
     (``Audiogram.thresholds``).
 
-    A tensor on a GPU is not validated, because the CPU would have to wait for its values, and no
-    tensor is in a compiled or exported program: instead, an ear with a level out of range becomes
+    Tensors on a GPU are not validated, because that would synchronise with the GPU, and neither are
+    tensors in a compiled or exported program. Instead, an ear with a level out of range becomes
     NaN, and so do the outputs that are computed with it.
 
     Args:
@@ -45,7 +48,7 @@ def as_thresholds(
 
     Returns:
         Thresholds in dB HL: (8,) for one ear, (2, 8) for a ``Listener``, (batch, 8) and
-        (batch, 2, 8) for sequences of them. A tensor is returned as it is.
+        (batch, 2, 8) for sequences of them. A floating-point tensor is returned as it is.
 
     Raises:
         ValueError: The value does not describe ears, an ear is missing, a tensor does not hold
@@ -69,10 +72,10 @@ def as_thresholds(
 
 
 def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None:
-    """Return the audiograms of a value, and the leading shape of their thresholds.
+    """Return the audiograms of a value, and the shape in which they are arranged.
 
-    The result is ``None`` for a tensor, a sequence of tensors, and a value that does not describe
-    ears.
+    The shape is () for one ear, (2,) for a listener, and (n,) or (n, 2) for sequences of these. The
+    result is ``None`` for a tensor, a sequence of tensors, and a value that does not describe ears.
 
     Raises:
         ValueError: A listener lacks an ear.
@@ -117,7 +120,7 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
         list is empty if all ears were.
 
     Raises:
-        ValueError: A level is above 100 dB HL, at any frequency.
+        ValueError: A level of such an ear is above 100 dB HL, or a listener lacks an ear.
 
     >>> ears_on_other_grids(["N3", {500: 20}])
     [None, Audiogram({500: 20})]
@@ -138,8 +141,11 @@ def store_thresholds(
     The result is a copy without a gradient, because the caller may write into a tensor later.
 
     Args:
-        audiogram: One or more ears; None gives None.
+        audiogram: One or more ears, or None, for which the result is None.
         highest: Highest level allowed, in dB HL.
+
+    Raises:
+        ValueError: The ears are not valid, see ``as_thresholds``.
 
     >>> store_thresholds("N3").shape
     torch.Size([8])
@@ -160,16 +166,15 @@ def resolve_thresholds(
     two_ears: bool = False,
     highest: float = HIGHEST_SIMULATED,
 ) -> Tensor:
-    """Return the thresholds with which a module processes a waveform, on its device.
+    """Return the thresholds with which a module processes a waveform, on the waveform's device.
 
-    They are those of the ears that were passed with the call, or else those that the module has
-    stored.
+    The ears that were passed with the call have precedence over those that the module has stored.
 
     Args:
         stored: Thresholds that the module has stored, (..., 8), or None.
         audiogram: Ears that were passed with the call, or None.
         waveform: Signals, (..., time).
-        two_ears: Whether the stored thresholds are those of listeners.
+        two_ears: Whether the stored thresholds are those of listeners, (..., 2, 8).
         highest: Highest level allowed, in dB HL.
 
     Returns:
@@ -177,8 +182,8 @@ def resolve_thresholds(
         For mono items, (batch, 1, time), and one ear per item they are (batch, 1, 8).
 
     Raises:
-        ValueError: There are no ears, the shapes do not broadcast, or the waveform of a listener is
-            not (..., 2, time).
+        ValueError: There are no ears, they are not valid (see ``as_thresholds``), the shapes do not
+            broadcast, or the waveform for a listener does not have the shape (..., 2, time).
 
     >>> resolve_thresholds(None, "N3", torch.zeros(2, 16000)).shape
     torch.Size([8])
@@ -202,7 +207,7 @@ def resolve_thresholds(
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:
-    """Return whether ears are those of listeners: a ``Listener`` or a sequence of listeners.
+    """Return whether a description of ears is a ``Listener`` or a sequence of listeners.
 
     >>> has_listeners(Listener("N1", "N3")), has_listeners("N1")
     (True, False)
@@ -226,7 +231,13 @@ def check_two_channels(waveform: Tensor) -> None:
 
 
 def _check_tensor(levels: Any, highest: float) -> Tensor:
-    """Validate a tensor of thresholds, as ``as_thresholds`` describes."""
+    """Validate a tensor of thresholds in dB HL, (..., 8), and return it as floating-point numbers.
+
+    An ear with a level out of range becomes NaN where the values are not known on the CPU.
+
+    Raises:
+        ValueError: The value is not such a tensor, or a level is out of range.
+    """
     if not isinstance(levels, Tensor):
         raise ValueError(
             f"expected an audiogram, got {type(levels).__name__}; pass an Audiogram, a name such "

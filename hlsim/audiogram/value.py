@@ -38,8 +38,8 @@ class Audiogram:
     """Hearing thresholds of one ear in dB HL, at any frequencies.
 
     The exact MSBG interpolates the thresholds linearly in Hz between the frequencies at which they
-    were measured, as pyclarity does. Everything else uses ``thresholds``, the levels at eight
-    frequencies. Simulators accept thresholds up to 100 dB HL.
+    were measured, as pyclarity does. Networks, losses, aids and metrics use ``thresholds``, the
+    levels at eight frequencies. Simulators accept thresholds up to 100 dB HL.
 
     PyTorch loads checkpoints that hold audiograms or listeners, for example as hyperparameters,
     with ``weights_only=True`` once a loss, a simulator or an aid was imported, and otherwise inside
@@ -155,8 +155,8 @@ class Audiogram:
     def severity(self) -> str:
         """Degree of hearing loss in MSBG: ``"none"``, ``"mild"``, ``"moderate"`` or ``"severe"``.
 
-        It follows from the mean of the levels that were measured from 2 to 8 kHz, and is none if
-        there is no such level, as in pyclarity.
+        The mean of the levels that were measured from 2 to 8 kHz decides. Without such a level, the
+        degree is ``"none"``, as in pyclarity.
         """
         levels = torch.tensor(self.levels, dtype=torch.float64, device="cpu")
         return SEVERITIES[int(severity_index(levels, self.frequencies))]
@@ -195,7 +195,8 @@ class Audiogram:
     def who_grade(self) -> str:
         """Grade of hearing loss: ``"normal"``, ``"mild"`` to ``"profound"``, or ``"complete"``.
 
-        It follows from the pure-tone average, and differs from ``severity``, which MSBG needs.
+        The pure-tone average (``pta``) decides. The grade differs from ``severity``, which is
+        MSBG's.
 
         Source: World Health Organization 2021, World report on hearing, Table 1.3.
         """
@@ -203,18 +204,18 @@ class Audiogram:
         return next(grade for grade, limit in WHO_GRADES.items() if average < limit)
 
     def to(self, *args: Any, **kwargs: Any) -> Audiogram:
-        """Return the audiogram itself, which is on no device.
+        """Return the audiogram itself, because it is on no device.
 
-        Lightning calls this method of everything in a batch that it moves to a device.
+        Lightning calls this method when it moves a batch to a device.
         """
         return self
 
     def to_dict(self) -> dict[str, list[float]]:
-        """Return a dictionary of ``levels`` and ``frequencies``, which can be written as JSON."""
+        """Return a dict of ``levels`` and ``frequencies``, which can be written as JSON."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
 
     def to_row(self) -> dict[str, str]:
-        """Return the thresholds as texts for a CSV file by column: ``hl_250``, ``hl_500``, ..."""
+        """Return the thresholds as texts by column of a CSV file: ``hl_250``, ``hl_500``, ..."""
         points = zip(self.frequencies, self.levels, strict=True)
         return {f"hl_{_shortest(hz)}": _shortest(level) for hz, level in points}
 
@@ -225,7 +226,7 @@ class Audiogram:
         Args:
             row: Texts by column. Columns of thresholds have the names that ``threshold_columns``
                 describes; other columns are ignored. A text that is empty, ``NA``, ``null``,
-                ``None`` or ``nan`` was not measured.
+                ``None`` or ``nan`` means that the frequency was not measured.
 
         Raises:
             ValueError: The row has no measured threshold, those of both ears, two of one frequency,
@@ -255,7 +256,7 @@ class Audiogram:
 
 
 EarLike = Audiogram | str | Sequence[float] | NDArray[Any] | Tensor | Mapping[float, float]
-"""An audiogram, or what ``as_audiogram`` converts into one."""
+"""An audiogram, or a value that ``as_audiogram`` converts into one."""
 
 
 def as_audiogram(ear: EarLike) -> Audiogram:
@@ -290,7 +291,7 @@ def find_audiogram(ear: Any) -> Audiogram | None:
     """Convert a value as ``as_audiogram`` does, or return ``None`` if it does not describe one ear.
 
     Raises:
-        ValueError: The value describes one ear, but its thresholds are not valid.
+        ValueError: The value describes one ear, but its thresholds or its name are not valid.
 
     >>> find_audiogram("n3"), find_audiogram(3)
     (Audiogram('N3'), None)
@@ -316,7 +317,7 @@ def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
     """Convert a mapping from frequencies in Hz to thresholds in dB HL into an audiogram.
 
     Raises:
-        ValueError: It is no mapping of numbers.
+        ValueError: A frequency is not a number, or the thresholds are not valid.
     """
     try:
         frequencies = sorted(levels, key=float)
@@ -329,9 +330,12 @@ def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
 
 
 def _from_series(series: Any) -> Audiogram | None:
-    """Convert a ``Series`` of thresholds by position, by frequency or by column of a table.
+    """Convert a pandas ``Series`` of thresholds into an audiogram, or return None for a DataFrame.
 
-    Another object of pandas gives None.
+    The labels of the series are positions (0 to 7), frequencies in Hz, or columns of a table.
+
+    Raises:
+        ValueError: The labels or the thresholds are not valid.
     """
     if series.ndim != 1:
         return None
@@ -348,8 +352,8 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     """Compute the degree of hearing loss of each ear: 0 none, 1 mild, 2 moderate, 3 severe.
 
     The mean threshold from 2 to 8 kHz decides, as in pyclarity: a loss is mild above 15 dB HL,
-    moderate above 35 dB HL and severe above 56 dB HL. It is 0 if there is no frequency from 2 to
-    8 kHz.
+    moderate above 35 dB HL and severe above 56 dB HL. Without a frequency from 2 to 8 kHz, the
+    degree is 0.
 
     Shape: (..., frequencies) -> int64 (...), indices into ``SEVERITIES``.
 
@@ -372,7 +376,7 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
 def ears_in_row(
     row: Mapping[str, str], highest: float = HIGHEST_LEVEL
 ) -> dict[EarName | None, Audiogram]:
-    """Convert the thresholds of a row of a table into audiograms, by the ear that columns name.
+    """Convert the thresholds in a row of a table into audiograms, one per ear that columns name.
 
     A frequency was not measured if its value is empty, ``NA``, ``null``, ``None`` or ``nan``. An
     ear without a measured threshold is left out.
@@ -452,10 +456,15 @@ def _check_remark(text: str, column: str) -> None:
 
 
 def _parse_level(text: str, column: str, highest: float) -> float:
-    """Convert the text of a threshold, which may have a decimal comma, into a number.
+    """Convert the text of a threshold in dB HL, which may have a decimal comma, into a number.
+
+    Args:
+        text: Text to convert.
+        column: Name of the column, for the message.
+        highest: Highest level allowed, in dB HL.
 
     Raises:
-        ValueError: The text is no number, or one out of range.
+        ValueError: The text is not a number from -10 to ``highest``.
     """
     try:
         level = float(text.replace(",", "."))
@@ -471,10 +480,10 @@ def _parse_level(text: str, column: str, highest: float) -> float:
 
 
 def _as_array(values: Any) -> NDArray[np.float64]:
-    """Convert a sequence of numbers into an array with NaN in place of ``None``.
+    """Convert a sequence of numbers into a float64 array with NaN in place of ``None``.
 
     Raises:
-        ValueError: It is no sequence of numbers.
+        ValueError: The value is not a sequence of numbers.
     """
     try:
         numbers = np.array(values, dtype=np.float64)

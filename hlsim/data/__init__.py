@@ -1,1 +1,1 @@
-"""Speech, noise and ears from which trainings and evaluations draw, and bundled speech."""
+"""Speech, noise and ears for training and evaluation: corpora, random clips, bundled speech."""

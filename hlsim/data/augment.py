@@ -28,7 +28,7 @@ _POWER_FLOOR = 1e-20
 def draw_uniform(
     low: float, high: float, shape: tuple[int, ...], generator: torch.Generator
 ) -> Tensor:
-    """Draw numbers of a uniform distribution.
+    """Draw random numbers that are uniformly distributed between two limits.
 
     Args:
         low: Lower limit.
@@ -45,13 +45,16 @@ def draw_uniform(
 def replace_share(
     signals: Tensor, replacements: Tensor, share: float, generator: torch.Generator
 ) -> Tensor:
-    """Replace a random share of items.
+    """Replace random items by others.
 
     Args:
         signals: Items with shape (items, samples).
-        replacements: Item that may replace each of them, with the same shape.
+        replacements: Replacement for each item, with the same shape.
         share: Probability with which an item is replaced, from 0 to 1.
         generator: Source of the random numbers.
+
+    Returns:
+        A new tensor with shape (items, samples).
 
     >>> replace_share(torch.zeros(1, 3), torch.ones(1, 3), 1.0, torch.Generator())
     tensor([[1., 1., 1.]])
@@ -63,7 +66,7 @@ def replace_share(
 def equalise(
     waveform: Tensor, gains_db: Tensor, frequencies: Sequence[float], sample_rate: int
 ) -> Tensor:
-    """Filter signals without a delay, with gains that are stated at a few frequencies.
+    """Filter signals without delay by gains at a few frequencies.
 
     The gains in dB are interpolated over log frequency. Below the lowest and above the highest
     frequency they are constant.
@@ -92,8 +95,8 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     """Compress the dynamic range of signals, as hearing aids do.
 
     The level in a running window of 10 ms approaches the mean level of the signal: a difference of
-    d dB becomes one of about d / ratio dB. Parts that are more than 30 dB below the mean level are
-    amplified as much as parts 30 dB below it, so that silence is not amplified without limit.
+    d dB becomes one of about d / ratio dB. The gain of ever softer parts approaches that for 30 dB
+    below the mean level, so that silence is not amplified without limit.
 
     Args:
         waveform: Signals with shape (items, time).
@@ -115,12 +118,15 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
 
 
 def equalise_share(signals: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Filter a random share of signals with random gains of up to 15 dB.
+    """Filter random signals with random gains from -15 to 15 dB at six frequencies.
 
     Args:
         signals: Signals at 16 kHz with shape (items, time).
         share: Probability with which a signal is filtered, from 0 to 1.
         generator: Source of the random numbers.
+
+    Returns:
+        Signals with shape (items, time), where the others are unchanged.
 
     >>> equalise_share(torch.ones(2, 1600), 0.5, torch.Generator()).shape
     torch.Size([2, 1600])
@@ -140,11 +146,11 @@ def augment_speech(
     levels: tuple[float, float] = (40.0, 95.0),
     treated: bool = True,
 ) -> Tensor:
-    """Make random inputs, on which a simulator is trained, from clean speech.
+    """Make random inputs for training a simulator from clean speech.
 
-    40 % of the items are noisy, with -5 to 20 dB SNR. If ``treated``, 20 % are compressed with
-    ratios of 1.5 to 4, 40 % are equalised by up to 15 dB, and 40 % are amplified by 0.2 to 0.8
-    times the hearing loss.
+    Each item is noisy with a probability of 40 %, at -5 to 20 dB SNR, and gets a random level. If
+    ``treated``, it is compressed with ratios of 1.5 to 4 (20 %), equalised by up to 15 dB (40 %),
+    and amplified by 0.2 to 0.8 times the hearing loss (40 %).
 
     Args:
         speech: Clean speech at 16 kHz with shape (items, time).

@@ -16,7 +16,7 @@ DIGITS = Path(__file__).parent / "digits"
 """Folder of spoken digits at 16 kHz: one file per voice, with the digits 0 to 9 in equal slots."""
 
 SLOT_SAMPLES = 12000
-"""Length of the slot of a digit, 0.75 s, in samples at 16 kHz. Speech begins after 50 ms."""
+"""Length of the slot of a digit in samples at 16 kHz, 0.75 s. Speech begins 50 ms into it."""
 
 DIGIT_DBFS = -26.0
 """RMS level of each digit, without the silence around it, in dB relative to full scale."""

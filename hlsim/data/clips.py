@@ -14,20 +14,22 @@ from hlsim.audio import find_audio, read_audio
 from hlsim.dsp.resample import resample
 
 MAX_FAILURES = 10_000
-"""Number of draws in a row without a clip that is an error. It allows for recordings that are
-silent except for one second per hour."""
+"""Number of draws in a row without a usable clip after which an error is raised.
+
+It allows for recordings that are silent except for one second per hour.
+"""
 
 MAX_SAMPLES_IN_MEMORY = 2**30
-"""Number of samples of all recordings in memory: 2 GB, 18 hours at 16 kHz."""
+"""Largest number of samples of all recordings in memory: 2 GB, 18 hours at 16 kHz."""
 
 AudioFiles = str | Path | Sequence[Path | tuple[Path, Path]]
 """A folder that is searched for audio, with its subfolders; or a list of files.
 
-In a list, a pair of files, clean speech and its noisy version, stands for the noise between them.
+In a list, a pair of files, clean speech and its noisy version, means the noise: their difference.
 """
 
 _MAX_HASHED_BYTES = 2**30
-"""Number of bytes up to which ``hash_source`` reads all files completely."""
+"""Total size in bytes up to which ``hash_source`` reads all files completely."""
 
 _HASHED_PIECES = 4
 _SMALLEST_PIECE = 4096  # bytes
@@ -42,15 +44,15 @@ _LOWEST_PEAK = 1e-9
 class Clips:
     """Clips of equal length from the first channels of recordings, at one sample rate.
 
-    Recordings are scaled to a peak of 1.0, so that clips have no calibrated level. They are decoded
-    when they are first drawn, and kept as 16-bit samples, up to 2 GB; beyond that, the one that was
-    decoded first is dropped, and decoded again when it is drawn. A file that is broken or has an
-    unsupported sample rate causes a warning, and another one is drawn instead.
+    Recordings are scaled to a peak of 1.0, so that clips have no calibrated level. Recordings are
+    decoded when they are first drawn, and stored as 16-bit samples, up to 2 GB; beyond that, the
+    recording that was decoded first is dropped, and decoded again when it is drawn. A file that is
+    broken or has an unsupported sample rate causes a warning, and another one is drawn instead.
 
     Args:
         source: Folder or files, see ``AudioFiles``.
         sample_rate: Sample rate of the clips in Hz.
-        seconds: Duration of a clip.
+        seconds: Duration of a clip in seconds.
         repeat: Whether recordings that are shorter than a clip are repeated; otherwise silence
             follows them.
 
@@ -112,7 +114,7 @@ class Clips:
         return self._recordings[index].float() / 32767.0
 
     def cut_clip(self, index: int, position: float) -> Tensor:
-        """Cut a clip out of a recording whose peak is 1.0, so that its level is not calibrated.
+        """Cut a clip out of a recording. The recording has a peak of 1.0, no calibrated level.
 
         A recording that is shorter than the clip is repeated if ``repeat`` is true. Otherwise
         silence follows it.
@@ -174,7 +176,7 @@ class Clips:
 
 
 def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
-    """Read noisy speech, and check that it has the shape and the rate of its clean version.
+    """Read noisy speech, and validate that it has the shape and the rate of its clean version.
 
     Args:
         path: File of noisy speech.
@@ -202,11 +204,11 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
 
 
 def hash_source(source: AudioFiles) -> str:
-    """Compute a hash of the contents of recordings, which changes when one is replaced.
+    """Compute a hash of the contents of recordings, which changes when a recording is replaced.
 
-    Paths have no influence except for the order of the files, so that a corpus may be moved. If all
-    files have 1 GB or less together, they are read completely. Otherwise, the hash covers the size
-    of each file and four pieces of it, from its start to its end, about 1 GB together.
+    Paths have no influence except on the order of the files, so that a corpus may be moved. If all
+    files together have 1 GB or less, they are read completely. Otherwise, the hash covers the size
+    of each file and four pieces of each large file, from its start to its end, about 1 GB in total.
 
     Args:
         source: Folder or files, see ``AudioFiles``.
@@ -241,9 +243,10 @@ def hash_source(source: AudioFiles) -> str:
 
 
 def _find_pairs(source: AudioFiles) -> list[tuple[Path | None, Path]]:
-    """Return pairs of a clean version and a file: None and the file for a plain recording.
+    """Return a pair for each recording: the clean version, or None if there is none, and the file.
 
-    A pair of clean and noisy speech stands for the noise between them.
+    Raises:
+        ValueError: The folder does not exist, or contains no audio.
     """
     files = find_audio(source) if isinstance(source, str | Path) else source
     return [file if isinstance(file, tuple) else (None, file) for file in files]

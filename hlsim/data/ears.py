@@ -10,13 +10,13 @@ from torch import Tensor
 from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, STANDARD
 
 MILDER = ("NH", "N1", "N2", "S1")
-"""Standard ears that evaluations add to measured ones, most of which are moderate or severe."""
+"""Standard ears that evaluations add, because most measured ears are moderate or severe."""
 
 _SERIES = (("NH", "N1", "N2", "N3", "N4", "N5", "N6"), ("NH", "S1", "S2", "S3"))
 """Series of standard ears by increasing loss: flat or gently sloping, and steeply sloping."""
 
 _TILT = (1.0, 0.9, 0.6, 0.2, 0.0, 0.0, 0.0, 0.0)
-"""Random change of the threshold at each frequency, relative to that at 250 Hz."""
+"""Random shift of the threshold at each of ``FREQUENCIES``, relative to that at 250 Hz."""
 
 _CORRELATION = 0.8
 """Correlation of the random deviations at neighbouring frequencies, as among measured ears."""
@@ -27,10 +27,10 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
 
     Each ear starts between two neighbours in one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ...
     S3). Its thresholds from 250 to 2000 Hz are shifted together, by up to 20 dB up or down at 250
-    Hz and less at higher frequencies. Gaussian deviations are added, whose standard deviation is
-    2.4 to 8 dB and which correlate at neighbouring frequencies. Three in four ears are rounded to 5
-    dB, as in audiometry. By MSBG's definition, 27 % have no loss, 18 % a mild one, 19 % a moderate
-    one and 36 % a severe one.
+    Hz and less at higher frequencies. Gaussian deviations are added, with a standard deviation of
+    2.4 to 8 dB and a correlation between neighbouring frequencies. Three in four ears are rounded
+    to 5 dB, as in audiometry. By MSBG's definition, 27 % have no loss, 18 % a mild one, 19 % a
+    moderate one and 36 % a severe one.
 
     Args:
         count: Number of ears.

@@ -26,7 +26,7 @@ _SPLIT_NAMES = {
     "valid": ("valid", "validation", "val", "dev", "cv", "eval"),
     "test": ("test", "testing", "tt"),
 }
-"""Names of the folder of each split."""
+"""Names that the folder of each split may have."""
 
 _SPLIT_OF = {name: split for split, names in _SPLIT_NAMES.items() for name in names}
 
@@ -36,7 +36,7 @@ _LEVELS = {
     "condition": r"(?P<condition>clean|noisy|noises?)",
     "other": r"[^/]+",
 }
-"""Meanings that a level of folders can have, with the pattern of its names."""
+"""Meanings that a level of folders can have, each with a pattern of the folders' names."""
 
 _LAYOUTS = {
     "VoiceBank-DEMAND": (
@@ -82,7 +82,8 @@ def prepare(
             corpus has none.
 
     Returns:
-        Name of the layout, a table of the splits, and the number of files that are left out.
+        Text to print: the name of the layout, a table of the splits and, if files of noise were
+        left out, their number.
 
     Raises:
         ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
@@ -130,7 +131,7 @@ def prepare(
 def find_corpus(
     root: str | Path, folders: Sequence[str] | None = None
 ) -> tuple[str, list[Utterance]]:
-    """Recognise the layout of a folder, and list its utterances, whose audio is not read.
+    """Recognise the layout of a folder, and list its utterances, without reading audio.
 
     Args:
         root: Folder of the corpus.
@@ -140,7 +141,8 @@ def find_corpus(
         The name of the layout, and the utterances.
 
     Raises:
-        ValueError: The layout is unknown or contradictory.
+        ValueError: The folder does not exist or contains no audio, the layout is unknown or
+            contradictory, or the utterances contradict each other, see ``check_utterances``.
 
     >>> from hlsim.data.bundled import SPEECH
     >>> layout, utterances = find_corpus(SPEECH)
@@ -240,11 +242,16 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
 
 
 def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
-    """Read utterances from the paths of files, which must all match the pattern of a layout.
+    """Convert the paths of files, which must all match the pattern of a layout, to utterances.
+
+    Args:
+        files: Paths relative to the corpus, with forward slashes.
+        pattern: Regular expression for paths, with named groups as in ``_LAYOUTS``.
+        layout: Name of the layout, for messages.
 
     Raises:
-        ValueError: A file does not match the pattern, or lacks its counterpart; or two folders or
-            files claim one place.
+        ValueError: A file does not match the pattern, a clean or noisy file lacks its counterpart,
+            or two folders are for the same split, or two files have the same place in a pair.
     """
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}

@@ -13,7 +13,7 @@ from pathlib import Path
 from hlsim.files import convert_at, path_below, read_table, warn_of_unused, write_atomically
 
 SPLITS = ("train", "valid", "test")
-"""Names of the splits."""
+"""Names of the splits: parts of a corpus for training, validation and test."""
 
 COLUMNS = ("path", "noisy", "speaker", "split")
 """Columns of a manifest."""
@@ -28,7 +28,7 @@ class Utterance:
 
     Attributes:
         path: Path of the clean speech, relative to the folder of the corpus, with forward slashes.
-        noisy: Path of its noisy version, time-aligned and equally long; empty if there is none.
+        noisy: Path of the noisy version, time-aligned and equally long; empty if there is none.
         speaker: Name of the speaker; empty if unknown.
         split: ``train``, ``valid`` or ``test``.
 
@@ -43,7 +43,7 @@ class Utterance:
 
 
 def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utterance]:
-    """Read and check a manifest. The paths are returned without ``.`` and ``..``.
+    """Read and validate a manifest. The returned paths contain no ``.`` and ``..``.
 
     Args:
         path: CSV file with a column ``path`` and optional columns ``noisy`` (path of the noisy
@@ -91,7 +91,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
 
 
 def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
-    """Write a manifest atomically; an older manifest is replaced.
+    """Write a manifest atomically, in place of an older manifest of this name.
 
     Args:
         path: CSV file to write.

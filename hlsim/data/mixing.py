@@ -28,7 +28,8 @@ def mix(
     Args:
         speech: Tensor or NumPy array of speech, ``(..., time)``.
         noise: Noise of the same shape, or longer; its end is then left out.
-        snr: Signal-to-noise ratio in dB, or a tensor with one per signal, ``(...)``.
+        snr: Signal-to-noise ratio in dB, or a tensor of ratios, one per signal (with ``channels``,
+            one per recording).
         sample_rate: Sample rate in Hz, 16000 to 48000. ``None`` takes the RMS level of the speech
             with its pauses instead of the active level.
         channels: Whether the second last dimension holds the channels of a recording, which have
@@ -40,7 +41,7 @@ def mix(
 
     Raises:
         ValueError: The shapes do not fit, the noise is silent or shorter than the speech, samples
-            are NaN or infinite, or the SNR is not a number.
+            are NaN or infinite, the SNR is NaN, or the sample rate is out of range.
 
     Example:
         >>> import hlsim

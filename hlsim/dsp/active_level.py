@@ -10,10 +10,10 @@ _TIME_CONSTANT = 0.03
 """Time constant in seconds of each of the two filters that smooth the envelope."""
 
 _HANGOVER = 0.2
-"""Seconds for which speech counts as active after its envelope has fallen."""
+"""Time in seconds for which speech counts as active after its envelope has fallen."""
 
 _MARGIN_DB = 15.9
-"""Active speech level minus the threshold of activity in dB."""
+"""Active speech level minus the threshold of activity in dB, as the standard defines it."""
 
 _THRESHOLDS = 2.0 ** -np.arange(16.0)[::-1]
 """Thresholds of activity relative to the envelope's maximum, in ascending order."""

@@ -24,7 +24,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
     Shape: (..., time) -> complex (..., points // 2 + 1).
 
     Args:
-        signals: Real signals, which are cut or followed by zeros to the length of the transform.
+        signals: Real signals, which are cut or zero-padded to the length of the transform.
         points: Length of the transform, by default that of the signals.
 
     Raises:
@@ -43,7 +43,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
 
 
 class _RFFT(torch.autograd.Function):
-    """Real Fourier transform with a hand-written backward pass, which is a real transform, too.
+    """Real Fourier transform with a hand-written backward pass, which is also a real transform.
 
     Autograd's backward pass of ``torch.fft.rfft`` is a complex transform of twice the length.
     """
@@ -128,9 +128,9 @@ class _Power(torch.autograd.Function):
 def fade_out_weights(bins: int, spacing: float, end: float) -> NDArray[np.float64]:
     """Compute weights that fade a spectrum out over the last 80 Hz below a frequency.
 
-    They are 1 up to 80 Hz below this frequency, and then fall to 0. If the spectrum were cut off
-    suddenly, signals would ring for seconds, and the length of the transform would decide how much
-    of the ringing wraps around.
+    The weights are 1 up to 80 Hz below this frequency, and then fall to 0. If the spectrum were cut
+    off suddenly, signals would ring for seconds, and the length of the transform would decide how
+    much of the ringing wraps around.
 
     Args:
         bins: Number of frequencies of the spectrum.

@@ -17,10 +17,10 @@ BLOCK_POINTS = 4096
 """Length of the Fourier transforms of ``filter_in_blocks``."""
 
 _BLOCK_HOP = 3072
-"""Samples from the start of one block of ``filter_in_blocks`` to the start of the next."""
+"""Number of samples from the start of one block of ``filter_in_blocks`` to that of the next."""
 
 _GRID_POINTS = 513
-"""Frequencies of the grid on which a filter is designed, from 0 Hz to the Nyquist frequency."""
+"""Number of frequencies of the grid on which a filter is designed, 0 Hz to Nyquist frequency."""
 
 
 def frequency_sampling_fir(
@@ -70,7 +70,7 @@ def filters_with_gains(
 ) -> Tensor:
     """Design linear-phase filters whose gains in dB are straight lines between some frequencies.
 
-    They are those of ``frequency_sampling_fir``, and differentiable in the gains.
+    The filters are those of ``frequency_sampling_fir``, and differentiable in the gains.
 
     Shape: (..., gains) -> (..., order + 1).
 
@@ -91,11 +91,13 @@ def filters_with_gains(
 
 @constant
 def _unit_filters(order: int) -> NDArray[np.float64]:
-    """Return the filters with a gain of 1 at one of ``order + 1`` evenly spaced frequencies.
+    """Design one filter for each of ``order + 1`` evenly spaced frequencies.
 
-    A filter is linear in its gains: it is the sum of these filters times the gains.
+    The gain of a filter is 1 at its frequency and 0 at the other frequencies. Filters are linear in
+    their gains: the sum of these filters times some gains is the filter with these gains.
 
-    Returns: (order + 1, order + 1), one row per frequency.
+    Returns:
+        Coefficients, (order + 1, order + 1), one row per frequency.
     """
     grid = np.arange(order + 1) / order
     return np.stack([frequency_sampling_fir(len(grid), grid, gain) for gain in np.eye(len(grid))])

@@ -12,7 +12,7 @@ Positions = tuple[float, ...] | NDArray[np.float64]
 
 
 def interpolate(values: Tensor, grid: tuple[float, ...], points: tuple[float, ...]) -> Tensor:
-    """Interpolate values linearly. Beyond the ends of the grid they stay constant.
+    """Interpolate values linearly. Beyond the ends of the grid the result is constant.
 
     Args:
         values: Values on the grid, such as levels in dB.
@@ -39,8 +39,8 @@ def interpolation_weights(grid: Positions, points: Positions) -> NDArray[np.floa
         points: Positions of the result.
 
     Returns:
-        Weights, (grid, points). The product of values on the grid and this matrix are the values
-        at the points.
+        Weights, (grid, points). Values on the grid, (..., grid), times this matrix are the values
+        at the points, (..., points).
 
     >>> interpolation_weights((250.0, 500.0), (375.0, 900.0)).T
     array([[0.5, 0.5],

@@ -22,9 +22,9 @@ class STFT:
     Args:
         fft: Length of the Fourier transform in samples, an even number.
         window: Length of the Hann window in samples, at most ``fft``.
-        hop: Samples from one frame to the next, at most half of ``window``. Where spectra are
-            modified before synthesis, take a quarter of it: with longer hops, the last samples may
-            be divided by a number close to zero.
+        hop: Number of samples from one frame to the next, at most half of ``window``. If spectra
+            are modified before synthesis, choose a quarter of ``window`` or less: with longer hops,
+            the last samples may be divided by a number close to zero.
 
     Raises:
         ValueError: The lengths do not fit together.
@@ -51,7 +51,7 @@ class STFT:
 
     @property
     def frequencies(self) -> int:
-        """Number of frequencies of a spectrum, ``fft // 2 + 1``."""
+        """Number of frequencies of a frame's spectrum, ``fft // 2 + 1``."""
         return self.fft // 2 + 1
 
     def analyse(self, waveform: Tensor) -> Tensor:
