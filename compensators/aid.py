@@ -27,7 +27,7 @@ from hlsim.torchtools import constant
 
 
 class Aid(nn.Module):
-    """Base class of aids, which may store an ear, and measure how much they amplify a noise.
+    """Base class of all aids: it stores ears, and measures the gains of an aid.
 
     Subclasses implement ``forward`` and ``_amplify``.
 
@@ -37,7 +37,7 @@ class Aid(nn.Module):
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Attributes:
-        highest_level: Highest threshold that is accepted, in dB HL.
+        highest_level: Highest hearing threshold that the aid accepts, in dB HL.
         thresholds: Thresholds in dB HL of the ears that calls without an audiogram use, (..., 8);
             None if there are none.
 
@@ -132,7 +132,7 @@ class Aid(nn.Module):
         return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
 
     def find_thresholds(self, audiogram: AudiogramLike | None) -> Tensor:
-        """Return the thresholds of the ears of a call, (..., 8), or else the stored ones.
+        """Return the thresholds in dB HL of the passed ears, or else of the stored ones, (..., 8).
 
         Args:
             audiogram: Ears that were passed with the call, or None.
@@ -144,7 +144,7 @@ class Aid(nn.Module):
         return as_thresholds(ears, highest=self.highest_level)
 
     def resolve_thresholds(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
-        """Return the thresholds of the passed ears, or of the stored ones, for a waveform.
+        """Return the thresholds of the passed or else of the stored ears, checked for a waveform.
 
         See ``hlsim.audiogram.thresholds.resolve_thresholds`` for shapes and errors.
 
@@ -160,6 +160,8 @@ class Aid(nn.Module):
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Return the output for signals in pascals at 16 kHz, without noise reduction and limit.
+
+        The output may be late by the delay of the aid's filters.
 
         Shape: (items, time), (items, 8) in dB HL -> (items, time).
         """
@@ -182,7 +184,9 @@ def _speech_noise() -> NDArray[np.float64]:
 
 @constant
 def thirds_of_octave() -> NDArray[np.float64]:
-    """Return 1 for each whole frequency in Hz in each third of an octave, else 0, (8001, 8).
+    """Return the thirds of an octave around ``FREQUENCIES`` as weights of 0, 1, ..., 8000 Hz.
+
+    Shape: -> (8001, 8), 1 where a frequency lies in a third of an octave, else 0.
 
     >>> print(thirds_of_octave().sum(0))
     [  58.  116.  232.  463.  695.  926. 1389.  873.]

@@ -12,8 +12,8 @@ class MappingConfig(NetworkConfig):
     """Settings of a ``MappingCompensator``, in addition to the sizes in ``NetworkConfig``.
 
     Attributes:
-        start: Gain before training, to which the network adds a correction: that of the
-            prescription, ``"nalr"``.
+        start: Prescription that gives the gain before training, to which the network adds a
+            correction. There is only ``"nalr"``.
         phase: Phase of the output: ``input`` for that of the input, or ``predicted`` by the
             network, as in Neuro-MSBG. Do not combine ``predicted`` with a criterion that compares
             only levels, such as ``"bands"``. Training may then find phases that differ between
@@ -61,12 +61,12 @@ class HearingAidConfig(ModelConfig):
         reach_db: Largest correction of the restoring gain up or down in dB.
         reduction_db: Largest attenuation of a band by noise reduction in dB.
         attack: Time constant in seconds with which the level that sets the amplification rises.
-        release: Time constant in seconds with which it falls.
+        release: Time constant in seconds with which this level falls.
         opening: Time constant in seconds with which the attenuation of noise decreases.
-        closing: Time constant in seconds with which it increases.
+        closing: Time constant in seconds with which the attenuation of noise increases.
         cap_db: Largest amplification of a band in dB.
         quiet_spl: Level of a frame in dB SPL below which the amplification fades. Frames that are
-            15 dB softer are not amplified.
+            15 dB softer than this level are not amplified.
         limit_spl: Peak of the output in dB SPL that no sample exceeds.
 
     Raises:

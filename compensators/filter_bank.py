@@ -1,11 +1,12 @@
 """Filter bank of the wearable aids: it amplifies bands of a signal, and measures their levels.
 
-The bands cover 0 to 8000 Hz at a sample rate of 16 kHz. Their filters have linear phase, and add up
-to a delay of 64 samples. Three terms of all wearable aids:
+The bands cover 0 to 8000 Hz at a sample rate of 16 kHz. Their filters have linear phase, and their
+sum is a delay of 64 samples. Three terms of all wearable aids:
 
 - A *hop* is 64 samples (4 ms). An aid computes the gains of its bands once per hop.
 - A *frame* is the last 256 samples (16 ms) at the end of a hop, whose spectrum sets the gains.
-- An *excess gain* is a linear gain minus 1. With 0 in all bands, no bit of the signal changes.
+- An *excess gain* is a linear gain minus 1. If it is 0 in all bands, the signal is only delayed,
+  and no bit of its samples changes.
 """
 
 from functools import lru_cache
@@ -28,16 +29,16 @@ DELAY = 64
 """Delay of the filters in samples, 4 ms. Each filter has 2 * 64 + 1 taps."""
 
 HOP = 64
-"""Samples from the end of one frame to the end of the next."""
+"""Number of samples from the end of one frame to the end of the next one."""
 
 FRAME = 256
-"""Samples of a frame."""
+"""Number of samples of a frame."""
 
 FALL = 64
-"""Samples at the end of a frame in which its window falls."""
+"""Number of samples at the end of a frame in which its window falls."""
 
 HISTORY = FRAME - HOP
-"""Samples before a hop that belong to its frame."""
+"""Number of samples before a hop that belong to its frame."""
 
 MIN_SPACING = 125.0
 """Smallest distance of two centres in Hz, about what filters of this length can separate."""
@@ -49,7 +50,7 @@ GRID_POINTS = 4096
 """Length of the Fourier transform with which filters and the spectrum of speech are computed."""
 
 SPEECH_SPL = 65.0
-"""Level in dB SPL of average speech."""
+"""Level in dB SPL at which average speech is presented."""
 
 # Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's:
 # Byrne et al. 1994, Journal of the Acoustical Society of America 96(4)
@@ -84,7 +85,7 @@ def filter_centres(bands: int) -> tuple[float, ...]:
 
 
 def _spaced_frequencies(count: int, erbs: float) -> list[float]:
-    """Return frequencies from 0 Hz upwards with a spacing in ERBs, but at least 125 Hz."""
+    """Return ``count`` frequencies in Hz from 0 Hz upwards, ``erbs`` ERBs or 125 Hz apart."""
     frequencies = [0.0]
     for _ in range(count - 1):
         width = erbs * float(erb(np.array(frequencies[-1])))
@@ -93,9 +94,10 @@ def _spaced_frequencies(count: int, erbs: float) -> list[float]:
 
 
 def filter_powers(powers: Tensor, bands: int) -> Tensor:
-    """Add up the power in each band from the power at each frequency of a frame.
+    """Add up the powers of a frame's frequencies in each band.
 
-    A frequency between two centres belongs to both bands, in inverse proportion to the distance.
+    The power at a frequency between two centres is shared between both bands, linearly, so that the
+    nearer band gets more.
 
     Args:
         powers: Powers in Pa^2 from ``frame_power``.
@@ -122,7 +124,9 @@ def _filter_shares(bands: int, points: int) -> NDArray[np.float64]:
 
 
 def _filter_taps(bands: int) -> NDArray[np.float64]:
-    """Return the symmetric taps of the filters, whose sum over bands is 1 in the middle, else 0.
+    """Return the symmetric taps of the bands' filters.
+
+    Their sum over all bands is 1 in the middle and 0 elsewhere: a delay.
 
     Returns: (bands, 2 * DELAY + 1).
     """
@@ -140,8 +144,9 @@ def apply_gains(samples: Tensor, excess_gains: Tensor, position: int = 0) -> Ten
     Args:
         samples: ``2 * DELAY`` = 128 earlier samples, which the filters need, followed by whole hops
             or a part of one hop.
-        excess_gains: Linear gains minus 1 at the beginning of each hop and at the end of the last.
-        position: Number of samples of the hop that come before the part that is passed; 0 for whole
+        excess_gains: Linear gains minus 1 of each band, at the beginning of each hop and at the end
+            of the last one.
+        position: Number of samples of the hop before the part of it that is passed; 0 for whole
             hops.
 
     Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
@@ -168,7 +173,8 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
     """Interpolate the gains of one band linearly to the samples of a signal at another rate.
 
     Args:
-        gains: Gains before the first sample and at the last sample of each hop at 16 kHz.
+        gains: Gain just before the first sample, then that at the last sample of each hop at 16
+            kHz.
         rate: Sample rate of the signal in Hz.
         time: Number of samples of the signal.
 
@@ -213,7 +219,7 @@ def level_db(powers: Tensor) -> Tensor:
 
 @constant
 def speech_band_levels(bands: int) -> NDArray[np.float64]:
-    """Return the level of average speech in each band in dB SPL, at 65 dB SPL in total.
+    """Return the level in dB SPL of average speech in each band, at 65 dB SPL in total, (bands,).
 
     >>> print(speech_band_levels(4).round())
     [60. 63. 53. 43.]
@@ -223,7 +229,7 @@ def speech_band_levels(bands: int) -> NDArray[np.float64]:
 
 
 def speech_density(points: int) -> NDArray[np.float64]:
-    """Return the relative power density of average speech at the frequencies of a transform.
+    """Return the power density of average speech at the frequencies of a transform, on any scale.
 
     Args:
         points: Length of the Fourier transform at 16 kHz.
@@ -243,7 +249,7 @@ def speech_density(points: int) -> NDArray[np.float64]:
 
 @constant
 def _hop_matrix(bands: int) -> NDArray[np.float64]:
-    """Return the matrix from the samples of a hop, and those before it, to the bands of the hop.
+    """Return the matrix that filters a hop, with the 128 samples before it, into all bands.
 
     Returns: (2 * DELAY + HOP, bands * HOP).
     """
@@ -272,7 +278,10 @@ def _window() -> NDArray[np.float64]:
 
 @constant
 def _scale() -> NDArray[np.float64]:
-    """Return the factor from squared magnitudes to powers, (FRAME / 2 + 1,)."""
+    """Return the factors by which squared magnitudes of a frame's spectrum become powers in Pa^2.
+
+    Returns: (FRAME / 2 + 1,).
+    """
     scale = np.full(FRAME // 2 + 1, 2.0 / (FRAME * np.square(_window()).sum()))
     scale[[0, -1]] /= 2.0
     return scale

@@ -22,7 +22,7 @@ from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.torchtools import built_in_float32
 
 DEFAULT_NOISE_REDUCTION = 0.5
-"""Share of the attenuation by default.
+"""Default of the slider ``noise_reduction``, the share of the attenuation that is applied.
 
 Whisper base behind the simulated ear finds most words in noise with half of it (docs/measured.md).
 """
@@ -34,7 +34,7 @@ INITIAL_REDUCTION_LOGIT = -3.0
 """Initial logit of noise reduction: 5 % of the largest attenuation."""
 
 NO_GAIN_SPL = 100.0
-"""Level of a band in dB SPL from which on the restoring gain is 0.
+"""Level of a band in dB SPL from which the restoring gain is 0.
 
 The bands are wider than MSBG's, and louder than each part of them: of 95, 100, 105 and 110 dB SPL,
 100 came closest to normal hearing of speech.
@@ -51,11 +51,11 @@ class HearingAid(Wearable, HubModel):
 
         amplification * (restoring gain + correction) - noise_reduction * attenuation,
 
-    where ``amplification`` and ``noise_reduction`` are sliders from 0 to 1 that the wearer sets. At
-    0 and 0 the input passes unchanged. The terms are:
+    where ``amplification`` and ``noise_reduction`` are sliders from 0 to 1 that the wearer sets. If
+    both are 0, nothing but the peaks of the input changes. The terms are:
 
-    - The restoring gain makes the band as loud for the impaired ear as for a normal one, by the
-      formula with which MSBG simulates the growth of loudness.
+    - The restoring gain makes the band about as loud for the impaired ear as for a normal one. It
+      inverts the formula by which MSBG simulates the growth of loudness.
     - The correction comes from a network that gets the audiogram and the level of each band. It is
       0 before training, and where there is no loss.
     - The attenuation comes from a recurrent network that gets levels, but no audiogram.
@@ -126,7 +126,10 @@ class HearingAid(Wearable, HubModel):
 
     @property
     def noise_reduction_network(self) -> nn.ModuleList:
-        """Modules that compute the attenuation of noise. ``correct`` computes the amplification."""
+        """Modules that compute the attenuation of noise, to train or freeze them separately.
+
+        The other network, ``correct``, computes the correction of the restoring gain.
+        """
         return nn.ModuleList([self.enter, self.recur, self.leave])
 
     def train(self, mode: bool = True) -> Self:
@@ -153,7 +156,13 @@ class HearingAid(Wearable, HubModel):
             audiogram: Ears of the signals, by default those of the constructor.
             noise_reduction: Share of the attenuation of noise that is applied, 0 to 1: one number,
                 or one value per item.
-            amplification: Share of the amplification that is applied, likewise.
+            amplification: Share of the amplification that is applied, in the same form.
+
+        Shape: (..., time) -> (..., time).
+
+        Raises:
+            ValueError: A slider is outside 0 to 1, or an argument is not valid, see
+                ``Aid.forward``.
         """
         sliders: dict[str, Slider] = {
             "noise_reduction": noise_reduction,
@@ -174,7 +183,7 @@ class HearingAid(Wearable, HubModel):
     def attenuation(self, samples: Tensor) -> Tensor:
         """Compute the gains with which noise reduction attenuates each band, every 4 ms.
 
-        They do not depend on the ear.
+        They are those for the slider ``noise_reduction`` at 1, and do not depend on the ear.
 
         Args:
             samples: Input of the aid in pascals at 16 kHz, a multiple of 64 samples long.
@@ -188,6 +197,9 @@ class HearingAid(Wearable, HubModel):
     def _levels(self, powers: Tensor) -> Tensor:
         """Return the levels of the bands, of the whole frame, and of single frequencies in dB SPL.
 
+        Args:
+            powers: Powers in Pa^2 from ``frame_power``.
+
         Shape: (items, frames, FRAME / 2 + 1) -> (items, frames, bands + 1 + bins).
         """
         by_band = filter_powers(powers, self.bands)
@@ -197,10 +209,14 @@ class HearingAid(Wearable, HubModel):
     def _amplification(
         self, levels: Tensor, fitted: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the restoring gain with its correction in dB, and the state of the levels.
+        """Return the sum of restoring gain and correction in dB, and the new state.
 
-        Shape: (items, frames, bands + 1) for the bands and the whole frame, (items, 2 bands)
-            -> (items, frames, bands).
+        Args:
+            levels: Levels in dB SPL of the bands and of the whole frame.
+            fitted: Hearing loss in dB HL in each band, then NAL-R's gain in dB in each band.
+            state: Memory of earlier frames, of which ``levels`` is used and returned.
+
+        Shape: (items, frames, bands + 1), (items, 2 * bands) -> (items, frames, bands).
         """
         config = self.config
         present = levels[..., : self.bands]
@@ -224,7 +240,10 @@ class HearingAid(Wearable, HubModel):
     def _attenuation(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the gain of noise reduction in dB, 0 or less, and its state after these frames.
 
-        ``levels`` are in dB SPL, as ``_levels`` returns them.
+        Args:
+            levels: Levels in dB SPL from ``_levels``.
+            state: Memory of earlier frames, of which ``attenuation`` and ``hidden`` are used and
+                returned.
 
         Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands).
         """
@@ -246,9 +265,9 @@ class HearingAid(Wearable, HubModel):
 
 
 def _lstm_step(lstm: nn.LSTM, frame: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Run a one-layer LSTM for one frame, which takes a quarter of the time of a call of the LSTM.
+    """Run a one-layer LSTM for one frame, in a quarter of the time that a call of the LSTM takes.
 
-    The bits are the same on a CPU.
+    On a CPU, every bit of the result is the same.
 
     Shape: (items, inputs), (items, units) twice -> hidden and cell state, (items, units) each.
     """

@@ -8,20 +8,21 @@ EXPONENT = 8.0
 """Exponent of the curve. The higher it is, the closer the curve is to clipping."""
 
 HIGHEST_RATIO = 1e4
-"""Ratio of a sample to the peak above which samples are treated alike.
+"""Ratio of a sample to the limit from which all samples have the same output.
 
 Its eighth power fits into float32.
 """
 
 
 def soft_limit(waveform: Tensor, limit_spl: float) -> Tensor:
-    """Limit the magnitude of samples without the edges of clipping: x / (1 + |x / peak|^8)^(1/8).
+    """Limit the magnitude of samples by a smooth curve: x / (1 + |x / limit|^8)^(1/8).
 
-    Below half of the peak, samples are attenuated by 0.004 dB at most.
+    Up to half of the limit, samples are attenuated by less than 0.005 dB.
 
     Args:
         waveform: Samples in pascals. Any shape.
-        limit_spl: Peak in dB SPL that the magnitude of no sample of the result exceeds.
+        limit_spl: Limit of the magnitude of each sample of the result, in dB relative to 20
+            micropascals.
 
     >>> import torch
     >>> soft_limit(torch.tensor([0.1, 2.0, 100.0]), limit_spl=100.0)  # 2 pascals

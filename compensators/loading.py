@@ -19,7 +19,7 @@ Trained = MappingCompensator | HearingAid
 CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
     kind.kind: kind.config_class for kind in (MappingCompensator, HearingAid)
 }
-"""Class of the settings of each kind of checkpoint, by the kind's name in ``config.json``."""
+"""Class of the settings of each kind of compensator, by the name of the kind in ``config.json``."""
 
 UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
 """Compensators without a checkpoint."""
@@ -29,8 +29,8 @@ def build_compensator(config: MappingConfig | HearingAidConfig, **levels: Any) -
     """Build an untrained compensator from its settings.
 
     Args:
-        config: Settings. Their class decides which kind of compensator is built.
-        levels: ``sample_rate`` and ``full_scale_spl``, as in ``load_compensator``.
+        config: Settings. Their class selects the kind of compensator.
+        levels: Arguments ``sample_rate`` and ``full_scale_spl``, as in ``load_compensator``.
 
     >>> build_compensator(HearingAidConfig(bands=12)).bands
     12
@@ -47,7 +47,7 @@ def load_compensator(
     full_scale_spl: float = PASCAL_SPL,
     linked: bool = False,
 ) -> Trained | NALR | WDRC:
-    """Load a hearing aid by name, in evaluation mode and with weights that are not trained further.
+    """Load a hearing aid by name, in evaluation mode and without gradients of its weights.
 
     Nothing is downloaded.
 
@@ -62,7 +62,8 @@ def load_compensator(
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind or has changed since it was
-            saved, or ``linked`` is set for an aid that does not support it.
+            saved, the rate or the level is out of range, or ``linked`` is set for an aid that does
+            not support it.
 
     >>> import hlsim
     >>> aid = load_compensator("hearing-aid")
@@ -92,9 +93,9 @@ def save_compensator(
 ) -> None:
     """Save a trained compensator as a folder, which ``load_compensator`` loads.
 
-    A checkpoint that is already there is replaced. A card, README.md, is written too, unless there
-    is one that somebody else wrote. The sample rate and ``full_scale_spl`` are not saved; pass them
-    to ``load_compensator``.
+    A checkpoint that is already there is replaced. A card, README.md, is written too, unless the
+    folder has one that hlsim did not write. The sample rate and ``full_scale_spl`` are not saved;
+    pass them to ``load_compensator``.
 
     Args:
         model: Compensator to save.

@@ -1,4 +1,7 @@
-"""Hearing aids on signals that are too long for the memory: block by block, with one state."""
+"""Wearable hearing aids on signals that are too long for the memory: block by block.
+
+Each block continues with the state in which the block before has left the aid.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,13 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.dsp.overlap import Block, split_into_blocks
 
 _BLOCK_SECONDS = 10.0
-"""Duration of the output of a block."""
+"""Duration in seconds of the output of one block."""
 
 _MARGIN_SECONDS = 0.01
-"""Duration that contains the kernels of resampling (4.3 ms) and the delay of an aid (4 ms)."""
+"""Duration in seconds of one part of the context of a block, which has two on each side.
+
+It covers the kernels of resampling (4.3 ms) and the delay of an aid (4 ms).
+"""
 
 
 def process_blocks(
@@ -33,11 +39,15 @@ def process_blocks(
 
     Args:
         aid: Hearing aid at the sample rate of the signal.
-        read: Function from blocks to their inputs, an iterable of tensors (..., time).
-        samples: Length of the signal.
+        read: Function from a list of blocks to an iterable of their inputs, tensors with shape
+            (..., time). See ``Block.cut_input`` for the samples of a block.
+        samples: Length of the signal in samples.
         audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the leading
             dimensions of the signal.
         sliders: Value from 0 to 1 under each slider's name; by default those of ``SLIDERS``.
+
+    Yields:
+        Parts of the output, (..., time), of about 10 s.
 
     Raises:
         ValueError: The audiogram or a slider is not valid.

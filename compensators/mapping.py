@@ -36,15 +36,14 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
     """A trainable aid for whole signals: a network that amplifies each point of the spectrogram.
 
     In dB, the gain at a time and a frequency is that of the prescription NAL-R plus a correction by
-    the network, which is smooth over time and frequency, and 0 before training. The
-    network gets the log magnitude of the input, the audiogram and the prescribed gain. It has the
-    encoder, dual-path blocks and decoder of Neuro-MSBG. Training needs the prescription: an
-    inaudible band has almost no gradient, and without a prescription the trained network is worse
-    than NAL-R.
+    the network, which is smooth over time and frequency. The network gets the log magnitude of the
+    input, the audiogram and the prescribed gain. It has the encoder, dual-path blocks and decoder
+    of Neuro-MSBG. Training needs the prescription: an inaudible band has almost no gradient, and
+    without a prescription the trained network is worse than NAL-R.
 
     The output is time-aligned with the input, and has its phase, which a second decoder shifts if
-    ``config.phase`` is "predicted". It depends on the level, because nothing is normalised, and is
-    softly limited at ``config.limit_spl``.
+    ``config.phase`` is "predicted". Gains depend on the level of the input, because nothing is
+    normalised. The output is softly limited at ``config.limit_spl``.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
@@ -131,7 +130,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
         """Return the correction of NAL-R's gain in nepers, smooth over time and frequency.
 
-        It lies between plus and minus ``config.reach_db``.
+        It lies between plus and minus ``config.reach_db`` dB.
 
         Args:
             features: Features after the last block. Shape: (items, channels, ...).
@@ -148,7 +147,15 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         return smooth @ out_of_bands * (self.config.reach_db / NEPER_DB)
 
     def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
-        """Return the input channels.
+        """Return the input channels of the encoder.
+
+        They are: log magnitude; with a predicted phase, the sine of the phase; encoded audiogram;
+        and NAL-R's gain.
+
+        Args:
+            spectrum: Spectrum of the input.
+            ears: Thresholds in dB HL.
+            start: NAL-R's gain at each frequency in nepers.
 
         Shape: complex (items, frames, frequencies), (items, 8), (items, frequencies)
             -> (items, 3 or 4, frames, frequencies).
@@ -162,9 +169,10 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 
 
 def _average_over_stride(levels: Tensor, stride: int) -> Tensor:
-    """Average twice over ``stride`` frames, which removes the decoder's pattern from steady input.
+    """Average twice over ``stride`` frames, so that gains for steady input are steady.
 
-    Before the first frame and after the last one, these are repeated.
+    The decoder's output has a pattern that repeats every ``stride`` frames. Before the averages,
+    the first and the last frame are repeated.
 
     Shape: (items, frames, bands) -> the same.
     """
@@ -174,11 +182,11 @@ def _average_over_stride(levels: Tensor, stride: int) -> Tensor:
 
 @constant
 def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
-    """Return weights that interpolate from bands to frequencies, linearly between band centres.
+    """Return weights that interpolate from bands to frequencies, linearly over ERB number.
 
-    The centres lie evenly on the ERB-number scale from 100 Hz to 8 kHz.
+    The centres of the bands are evenly spaced in ERB numbers from 100 Hz to 8 kHz.
 
-    Returns: (count, frequencies).
+    Returns: (count, fft // 2 + 1).
     """
     positions = erb_number(np.arange(fft // 2 + 1) * NEURO_RATE / fft)
     lowest, highest = erb_number(np.array([LOWEST_CENTRE, NEURO_RATE / 2.0]))

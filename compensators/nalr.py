@@ -1,4 +1,4 @@
-"""NAL-R, a prescription of gains for an audiogram that do not depend on the level."""
+"""NAL-R, a prescription of gains that depend on the audiogram and not on the level."""
 
 import scipy
 import torch
@@ -12,7 +12,7 @@ from hlsim.checks import check_waveform
 from hlsim.dsp.fir import filters_with_gains
 
 ORDER = 220
-"""Order of the filter, which has one more tap."""
+"""Order of the filter, which has 221 taps."""
 
 
 class NALR(Aid):
@@ -20,9 +20,8 @@ class NALR(Aid):
 
     NAL-R is the revised prescription of the National Acoustic Laboratories: Byrne and Dillon 1986,
     Ear and Hearing 7(4), and for severe losses Byrne, Parkinson and Newall 1990, Ear and Hearing
-    11(1). The filter has linear phase, and is that of pyclarity 0.9.0 without its delay of
-    110 samples. It amplifies loud sounds as much as soft ones, and the output has no
-    limit.
+    11(1). The filter has linear phase, and is that of pyclarity 0.9.0 without its delay of 110
+    samples. It amplifies loud sounds as much as soft ones, and the output is not limited.
 
     Args:
         audiogram: Audiogram of one ear, or of several, which is used by all calls that pass none.
@@ -60,7 +59,7 @@ class NALR(Aid):
             return output.to(waveform.dtype)
 
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
-        """Compute the insertion gains: the output level minus the input level at each frequency.
+        """Compute the insertion gains: NAL-R's gains themselves, which need no measurement.
 
         Args:
             audiogram: One or more ears, by default those of the constructor.
@@ -70,7 +69,7 @@ class NALR(Aid):
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: A threshold is outside -10 to 120 dB HL.
+            ValueError: There is no ear, or a threshold is outside -10 to 120 dB HL.
 
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])

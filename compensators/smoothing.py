@@ -1,7 +1,8 @@
-"""Smoothing of the levels and gains of bands from frame to frame, 4 ms each.
+"""Smoothing of the levels and gains of bands from frame to frame, which are 4 ms apart.
 
-A smoother gets the values of some frames, and returns its memory after the last one. The next call
-gets this memory, so that a signal may be processed in chunks of any number of frames.
+A smoother gets the values of some frames and a memory of earlier ones, and returns the smoothed
+values and the memory after the last frame. The next call gets this memory, so that a signal may be
+processed in chunks of any number of frames.
 """
 
 import math
@@ -15,7 +16,10 @@ from compensators.filter_bank import HOP, RATE
 from hlsim.torchtools import constant
 
 BLOCK_FRAMES = 128
-"""Frames that are computed together by a matrix, whose powers must not overflow."""
+"""Number of frames that are smoothed together by one matrix product.
+
+Values are divided by powers of a weight with exponents up to this number, which must not underflow.
+"""
 
 
 def follow_peaks(
@@ -25,12 +29,12 @@ def follow_peaks(
 
     This is the smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng.
     Soc. 60(6), Equation 17, without a loop over frames. With x for the values, y for the result, r
-    and a for the weights of the past in a fall and in a rise:
+    for the weight of the past that belongs to ``release`` and a for that of ``attack``:
 
         p[n] = max(x[n], r p[n - 1] + (1 - r) x[n]),  y[n] = a y[n - 1] + (1 - a) p[n]
 
     Args:
-        values: Levels or gains in dB, for each frame.
+        values: Levels or gains in dB, n for each frame.
         memory: Second result of the call for the preceding frames, zeros before the first frame.
         attack: Time constant of a rise in seconds. With 0, the result follows at once.
         release: Time constant of a fall in seconds.
@@ -70,9 +74,9 @@ def _average(values: Tensor, before: Tensor, past: float) -> Tensor:
     """Compute the exponential average y[n] = past y[n - 1] + (1 - past) x[n].
 
     Args:
-        values: x in each frame.
-        before: y before the first frame.
-        past: Weight of the past.
+        values: Values x of each frame.
+        before: Average y before the first frame.
+        past: Weight of the past, 0 to below 1.
 
     Shape: (items, frames, n), (items, n) -> (items, frames, n).
     """
@@ -100,12 +104,15 @@ def _running_maximum(values: Tensor) -> Tensor:
 
 @constant
 def _powers(frames: int, past: float) -> NDArray[np.float64]:
-    """Return past ** 1 to past ** frames, (frames, 1)."""
+    """Return past ** 1, past ** 2, ..., past ** frames, (frames, 1)."""
     return past ** np.arange(1.0, frames + 1.0)[:, None]
 
 
 @constant
 def _weights(frames: int, past: float) -> NDArray[np.float64]:
-    """Return the weight of each frame in each average, lower triangular, (frames, frames)."""
+    """Return the matrix from the frames' values to their averages, without the past before them.
+
+    Returns: Lower triangular, (frames, frames).
+    """
     distance = np.arange(frames)[:, None] - np.arange(frames)
     return np.where(distance >= 0, (1.0 - past) * past ** np.maximum(distance, 0), 0.0)

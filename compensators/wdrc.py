@@ -18,17 +18,18 @@ KNEE_DB = 20.0
 class WDRC(Wearable):
     """A hearing aid that amplifies loud sounds less than soft ones, without trained parameters.
 
-    Each band of average speech at 65 dB SPL gets the gain that NAL-R prescribes. The gain falls
-    where the band is louder, and rises where it is softer: the output changes by 1 dB if the input
-    changes by ``ratio`` dB. The ratio is 1 up to a loss of 10 dB HL, rises by 1 per 40 dB of loss,
-    and is 3 at most. The delay is 4 ms.
+    Each band of average speech at 65 dB SPL gets the gain that NAL-R prescribes. The gain is
+    smaller if the band is louder, and larger if it is softer, by up to 20 dB: the output changes by
+    1 dB if the input changes by as many dB as the compression ratio. The ratio is 1 up to a loss of
+    10 dB HL, rises by 1 per 40 dB of loss, and is 3 at most. Gains are 0 dB or more. The delay is 4
+    ms.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
-        release: Time constant in seconds with which it falls, 0.01 to 2.
+        release: Time constant in seconds with which this level falls, 0.01 to 2.
         limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds. A band is not
             amplified beyond this level.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences

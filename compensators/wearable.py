@@ -6,7 +6,8 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
 - An *item* is one signal for one ear. Methods with ``samples`` take all items of a call as rows,
   (items, time), in pascals at 16 kHz.
 - ``fitted`` (items, n) holds the parameters that ``fit`` computes once from the audiogram.
-- A *slider* is a setting from 0 to 1 that may change meanwhile, such as ``noise_reduction``.
+- A *slider* is a setting from 0 to 1, such as ``noise_reduction``, which a user may change while a
+  stream runs.
 - The *state* is all that an aid remembers from one hop to the next: tensors (items, ...) by name,
   such as earlier samples and smoothed levels. Methods take the state and return the next one. The
   aid itself stores none, so that whole signals, streams and exported programs run the same code.
@@ -52,10 +53,10 @@ State = Mapping[str, Tensor]
 """Tensors that an aid remembers from one hop to the next, by name, (items, ...) each."""
 
 SLIDER_STEP = 0.04
-"""Largest change of a slider per hop, so that the way from 0 to 1 takes 0.1 s."""
+"""Largest change of a slider per hop, so that a change from 0 to 1 takes 0.1 s."""
 
 BLOCK_SAMPLES = 320_000
-"""Samples of all items that are processed together, which limits memory and changes no output."""
+"""Number of samples of all items together that are processed at once, to limit the memory."""
 
 
 class Wearable(Aid):
@@ -135,7 +136,10 @@ class Wearable(Aid):
         return Stream(self, audiogram, **sliders)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Compute the hearing loss in each band in dB HL, followed by NAL-R's gain in each in dB.
+        """Compute the parameters of the aid for each ear.
+
+        They are the hearing loss in dB HL in each band, followed by NAL-R's gain in dB in each
+        band.
 
         Shape: (items, 8) in dB HL -> (items, 2 * bands).
         """
@@ -163,12 +167,12 @@ class Wearable(Aid):
         raise NotImplementedError
 
     def initial_state(self, sliders: Tensor) -> dict[str, Tensor]:
-        """Return what the aid remembers at the beginning of a signal: silence.
+        """Return the state at the beginning of a signal, before which there is silence.
 
         Args:
             sliders: Values of the sliders at the beginning. Shape: (items, sliders).
 
-        Returns: Named tensors, (items, ...) each, of the type and device of ``sliders``.
+        Returns: Tensors by name, (items, ...) each, of the type and device of ``sliders``.
         """
         shapes = {"past": (HISTORY,), "gains": (2, self.bands), **self.state_shapes}
         zeros = {name: sliders.new_zeros(len(sliders), *shape) for name, shape in shapes.items()}
@@ -218,11 +222,12 @@ class Wearable(Aid):
     def process_portions(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, State]:
-        """Compute what ``process_hops`` computes, in portions that limit the memory.
+        """Compute the same as ``process_hops``, a portion of the hops at a time, to save memory.
 
         Returns:
-            The output and the state of ``process_hops``, and between them the gains, preceded by
-            the gain before the first hop, (items, hops + 1).
+            The output and the state of ``process_hops``, and between them the linear gains minus 1
+            of the highest band: that before the first hop, then that at the end of each hop,
+            (items, hops + 1).
         """
         outputs = []
         gains = [state["gains"][:, -1:, -1]]
@@ -251,14 +256,18 @@ class Wearable(Aid):
             audiogram: Ears of the signals, or None for those of the constructor.
             sliders: Value under each slider's name; by default those of ``SLIDERS``.
             state: State of the aid after the lead; None at the beginning of a signal.
-            lead: Samples of the block before the output, which resampling needs.
-            lag: Samples of the block after the output, which resampling needs; 0 at the end of a
-                signal.
-            state_time: Samples at 16 kHz, in whole hops after the lead, after which the state is
-                returned; by default after all.
+            lead: Number of samples at the start of the block that have no output. Resampling needs
+                them.
+            lag: Number of samples at the end of the block that resampling needs and that have no
+                output; 0 at the end of a signal.
+            state_time: Time after the lead at which the state is returned, in samples at 16 kHz and
+                whole hops; by default at the end.
 
         Returns:
             The output after the lead, (..., time), and the state.
+
+        Raises:
+            ValueError: The waveform, the audiogram or a slider is not valid, see ``Aid.forward``.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         rate = self.sample_rate
@@ -371,7 +380,7 @@ class Stream:
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
 
     Attributes:
-        sliders: Value of each slider by its name, to which it moves.
+        sliders: Value of each slider by its name, as it was set. The value in use moves there.
 
     Args:
         aid: Aid at 16 kHz.
@@ -442,9 +451,10 @@ class Stream:
             return as_type_of(chunk, output)
 
     def flush(self) -> Tensor:
-        """Return the output that is still missing because of the delay, and begin again.
+        """Return the end of the output, which is still missing because of the delay.
 
-        The next chunk is the beginning of another signal. The output is a tensor.
+        The next chunk is then the beginning of another signal. The output is a tensor, also for
+        chunks that are arrays.
 
         Shape: -> (..., latency), with the leading dimensions of the chunks.
         """
@@ -453,7 +463,7 @@ class Stream:
         return rest
 
     def _prepare(self, chunk: Tensor) -> None:
-        """Fit the aid to the ears with the first chunk, and read the sliders.
+        """Read the sliders, and with the first chunk fit the aid to the ears and begin its state.
 
         Raises:
             ValueError: The chunk has another shape than the first one.
@@ -473,9 +483,9 @@ class Stream:
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
 
     def _process_piece(self, samples: Tensor) -> Tensor:
-        """Process either whole hops, or a piece that ends within the current hop.
+        """Process either whole hops, or a piece that lies within one hop.
 
-        Shape: (items, time) -> (items, time).
+        Shape: (items, time) -> (items, time) in pascals, without the limit.
         """
         position, time, state = self._partial_hop.shape[-1], samples.shape[-1], self._state
         self._partial_hop = hops = torch.cat((self._partial_hop, samples), -1)
@@ -491,9 +501,16 @@ class Stream:
 
 
 def _glide(start: Tensor, target: Tensor, frames: int) -> Tensor:
-    """Return the sliders in each frame on their way to new values, because a jump would click.
+    """Move sliders gradually from their values to new ones, because a jump would click.
 
-    Shape: (items, sliders) twice -> (items, frames, sliders).
+    Args:
+        start: Values before the first frame.
+        target: New values.
+        frames: Number of frames, which are 4 ms apart.
+
+    Returns: Values in each frame.
+
+    Shape: (items, sliders), (items, sliders) -> (items, frames, sliders).
     """
     steps = torch.arange(1, frames + 1, dtype=start.dtype, device=start.device)
     limit = SLIDER_STEP * steps.unsqueeze(-1)
