@@ -4,11 +4,13 @@ from compensators.config import HearingAidConfig, MappingConfig
 from compensators.hearing_aid import HearingAid
 from compensators.loading import load_compensator, save_compensator, trained_for
 from compensators.mapping import MappingCompensator
-from compensators.nalr import NALR
-from compensators.wdrc import WDRC
+from compensators.nalr import NALR, NALRP
+from compensators.wdrc import CAMFIT, WDRC
 
 __all__ = [
+    "CAMFIT",
     "NALR",
+    "NALRP",
     "WDRC",
     "HearingAid",
     "HearingAidConfig",

@@ -7,8 +7,8 @@ from typing import Any
 from compensators.config import HearingAidConfig, MappingConfig
 from compensators.hearing_aid import HearingAid
 from compensators.mapping import MappingCompensator
-from compensators.nalr import NALR
-from compensators.wdrc import WDRC
+from compensators.nalr import NALR, NALRP
+from compensators.wdrc import CAMFIT, WDRC
 from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
@@ -21,7 +21,12 @@ CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
 }
 """Class of the settings of each kind of compensator, by the name of the kind in ``config.json``."""
 
-UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
+UNTRAINED: dict[str, type[NALR | WDRC]] = {
+    "nalr": NALR,
+    "nalrp": NALRP,
+    "wdrc": WDRC,
+    "camfit": CAMFIT,
+}
 """Compensators without a checkpoint."""
 
 
@@ -52,9 +57,10 @@ def load_compensator(
     Nothing is downloaded.
 
     Args:
-        name: ``"nalr"``, the prescription; ``"wdrc"``, the prescription with compression; a
-            checkpoint that ships with hlsim, such as ``"hearing-aid"``; or the folder of a
-            checkpoint. If an aid was trained for one ear, ``trained_for`` returns this ear.
+        name: A prescription, ``"nalr"``, ``"nalrp"`` (for profound losses) or ``"camfit"`` (with
+            compression); ``"wdrc"``, NAL-R with compression; a checkpoint that ships with hlsim,
+            such as ``"hearing-aid"``; or the folder of a checkpoint. If an aid was trained for one
+            ear, ``trained_for`` returns this ear.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences

@@ -1,4 +1,6 @@
-"""NAL-R, a prescription of gains that depend on the audiogram and not on the level."""
+"""NAL-R and NAL-RP, prescriptions of gains that depend on the audiogram and not on the level."""
+
+from typing import ClassVar
 
 import scipy
 import torch
@@ -6,7 +8,7 @@ from torch import Tensor
 
 from compensators.aid import Aid
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
-from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.audiogram.prescription import NALRP_END, NALRP_FREQUENCIES, nalr_gains_db, nalrp_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.checks import check_waveform
 from hlsim.dsp.fir import filters_with_gains
@@ -42,6 +44,15 @@ class NALR(Aid):
     """
 
     highest_level = HIGHEST_LEVEL
+    grid: ClassVar[tuple[float, ...]] = FREQUENCIES
+    """Frequencies in Hz between which the gains of the filter are straight lines."""
+
+    def prescribe(self, thresholds: Tensor, points: tuple[float, ...]) -> Tensor:
+        """Return the prescribed gains in dB at ``FREQUENCIES``, or at the points of ``grid``.
+
+        Shape: (..., 8) in dB HL -> (..., points).
+        """
+        return nalr_gains_db(thresholds)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the amplified signals, see ``Aid.forward``."""
@@ -51,8 +62,8 @@ class NALR(Aid):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
             points = scipy.fft.next_fast_len(time + ORDER, real=True)
-            gains = nalr_gains_db(thresholds.double())
-            taps = filters_with_gains(gains, FREQUENCIES, self.sample_rate, ORDER).to(signal.dtype)
+            gains = self.prescribe(thresholds.double(), self.grid)
+            taps = filters_with_gains(gains, self.grid, self.sample_rate, ORDER).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
             delay = ORDER // 2
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
@@ -74,4 +85,25 @@ class NALR(Aid):
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
         """
-        return nalr_gains_db(self.find_thresholds(audiogram))
+        return self.prescribe(self.find_thresholds(audiogram), FREQUENCIES)
+
+
+class NALRP(NALR):
+    """The prescription NAL-RP, NAL-R for severe and profound losses, as a filter.
+
+    Where the threshold at 2 kHz is above 90 dB HL, NAL-RP gives low frequencies more gain and high
+    ones less than ``NALR``, which has NAL-RP's gain for severe losses already. See
+    ``hlsim.audiogram.prescription.nalrp_gains_db`` for the formula, its sources, and its gain above
+    6 kHz, which falls. The filter, arguments and errors are those of ``NALR``.
+
+    The gains equal those of openMHA at all levels.
+
+    >>> import hlsim
+    >>> NALRP("N6").gains().round()
+    tensor([24., 34., 45., 45., 45., 47., 47., 20.])
+    """
+
+    grid = (*NALRP_FREQUENCIES, 8000.0, NALRP_END)
+
+    def prescribe(self, thresholds: Tensor, points: tuple[float, ...]) -> Tensor:
+        return nalrp_gains_db(thresholds, points)

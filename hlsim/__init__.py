@@ -9,7 +9,9 @@ from hlsim.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from compensators import (
+        CAMFIT as CAMFIT,
         NALR as NALR,
+        NALRP as NALRP,
         WDRC as WDRC,
         HearingAid as HearingAid,
         MappingCompensator as MappingCompensator,
@@ -39,7 +41,9 @@ if TYPE_CHECKING:
 
 # A name is imported when it is first used, so that the command line's help does not wait for torch.
 _NAMES = {
-    "compensators": ("NALR WDRC HearingAid MappingCompensator load_compensator save_compensator"),
+    "compensators": (
+        "CAMFIT NALR NALRP WDRC HearingAid MappingCompensator load_compensator save_compensator"
+    ),
     "hlsim.audiogram": "Audiogram",
     "hlsim.audiogram.listener": "Listener",
     "hlsim.audiogram.table": "read_audiograms read_listeners",

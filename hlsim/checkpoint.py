@@ -34,7 +34,10 @@ WEIGHTS = "model.safetensors"
 OLDER_WEIGHTS = "model.older.safetensors"
 CONFIG = "config.json"
 
-_WITHOUT_CHECKPOINT = ("msbg", "msbg-unsmeared", "attenuation", "nalr", "wdrc")
+_WITHOUT_CHECKPOINT = (
+    *("msbg", "msbg-unsmeared", "attenuation"),
+    *("nalr", "nalrp", "wdrc", "camfit"),
+)
 """Names of simulators and aids that have no checkpoint."""
 CARD = "README.md"
 

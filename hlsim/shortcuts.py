@@ -150,8 +150,8 @@ def compensate(
             mapping of frequencies in Hz to thresholds, a ``Listener`` for ``(..., 2, time)``, or
             a sequence with one ear per item.
         sample_rate: Sample rate in Hz, 16000 (default) to 48000.
-        compensator: ``"nalr"`` or ``"wdrc"``, or the name or folder of a checkpoint, such as
-            ``"hearing-aid"``.
+        compensator: ``"nalr"``, ``"nalrp"``, ``"wdrc"`` or ``"camfit"``, or the name or folder
+            of a checkpoint, such as ``"hearing-aid"``.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0, by default 94, so that samples
             are in pascals.
 

@@ -1,13 +1,72 @@
-"""Gains that the prescription NAL-R gives to an ear.
+"""Gains that published prescriptions give to an ear: NAL-R, NAL-RP and CAMFIT.
 
-Source: Byrne and Dillon 1986, Ear and Hearing 7(4), and for severe losses Byrne, Parkinson and
-Newall 1990, Ear and Hearing 11(1).
+- NAL-R: Byrne and Dillon 1986, Ear and Hearing 7(4), with the gain for severe losses of Byrne,
+  Parkinson and Newall 1990, Ear and Hearing 11(1), as in pyclarity.
+- NAL-RP: the same, and the correction for profound losses of Byrne, Parkinson and Newall 1990 and
+  1991 (The Vanderbilt Hearing-Aid Report II, York Press), as in Dillon 2012, Hearing Aids.
+- CAMFIT: Moore, Alcantara, Stone and Glasberg 1999, British Journal of Audiology 33(4), on the
+  Cambridge formula of Moore and Glasberg 1998, British Journal of Audiology 32(5).
 """
 
+from typing import NamedTuple
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.scale import FREQUENCIES
 from hlsim.torchtools import constant
+
+Frequencies = tuple[float, ...]
+
+NALRP_FREQUENCIES = (250.0, 500.0, 1000.0, 1500.0, 2000.0, 3000.0, 4000.0, 6000.0)
+"""Frequencies in Hz of the formula of NAL-RP."""
+
+NALRP_END = 10000.0
+"""Frequency in Hz at which the gain of NAL-RP is 0."""
+
+PROFOUND_FROM = 90.0
+"""Threshold in dB HL at 2 kHz above which NAL-RP corrects its gains for a profound loss."""
+
+SPEECH_RANGE_DB = 38.0
+"""Range in dB below the level of average speech that CAMFIT makes audible.
+
+At its lower end are the softest parts of speech at 45 dB SPL.
+"""
+
+LOWEST_CAMFIT_SLOPE = 13.0 / SPEECH_RANGE_DB - 1.0
+"""Lowest slope of CAMFIT's gain over the level in dB/dB: a compression ratio of 38 / 13 = 2.92."""
+
+CAMFIT_LIMIT_SPL = 100.0
+"""Level of a band in dB SPL beyond which CAMFIT does not amplify it."""
+
+# Level in dB SPL of 0 dB HL, for tones in a free field from the front: ISO 389-7:2005
+FREE_FIELD_THRESHOLD_SPL = {
+    125: 22.1, 160: 17.9, 200: 14.4, 250: 11.4, 315: 8.6, 400: 6.2, 500: 4.4, 630: 3.0, 800: 2.2,
+    1000: 2.4, 1250: 3.5, 1600: 1.7, 2000: -1.3, 2500: -4.2, 3150: -6.0, 4000: -5.4, 5000: -1.5,
+    6300: 6.0, 8000: 12.6, 10000: 13.9, 12500: 12.3,
+}  # fmt: skip
+
+# Constant of the Cambridge formula in dB; above 5 kHz it stays the same
+CAMBRIDGE_INTERCEPTS = {
+    125: -11.0, 250: -10.0, 500: -8.0, 750: -6.0, 1000: 0.0, 1500: -1.0, 2000: 1.0, 3000: -1.0,
+    4000: 0.0, 5000: 1.0,
+}  # fmt: skip
+
+
+class CompressiveGains(NamedTuple):
+    """Gain of each band of a compressive prescription, a straight line over the band's level.
+
+    >>> CompressiveGains(torch.tensor([20.0]), torch.tensor([-0.5])).slope
+    tensor([-0.5000])
+    """
+
+    at_speech_level: Tensor
+    """Gain in dB for the level that the band has in average speech at 65 dB SPL."""
+
+    slope: Tensor
+    """Change of the gain in dB per dB of the level."""
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
@@ -27,11 +86,7 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     """
     losses = torch.cat((thresholds[..., :4], thresholds[..., 5:7]), -1)  # without 3 and 8 kHz
     three_frequency_sum = losses[..., 1:4].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
-    common = torch.where(
-        three_frequency_sum <= 180.0,
-        0.05 * three_frequency_sum,
-        9.0 + 0.116 * (three_frequency_sum - 180.0),
-    )
+    common = _common_gain(three_frequency_sum)
     bias = _bias(like=losses)
     gains = (common + 0.31 * losses + bias).clamp_min(0.0)
     low, high = gains[..., :4], gains[..., 4:]
@@ -43,5 +98,165 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
 
 @constant
 def _bias() -> list[float]:
-    """Return the constant in dB of the formula at 250, 500, 1000, 2000, 4000 and 6000 Hz."""
+    """Return the constant in dB of NAL-R's formula at 250, 500, 1000, 2000, 4000 and 6000 Hz."""
     return [-17.0, -8.0, 1.0, -1.0, -2.0, -2.0]
+
+
+def nalrp_gains_db(
+    thresholds: Tensor, points: Frequencies = FREQUENCIES, frequencies: Frequencies = FREQUENCIES
+) -> Tensor:
+    """Return the gains that NAL-RP prescribes.
+
+    NAL-RP has NAL-R's formula, with a constant for 1500 Hz. If the threshold at 2 kHz is above 90
+    dB HL, low frequencies get more gain and high ones less; the steps of 5 dB of the published
+    table are interpolated linearly.
+
+    The formula is for 250 to 6000 Hz. Below, the gain is constant; above, it falls to 0 at 10 kHz.
+    Thresholds and gains are interpolated over log frequency. An ear without any loss has no gain.
+
+    Args:
+        thresholds: Thresholds in dB HL.
+        points: Frequencies of the gains in Hz.
+        frequencies: Frequencies of the thresholds in Hz.
+
+    Shape: (..., frequencies) -> (..., points) in dB, 0 or more.
+
+    >>> nalrp_gains_db(torch.tensor([75.0, 80.0, 85.0, 100.0, 95.0, 100.0, 100.0, 100.0])).round()
+    tensor([31., 40., 46., 46., 43., 45., 45., 20.])
+    """
+    losses = _interpolate_over_log(thresholds, frequencies, NALRP_FREQUENCIES)
+    three_frequency_sum = losses[..., [1, 2, 4]].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
+    common = _common_gain(three_frequency_sum)
+    at_2_khz = losses[..., 4:5]
+    table = _profound_corrections(like=losses)
+    row = (at_2_khz - PROFOUND_FROM) / 5.0 - torch.arange(len(table)).to(losses)
+    weights = (1.0 - row.abs()).clamp_min(0.0)
+    correction = (weights.unsqueeze(-1) * table).sum(-2)
+    gains = (common + 0.31 * losses + _nalrp_bias(like=losses) + correction).clamp_min(0.0)
+    gains = torch.where((losses <= 0.0).all(-1, keepdim=True), 0.0, gains)
+    gains = torch.cat((gains, torch.zeros_like(at_2_khz)), -1)
+    return _interpolate_over_log(gains, (*NALRP_FREQUENCIES, NALRP_END), points)
+
+
+def camfit_gains(
+    thresholds: Tensor,
+    speech_levels: Tensor,
+    points: Frequencies = FREQUENCIES,
+    frequencies: Frequencies = FREQUENCIES,
+) -> CompressiveGains:
+    """Return the gains that CAMFIT prescribes for bands, before their limits.
+
+    A band of average speech at 65 dB SPL gets the gain of the Cambridge formula, 0.48 of the loss
+    plus a constant. A band that is 38 dB softer is amplified to the threshold. Between and beyond,
+    the gain is a straight line over the level. Where the compression ratio would exceed 2.92, the
+    line goes through the softer point with this ratio. ``compressed_gains_db`` computes the gains.
+
+    Args:
+        thresholds: Thresholds in dB HL, which are interpolated over log frequency.
+        speech_levels: Level in dB SPL of each band in average speech at 65 dB SPL.
+        points: Centre frequencies of the bands in Hz.
+        frequencies: Frequencies of the thresholds in Hz.
+
+    Shape: (..., frequencies), (points,) -> (..., points) twice.
+
+    >>> ear = torch.tensor([35.0, 35.0, 40.0, 50.0, 55.0, 60.0, 65.0, 65.0])
+    >>> speech = torch.full((2,), 50.0)
+    >>> camfit_gains(ear, speech, points=(1000.0, 4000.0)).at_speech_level
+    tensor([19.2000, 28.8000])
+    """
+    losses = _interpolate_over_log(thresholds, frequencies, points)
+    softest = speech_levels - SPEECH_RANGE_DB
+    gain_for_softest = losses + _free_field_threshold(points, like=losses) - softest
+    middle_gain = (0.48 * losses + _cambridge_intercepts(points, like=losses)).clamp_min(0.0)
+    slope = ((middle_gain - gain_for_softest) / SPEECH_RANGE_DB).clamp_min(LOWEST_CAMFIT_SLOPE)
+    return CompressiveGains(gain_for_softest + slope * SPEECH_RANGE_DB, slope)
+
+
+def compressed_gains_db(
+    gains: CompressiveGains,
+    levels: Tensor,
+    speech_levels: Tensor,
+    range_db: float = SPEECH_RANGE_DB,
+    limit_spl: float = CAMFIT_LIMIT_SPL,
+) -> Tensor:
+    """Compute the gains of a compressive prescription for bands of some levels.
+
+    Args:
+        gains: Gains of each band.
+        levels: Level of each band in dB SPL.
+        speech_levels: Level in dB SPL of each band in average speech at 65 dB SPL.
+        range_db: Level below that of average speech in dB from which softer sounds get no more
+            gain.
+        limit_spl: Level in dB SPL beyond which no band is amplified.
+
+    Returns:
+        Gains in dB, 0 or more, in the common shape of the arguments.
+
+    >>> line = CompressiveGains(torch.tensor([20.0]), torch.tensor([-0.5]))
+    >>> compressed_gains_db(line, torch.tensor([[40.0], [60.0], [95.0]]), torch.tensor([50.0])).T
+    tensor([[25., 15.,  0.]])
+    """
+    above_speech = levels - speech_levels
+    amplified = gains.at_speech_level + gains.slope * above_speech.clamp_min(-range_db)
+    highest_gains = (limit_spl - levels).clamp_min(0.0)
+    return torch.minimum(amplified.clamp_min(0.0), highest_gains)
+
+
+def _common_gain(three_frequency_sum: Tensor) -> Tensor:
+    """Return the gain in dB at all frequencies for the sum of three thresholds in dB HL."""
+    return torch.where(
+        three_frequency_sum <= 180.0,
+        0.05 * three_frequency_sum,
+        9.0 + 0.116 * (three_frequency_sum - 180.0),
+    )
+
+
+def _interpolate_over_log(values: Tensor, grid: Frequencies, points: Frequencies) -> Tensor:
+    """Interpolate values linearly over log frequency, constant below the grid and above it.
+
+    Shape: (..., grid) -> (..., points).
+    """
+    return (values.unsqueeze(-1) * _log_weights(grid, points, like=values)).sum(-2)
+
+
+@constant
+def _log_weights(grid: Frequencies, points: Frequencies) -> NDArray[np.float64]:
+    """Return the matrix that interpolates over log frequency, (grid, points)."""
+    logs = np.log(np.maximum(points, grid[0]))
+    return np.stack([np.interp(logs, np.log(grid), row) for row in np.eye(len(grid))])
+
+
+@constant
+def _nalrp_bias() -> list[float]:
+    """Return the constant in dB of NAL-RP's formula at ``NALRP_FREQUENCIES``."""
+    return [-17.0, -8.0, 1.0, 1.0, -1.0, -2.0, -2.0, -2.0]
+
+
+@constant
+def _profound_corrections() -> list[list[float]]:
+    """Return NAL-RP's corrections in dB for 90, 95, ... 120 dB HL at 2 kHz, (7, 8)."""
+    return [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [4.0, 3.0, 0.0, -1.0, -2.0, -2.0, -2.0, -2.0],
+        [6.0, 4.0, 0.0, -2.0, -3.0, -3.0, -3.0, -3.0],
+        [8.0, 5.0, 0.0, -3.0, -5.0, -5.0, -5.0, -5.0],
+        [11.0, 7.0, 0.0, -3.0, -6.0, -6.0, -6.0, -6.0],
+        [13.0, 8.0, 0.0, -4.0, -8.0, -8.0, -8.0, -8.0],
+        [15.0, 9.0, 0.0, -5.0, -9.0, -9.0, -9.0, -9.0],
+    ]
+
+
+@constant
+def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
+    """Return the level of 0 dB HL in dB SPL, interpolated linearly over frequency."""
+    return np.interp(
+        points, list(FREE_FIELD_THRESHOLD_SPL), list(FREE_FIELD_THRESHOLD_SPL.values())
+    )
+
+
+@constant
+def _cambridge_intercepts(points: Frequencies) -> NDArray[np.float64]:
+    """Return the constant of the Cambridge formula in dB, interpolated over log frequency."""
+    grid = np.log(list(CAMBRIDGE_INTERCEPTS))
+    lowest = min(CAMBRIDGE_INTERCEPTS)
+    return np.interp(np.log(np.maximum(points, lowest)), grid, list(CAMBRIDGE_INTERCEPTS.values()))

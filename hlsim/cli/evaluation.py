@@ -97,6 +97,11 @@ def evaluate_compensator(parser: Parser) -> None:
     _declare_precision(parser)
     text = "measure thresholds for digits in noise as well, for the ears of the gain curves"
     parser.flag("--srt", text)
+    text = (
+        "prescription with which each compensator is compared at its level; for-ear is nal-rp if "
+        "the threshold at 2 kHz is above 90 dB HL, and otherwise nal-r"
+    )
+    option("--rival", str, text, "nal-r", choices=["nal-r", "nal-rp", "camfit", "for-ear"])
     _declare_study(parser)
 
 

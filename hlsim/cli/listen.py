@@ -35,7 +35,10 @@ def listen(parser: Parser) -> None:
     option = parser.option
     option("files", input_path, "audio files of 16 to 48 kHz", nargs="+")
     parser.ears(SIMULATED_EARS, "")
-    text = "also play what each ear perceives with an aid: nalr, wdrc, or a name or folder"
+    text = (
+        "also play what each ear perceives with an aid: nalr, nalrp, wdrc, camfit, or "
+        "a name or folder"
+    )
     option("--compensator", str, text)
     parser.sliders()
     parser.simulator("msbg")

@@ -22,7 +22,9 @@ def live(parser: Parser) -> None:
     parser.audiogram(ears=ALL_EARS, group=ears)
     parser.listener("both ears, for stereo headphones", group=ears)
     models = parser.add_mutually_exclusive_group()
-    text = "a streaming aid: wdrc (compression in bands), or a hearing aid's name or folder"
+    text = (
+        "a streaming aid: wdrc or camfit (compression in bands), or a hearing aid's name or folder"
+    )
     option("--compensator", str, text, "hearing-aid", group=models)
     text = (
         "simulate the hearing loss with neuro-msbg instead, in blocks of 36 ms and with a "

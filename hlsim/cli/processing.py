@@ -51,8 +51,9 @@ def compensate(parser: Parser) -> None:
         ears=ALL_EARS,
     )
     text = (
-        "nalr (a prescription), wdrc (compression in bands), or a checkpoint's name or folder; a "
-        "checkpoint that was trained for one ear causes a warning if it is used for another"
+        "nalr or nalrp (linear prescriptions), wdrc or camfit (compression in bands), or a "
+        "checkpoint's name or folder; a checkpoint that was trained for one ear causes "
+        "a warning if it is used for another"
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()

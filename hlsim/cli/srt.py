@@ -25,7 +25,7 @@ def srt(parser: Parser) -> None:
     group = parser.add_mutually_exclusive_group(required=True)
     parser.audiogram(text="; repeat the option for several ears", group=group, action="append")
     parser.listener("both ears, each of which is tested alone", group=group)
-    text = "aid to compare with none: nalr, wdrc, or a checkpoint's name or folder"
+    text = "aid to compare with none: nalr, nalrp, wdrc, camfit, or a checkpoint's name or folder"
     parser.option("--compensator", str, text)
     parser.sliders()
     parser.simulator("msbg")

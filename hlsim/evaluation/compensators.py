@@ -32,8 +32,10 @@ from hlsim.evaluation.conditions import (
     AtLevelOf,
     Enhanced,
     EqualiserLike,
+    Rival,
     Unaided,
     load_enhancers,
+    load_rival,
 )
 from hlsim.evaluation.digits import DigitTest
 from hlsim.evaluation.items import INPUT_LEVELS, draw_aid_items, ear_name, read_ears
@@ -67,13 +69,15 @@ def evaluate_compensators(
     srt: bool = False,
     seed: int = 0,
     listen: int = 0,
+    rival: Rival = "nal-r",
     **running: Any,
 ) -> Evaluation:
     """Compare compensators with no aid, NAL-R and WDRC, and with two rivals at their output level.
 
-    The rivals are NAL-R and an equaliser, a fixed filter for each ear with the compensator's mean
-    gain for speech at ``levels``. The comparison with NAL-R at the compensator's level by HASPI is
-    planned, so that its p values are not adjusted for the number of comparisons.
+    The rivals are a prescription, by default NAL-R, and an equaliser, a fixed filter for each ear
+    with the compensator's mean gain for speech at ``levels``. The comparison with the prescription
+    at the compensator's level by HASPI is planned, so that its p values are not adjusted for the
+    number of comparisons.
 
     Scores are stored as they become known. An interrupted run can be continued, and a run with one
     more compensator, or with another simulator, computes only the scores that are missing. An item
@@ -104,6 +108,9 @@ def evaluate_compensators(
             threshold per ear and aid. Each takes about five seconds, without the time of the aid.
         seed: Seed of all random draws.
         listen: Number of items with sounds for the players of a page, as the ear perceives them.
+        rival: Prescription for the planned comparison: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or
+            ``"for-ear"``, which is NAL-RP for ears with a profound loss at 2 kHz, and otherwise
+            NAL-R. One that is not NAL-R is a further condition, which takes time.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
@@ -128,7 +135,8 @@ def evaluate_compensators(
     >>> evaluation.names[:3], evaluation.names[3:]
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
-    for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION}:
+    rival_name, rival_aid = load_rival(rival)
+    for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION, rival_name}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")
     for name, aid in compensators.items():
         check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
@@ -146,10 +154,14 @@ def evaluate_compensators(
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
     utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     enhancer_plugins = load_enhancers(enhancers)
-    prescriptions = {NAL_R: NALR(sample_rate=NEURO_RATE), COMPRESSION: WDRC(sample_rate=NEURO_RATE)}
+    prescriptions = {
+        NAL_R: NALR(sample_rate=NEURO_RATE),
+        rival_name: rival_aid,
+        COMPRESSION: WDRC(sample_rate=NEURO_RATE),
+    }
     aids = {**prescriptions, **compensators}
     equalisers = {name: EqualiserLike(aids[name], utterances, levels) for name in compensators}
-    conditions = _make_conditions(aids, equalisers, enhancer_plugins)
+    conditions = _make_conditions(aids, equalisers, enhancer_plugins, rival_name)
     kinds = ("aid", "prescription", "enhanced")
     wearable = {c.name: c.process for c in conditions if c.process and c.kind in kinds}
     with_unaided: dict[str, Any] = {UNAIDED: Unaided(), **wearable}
@@ -178,6 +190,7 @@ def evaluate_compensators(
         settings={
             **settings,
             "precision": precision,
+            "rival": rival_name,
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),
         },
@@ -198,17 +211,19 @@ def _make_conditions(
     aids: Mapping[str, nn.Module],
     equalisers: Mapping[str, nn.Module],
     enhancers: Mapping[str, WaveformPlugin],
+    rival: str,
 ) -> list[Condition]:
     """Return the conditions, each of which the study compares with all earlier ones.
 
     The order is: unaided; each prescription, then this prescription behind each enhancer; and for
-    each trained aid, NAL-R at its level, the equaliser at its level, the aid behind each enhancer,
-    and the aid.
+    each trained aid, the rival at its level, the equaliser at its level, the aid behind each
+    enhancer, and the aid.
 
     Args:
-        aids: Prescriptions, NAL-R among them, and then trained aids, each under its name.
+        aids: Prescriptions, the rival among them, and then trained aids, each under its name.
         equalisers: For each trained aid, under its name, an equaliser with its mean gain.
         enhancers: Enhancers, by the part of their names after the colon.
+        rival: Name of the prescription at the level of each trained aid.
     """
     conditions = [Condition(UNAIDED, Unaided(), kind="unaided")]
     for name, aid in aids.items():
@@ -219,10 +234,10 @@ def _make_conditions(
         if name not in equalisers:
             conditions += [Condition(name, aid, "prescription"), *enhanced]
             continue
-        nal_r = AtLevelOf(aids[NAL_R], aid)
+        prescription = AtLevelOf(aids[rival], aid)
         equaliser = AtLevelOf(equalisers[name], aid)
         conditions += [
-            Condition(f"{NAL_R} at {name}'s level", nal_r, "same level", name),
+            Condition(f"{rival} at {name}'s level", prescription, "same level", name),
             Condition(f"equaliser at {name}'s level", equaliser, "equaliser", name),
             *enhanced,
             Condition(name, aid),

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy
 import torch
 from torch import Tensor, nn
 
+from compensators.loading import load_compensator
+from compensators.nalr import NALR, NALRP
 from hlsim.audio import read_audio
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.audiogram.prescription import PROFOUND_FROM
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.checks import check_choice
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.evaluation.aid_properties import measure_gain_curve
@@ -30,6 +34,9 @@ UNAIDED = "unaided"
 
 NAL_R = "NAL-R"
 """Name of the linear prescription NAL-R."""
+
+Rival = Literal["nal-r", "nal-rp", "camfit", "for-ear"]
+"""Prescription with which a compensator is compared at its level, see ``load_rival``."""
 
 COMPRESSION = "WDRC"
 """Name of the prescription ``WDRC`` with its default settings."""
@@ -63,6 +70,47 @@ class Unaided(nn.Module):
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
         """Return the waveform as it is."""
         return waveform
+
+
+class PrescriptionForEar(nn.Module):
+    """The prescription for the degree of an ear's loss: NAL-RP if profound at 2 kHz, else NAL-R.
+
+    The rule is that of Byrne, Parkinson and Newall 1990, who corrected NAL-R for ears with a
+    threshold above 90 dB HL at 2 kHz. It is known before any output is scored, so that a comparison
+    with it needs no correction for a choice.
+
+    >>> PrescriptionForEar()(torch.ones(2), Audiogram.standard("NH")).round()
+    tensor([1., 1.])
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.usual, self.profound = NALR(sample_rate=NEURO_RATE), NALRP(sample_rate=NEURO_RATE)
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        """Return the waveform amplified by the prescription for the ear."""
+        at_2_khz = audiogram.thresholds[FREQUENCIES.index(2000.0)]
+        aid = self.profound if at_2_khz > PROFOUND_FROM else self.usual
+        return aid(waveform, audiogram)
+
+
+def load_rival(rival: Rival) -> tuple[str, nn.Module]:
+    """Return the name in tables and the aid of a rival.
+
+    Args:
+        rival: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or ``"for-ear"`` for the one that
+            ``PrescriptionForEar`` chooses for each ear.
+
+    Raises:
+        ValueError: There is no such rival.
+
+    >>> load_rival("nal-rp")[0]
+    'NAL-RP'
+    """
+    check_choice("rival", rival, Rival)
+    if rival == "for-ear":
+        return "prescription for the ear", PrescriptionForEar()
+    return rival.upper(), load_compensator(rival.replace("-", ""), sample_rate=NEURO_RATE)
 
 
 class AtLevelOf(nn.Module):

@@ -7,7 +7,7 @@ from typing import Any
 
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
 from hlsim.evaluation.compensators import UTTERANCES
-from hlsim.evaluation.conditions import COMPRESSION, NAL_R
+from hlsim.evaluation.conditions import COMPRESSION
 from hlsim.evaluation.digits import Estimate
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
@@ -59,14 +59,16 @@ _COLUMN_NOTES = (
     "the median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
     "perceived by the impaired ear and, for clean speech, by a normal ear, both by the exact "
     "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0.",
-    "A condition at a compensator's level is NAL-R, or an equaliser, whose output is brought to "
-    "the RMS level of the compensator's output for the same item. The equaliser is for each ear "
+    "A condition at a compensator's level is a prescription (NAL-R, unless --rival chose another "
+    "one: 'prescription for the ear' is NAL-RP if the threshold at 2 kHz is above 90 dB HL, and "
+    "otherwise NAL-R), or an equaliser, whose output is brought to the RMS level of the "
+    "compensator's output for the same item. The equaliser is for each ear "
     f"a fixed filter with the compensator's mean insertion gain in 24 bands, for {UTTERANCES} "
     "clips of speech at the input levels: the rest of the difference is not gain.",
     "Holm's family is every pair of conditions by one measure in one group, except the planned "
-    "comparisons of each compensator with NAL-R at its level by HASPI. Several items share an "
-    "ear, so that p is too small and intervals are too narrow; the tests of the means of each "
-    "ear take that into account. The two ears of a person count as two.",
+    "comparisons of each compensator with the prescription at its level by HASPI. Several items "
+    "share an ear, so that p is too small and intervals are too narrow; the tests of the means "
+    "of each ear take that into account. The two ears of a person count as two.",
 )
 _FACTS = {
     "input_level": "By input level (dB SPL)",
@@ -118,8 +120,9 @@ def compensators_page(evaluation: Evaluation) -> Page:
         evaluation: Evaluation of ``evaluate_compensators``.
     """
     groups = evaluation.groups
+    rival = f"{evaluation.settings['rival']} at the same level"
     first_verdict, *further_verdicts = [
-        f"On {_GROUPS[name].lower()}, {verdict(c, c.after, 'NAL-R at the same level')}"
+        f"On {_GROUPS[name].lower()}, {verdict(c, c.after, rival)}"
         for name, group in groups.items()
         for c in group.comparisons
         if c.planned
@@ -188,13 +191,14 @@ def _details(evaluation: Evaluation) -> Section:
 
 
 def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw the gain of each aid beside NAL-R's for each ear."""
+    """Draw the gain of each aid beside that of the rival prescription for each ear."""
     colours = condition_colours(evaluation.conditions)
     curves = evaluation.details["gain_curves"]
+    rival = evaluation.settings["rival"]
     pictures = []
     for ear in dict.fromkeys(row["ear"] for row in curves):
         for aid in [COMPRESSION, *evaluation.aids]:
-            rows = [row for row in curves if row["ear"] == ear and row["aid"] in (NAL_R, aid)]
+            rows = [row for row in curves if row["ear"] == ear and row["aid"] in (rival, aid)]
             pictures.append(gain_picture(f"{aid}, ear {ear}", rows, colours))
     return pictures
 

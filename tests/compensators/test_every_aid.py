@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from compensators import (
+    CAMFIT,
     NALR,
+    NALRP,
     WDRC,
     HearingAid,
     HearingAidConfig,
@@ -31,7 +33,9 @@ from tests.compensators.aids import (
 
 AIDS: dict[str, Callable[..., Any]] = {
     "nalr": NALR,
+    "nalrp": NALRP,
     "wdrc": WDRC,
+    "camfit": CAMFIT,
     "aid": varied_hearing_aid,
     "mapping": varied_mapping,
 }

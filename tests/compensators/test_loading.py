@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from compensators import (
+    CAMFIT,
     NALR,
+    NALRP,
     WDRC,
     MappingCompensator,
     load_compensator,
@@ -21,9 +23,10 @@ from tests.compensators.aids import EAR, SMALL
 
 
 def test_aids_without_training_have_names() -> None:
-    for name, kind in (("nalr", NALR), (Path("nalr"), NALR), ("wdrc", WDRC)):
+    kinds = {"nalr": NALR, Path("nalr"): NALR, "nalrp": NALRP, "wdrc": WDRC, "camfit": CAMFIT}
+    for name, kind in kinds.items():
         aid = load_compensator(name, sample_rate=44100, full_scale_spl=100.0)
-        assert isinstance(aid, kind)
+        assert type(aid) is kind
         assert (aid.sample_rate, aid.full_scale_spl, aid.training) == (44100, 100.0, False)
 
 

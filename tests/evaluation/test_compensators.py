@@ -115,6 +115,26 @@ def test_conditions_groups_and_page(
     assert "my_enhancer:half" in page.markdown() and page.html().count("<audio") == 4
 
 
+def test_another_prescription_may_be_the_rival(
+    options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hlsim.report.plots._draw_svg", lambda *_: b"<svg></svg>")
+    study = evaluate_compensators(
+        {"mine": Gain()}, **options, audiogram=N3, items=2, rival="for-ear"
+    )
+    rival = "prescription for the ear"
+    assert study.names[1:5] == ["NAL-R", rival, "WDRC", f"{rival} at mine's level"]
+    scores = study.wide("hasqi")
+    assert scores[rival].tolist() == scores["NAL-R"].tolist()  # which N3 gets by the rule
+    planned = [c.before for group in study.groups.values() for c in group.comparisons if c.planned]
+    assert planned == [f"{rival} at mine's level"] * 2
+    assert f"{rival} at the same level" in compensators_page(study).verdict
+    with pytest.raises(ValueError, match="NAL-R is always evaluated"):
+        evaluate_compensators({"NAL-R": Gain()}, **options, rival="camfit")
+    with pytest.raises(ValueError, match="expected rival to be"):
+        evaluate_compensators({"mine": Gain()}, **{**options, "rival": "nal-nl2"})
+
+
 @pytest.mark.slow
 def test_thresholds_in_noise_are_measured_for_each_ear_and_aid(
     options: dict[str, Any], monkeypatch: pytest.MonkeyPatch

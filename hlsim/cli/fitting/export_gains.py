@@ -21,7 +21,9 @@ def export_gains(parser: Parser) -> None:
     parser.audiogram(ears=SIMULATED_EARS, required=True)
     programs = ("camilladsp", "equalizer-apo", "openmha", "csv")
     option("--to", str, "program that reads the file", required=True, choices=programs)
-    text = "aid whose gains are exported: nalr, wdrc, or a checkpoint's name or folder"
+    text = (
+        "aid whose gains are exported: nalr, nalrp, wdrc, camfit, or a checkpoint's name or folder"
+    )
     option("--compensator", str, text, "hearing-aid")
     text = (
         "level of speech in dB SPL for which camilladsp and equalizer-apo amplify; the other "

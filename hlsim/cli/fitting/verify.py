@@ -26,7 +26,10 @@ def verify(parser: Parser) -> None:
     option("input", input_path, "input of the aid, a mono file of 16 to 48 kHz")
     option("output", input_path, "output of the aid at the same scale and rate")
     parser.audiogram(ears=SIMULATED_EARS, required=True)
-    text = "aid whose gains are the targets: nalr, wdrc, or a checkpoint's name or folder"
+    text = (
+        "aid whose gains are the targets: nalr, nalrp, wdrc, camfit, or "
+        "a checkpoint's name or folder"
+    )
     option("--target", str, text, "nalr")
     parser.levels("the input; the output is scaled by the same factor")
     option("--csv", Path, "file to write, with the printed table")

@@ -135,7 +135,8 @@ def verify(
         ear: Audiogram of the ear.
         sample_rate: Sample rate of both in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
-        prescription: Aid whose gains are the targets: ``nalr``, ``wdrc``, or a checkpoint.
+        prescription: Aid whose gains are the targets: ``nalr``, ``nalrp``, ``wdrc``,
+            ``camfit``, or a checkpoint.
 
     Raises:
         ValueError: A signal has several channels, NaN or infinity, or is too short; one of them is
