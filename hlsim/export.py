@@ -278,7 +278,10 @@ class _Call(nn.Module):
 
 
 def _simulate(simulator: NeuroMSBG, waveform: Tensor, thresholds: Tensor) -> dict[str, Tensor]:
-    """Call a simulator without its validation, which would read the values of tensors."""
+    """Call a simulator without its validation, which would read the values of tensors.
+
+    Shape: (items, time), (items, 8) in dB HL -> {"perceived": (items, time)}.
+    """
     gain = gain_to_pascals(simulator.full_scale_spl)
     return {"perceived": simulator.process_items(waveform * gain, thresholds) / gain}
 

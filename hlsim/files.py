@@ -66,7 +66,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     """Keep other processes out of a folder, as long as they call this function as well.
 
     The operating system releases the lock when the ``with`` block or the process ends, even if the
-    process is killed.
+    process is killed. On a file system without locks, nothing is locked.
 
     Args:
         folder: Folder to lock, which is created if there is none.

@@ -105,7 +105,10 @@ def power(spectrum: Tensor) -> Tensor:
 
 
 class _Power(torch.autograd.Function):
-    """Squared modulus of complex numbers, whose backward pass has two multiplications.
+    """Squared modulus of complex numbers, with a hand-written backward pass.
+
+    The gradient with respect to x is 2 x times that of the result. Autograd's pass takes more
+    operations.
 
     Shape: complex (...) -> real (...).
     """

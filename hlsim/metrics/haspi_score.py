@@ -234,7 +234,7 @@ class _Channels(NamedTuple):
     """Features of the clean speech in some channels of a normal ear.
 
     Attributes:
-        channels: The channels.
+        channels: Range of these channels among the 32 of the ear.
         spectrum: Result of ``lag_spectrum`` for the envelopes, with which the channels of outputs
             are aligned. Shape: (items, channels, frequencies).
         delays: Delays in samples that compensate for different group delays. Shape: (items,

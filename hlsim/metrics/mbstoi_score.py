@@ -268,6 +268,8 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
     centred = windows - windows.mean(-1, keepdim=True)
     products = centred @ centred.transpose(-1, -2)
     first, second = torch.triu_indices(4, 4, device=windows.device)
+    # Both orders of a pair of features are added, so that squares count twice; the weights of
+    # squares in ``_cancellation_weights`` have a factor of 0.5.
     clean, both, output = (
         (part + part.transpose(-1, -2))[..., first, second]
         for part in (products[..., :4, :4], products[..., :4, 4:], products[..., 4:, 4:])
@@ -326,7 +328,8 @@ def _cancellation_weights() -> NDArray[np.float64]:
     """Compute the weights of products of band features after equalisation and cancellation.
 
     Let L and R be the powers of a band at both ears, r + i m its cross-spectrum, and w its angular
-    frequency. With the levels g and -g and the delay t, equalisation and cancellation give
+    frequency. With g, the interaural level in dB over 20, and the delay t, equalisation and
+    cancellation give
 
         10^g L + 10^-g R - 2 cos(w t) r - 2 sin(w t) m.
 

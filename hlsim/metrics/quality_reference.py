@@ -171,7 +171,7 @@ class QualityReference(Reference):
 
     @property
     def _unit(self) -> float:
-        """Amplitude of 20 uPa in the unit of the input."""
+        """Amplitude of 20 uPa, that is 0 dB SPL, on the scale of the input."""
         return 10.0 ** (-self._full_scale_spl / 20.0)
 
     def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
@@ -296,7 +296,7 @@ class QualityReference(Reference):
         Args:
             motion: Motion of the channels, (items, channels, padded).
             delays: Delays in samples, (items, channels).
-            channels: The channels.
+            channels: Range of these channels among the 32 of the ear.
             noise: Noise of standard deviation 1 for all 32 channels, (items, 32, longest) or (32,
                 longest), or None for no noise.
             extent: Number of samples of each item before padding. Samples after the longest item
@@ -318,7 +318,7 @@ class _Channels:
     """Features of the clean signal in some channels.
 
     Attributes:
-        channels: The channels.
+        channels: Range of these channels among the 32 of the ear.
         envelope, motion: Results of ``lag_spectrum`` for the clean signal's envelope and motion,
             with which those of an output are aligned. Shape: (items, channels, frequencies).
         delays: Delays in samples that compensate for different group delays. Shape: (items,

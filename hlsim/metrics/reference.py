@@ -132,7 +132,8 @@ class Reference(ABC):
             audiogram: One ear, or one for each item.
 
         Raises:
-            ValueError: The number of ears is neither 1 nor that of the items.
+            ValueError: The number of ears is neither 1 nor that of the items, or an ear is not
+                valid.
         """
         shape = self._clean.shape[:-1]
         ears = resolve_thresholds(None, audiogram, self._clean, highest=HIGHEST_LEVEL)
@@ -146,7 +147,7 @@ class Reference(ABC):
     @torch.inference_mode(False)  # the features may serve a training later
     @torch.no_grad()
     def _prepare(self, items: slice) -> PreparedBatch:
-        """Validate the clean signals of a group of items, and compute their features."""
+        """Validate the clean signals of a range of items, and compute their features."""
         with torch.autocast(self._clean.device.type, enabled=False):
             clean = CleanBatch(self._rows, self._ends, items, self._rate, self._full_scale_spl)
             at_ear, cells = self._sound_at_ear(clean)
@@ -185,7 +186,7 @@ class Reference(ABC):
             sound: Clean signals behind the middle ear at 24 kHz, in multiples of 20 uPa. Shape:
                 (items, padded).
             cells: Hair cells of all channels.
-            channels: The channels.
+            channels: Range of these channels among the 32 of the ear.
             longest_delay: Group delay in samples that all channels have after alignment. Shape:
                 (items, 1).
             extent: Number of samples of each item before padding.
@@ -243,7 +244,7 @@ class Reference(ABC):
 
 
 def _count_bytes(value: Any) -> int:
-    """Return the size in bytes of all tensors in lists, tuples and attributes of objects."""
+    """Return the size in bytes of a tensor, or of all tensors in a list, a tuple or an object."""
     if isinstance(value, Tensor):
         return value.nbytes
     if not isinstance(value, list | tuple):

@@ -248,7 +248,7 @@ class HASPI(_MeanScore):
         options: Keyword arguments of ``torchmetrics.Metric``, except ``dist_sync_on_step``.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A value is out of range, or ``dist_sync_on_step`` is true.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASPI()
@@ -317,6 +317,9 @@ class MBSTOI(_MeanScore):
     MBSTOI assumes normal hearing: for a listener with a hearing loss, apply a simulator to the
     outputs first. The arguments and attributes are those of ``HASPI`` without ``audiogram``. The
     level is that of both ears together.
+
+    Raises:
+        ValueError: A value is out of range, or an audiogram is passed.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000].expand(2, -1), MBSTOI()

@@ -96,8 +96,12 @@ def common_period(rate: int, rate_divisor: int = 1) -> int:
 def _whole_steps(rate_divisor: int) -> int:
     """Return a duration in samples at 44.1 kHz of which FFT lengths may be multiples.
 
-    It spans whole envelope steps, and at the rate of the model an even number of samples: 24 at
-    44.1 kHz, which is one step, or 196 for signals at 22.05 kHz, which is eight steps of 24.5.
+    The duration spans whole envelope steps (times between two values of an envelope) and an even
+    number of samples: 24 for signals at 44.1 kHz, which is one step, or 196 for signals at
+    22.05 kHz, which is eight steps of 24.5.
+
+    Args:
+        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
     """
     return STEP if rate_divisor == 1 else round(8 * HALF_RATE_STEP)
 
@@ -176,6 +180,10 @@ def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tenso
     Shape: complex (items, bins) -> (items, channels, time), (items, channels, 3, steps), where time
         is ``band.points``, or twice as many for the detector ``"modulus"``, whose channels are
         analytic signals with alternating real and imaginary parts.
+
+    Args:
+        spectrum: Fourier transforms of the signals in Pa.
+        band: Channels with a common sample rate.
     """
     band_spectrum = spectrum[..., None, : band.response.shape[-1]] * band.response
     if band.detector == "itself":

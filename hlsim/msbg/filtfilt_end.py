@@ -86,8 +86,9 @@ def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
         offset: Samples from the first sample of the last step to the last sample of the signal.
 
     Returns:
-        Oscillations at the first sample of each step, in the order of time, (channels, 170, 2).
-        The last of the 170 steps is ``AHEAD`` steps after the last step of the signal.
+        Oscillations at the first sample of each step of 24 samples, in the order of time,
+        (channels, 170, 2). The last of the 170 steps is three steps (``AHEAD``) after the last step
+        of the signal.
     """
     sampled = _oscillations(bank)[1][:, offset::STEP]
     return sampled[:, LOOK_BACK // STEP - 1 :: -1]
@@ -98,7 +99,7 @@ def _oscillations(bank: FilterBank) -> tuple[Array, Array]:
     """Compute the results of ``_oscillation`` for the low-passes of all channels.
 
     Returns:
-        Weights, (channels, 2, 4096), and oscillations, (channels, samples, 2).
+        Weights, (channels, 2, 4096), and oscillations, (channels, 72 + 4096, 2).
     """
     results = [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
     weights, oscillations = zip(*results, strict=True)
@@ -117,8 +118,8 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
 
     Returns:
         Weights of the last 4096 samples, the last one last, (2, 4096), and oscillations in an
-        orthonormal basis, (AHEAD * STEP + 4096, 2), which run backwards in time from ``AHEAD``
-        steps after the end.
+        orthonormal basis, (72 + 4096, 2), which run backwards in time from 72 samples (``AHEAD``
+        steps) after the end.
     """
     transition = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
     input_vector = numerator[1:] - denominator[1:] * numerator[0]

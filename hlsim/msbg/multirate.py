@@ -125,7 +125,7 @@ class MultirateBank:
 def _rate_and_detector(
     centre: float, top: float, is_wide: bool, rate_divisor: int, highest: float
 ) -> tuple[int, str]:
-    """Choose the number of samples per step and the detector of a channel.
+    """Choose the sample rate of a channel, and the detector, from which its envelope is computed.
 
     Args:
         centre: Centre frequency in Hz.
@@ -135,7 +135,7 @@ def _rate_and_detector(
         highest: Highest frequency in Hz that the output needs.
 
     Returns:
-        Number of samples per step of the envelope, and the name of the detector.
+        Number of samples between two values of the envelope, and the detector (see ``RateBand``).
     """
     steps_per_second = MSBG_RATE / _envelope_step(rate_divisor)
     if centre < _RECTIFIED_BELOW_HZ:
@@ -252,7 +252,11 @@ def multirate_bank(
 
 
 def _envelope_step(rate_divisor: int) -> float:
-    """Return the number of samples at 44.1 kHz from one value of an envelope to the next."""
+    """Return the number of samples at 44.1 kHz from one value of an envelope to the next.
+
+    Args:
+        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+    """
     return STEP if rate_divisor == 1 else HALF_RATE_STEP
 
 

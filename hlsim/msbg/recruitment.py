@@ -151,10 +151,10 @@ def apply_gains(
 def _correct_kinks(
     sample_gains: Tensor, envelopes: Tensor, ratios: Tensor, kernel: Tensor
 ) -> Tensor:
-    """Compute gains again from the interpolated envelope where it dips, for slight losses.
+    """Replace interpolated gains by gains for the interpolated envelope, where the envelope dips.
 
-    At these dips, interpolated gains would have audible kinks. A loss is slight below about 24 dB
-    HL.
+    At these dips, interpolated gains would have audible kinks after a slight loss, one below about
+    24 dB HL. Gains of other losses stay as they are.
 
     Shape: (..., channels, time), (..., channels, steps), (..., channels), (rows, columns) ->
         (..., channels, time).
@@ -182,7 +182,7 @@ def _correct_kinks(
 
 
 def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
-    """Add up channels times factors.
+    """Multiply channels by factors, and add up the channels.
 
     Shape: (..., channels, time), (..., channels, time) -> (..., time).
     """

@@ -137,13 +137,16 @@ def _inward_block_response() -> NDArray[np.complex128]:
 
 @constant
 def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
-    """Compute the response of outer and middle ear and of resampling, with a gain, (bins,).
+    """Compute the frequency response of outer and middle ear and of resampling, with a gain.
 
     Args:
         points: FFT length at 44.1 kHz.
         bins: Number of frequencies.
         gain: Linear gain.
         rate: Sample rate in Hz from which signals are resampled.
+
+    Returns:
+        Complex response at the lowest ``bins`` frequencies, (bins,).
     """
     return gain * np.fft.rfft(ear_filter(), points)[:bins] * _band_end(points, bins, rate)
 
@@ -152,7 +155,9 @@ def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[
 def _outward_response(
     points: int, delay: int, bins: int, gain: float, rate: int
 ) -> NDArray[np.complex128]:
-    """Compute the response of the inverse ear and the low-pass with a gain and an advance, (bins,).
+    """Compute the frequency response from the cochlea to the output: inverse ear and low-pass.
+
+    A gain and an advance in time are part of the response.
 
     Args:
         points: FFT length at 44.1 kHz.
@@ -160,6 +165,9 @@ def _outward_response(
         bins: Number of frequencies.
         gain: Linear gain.
         rate: Sample rate in Hz to which signals are resampled.
+
+    Returns:
+        Complex response at the lowest ``bins`` frequencies, (bins,).
     """
     inverse_ear = np.fft.rfft(ear_filter(backward=True), points)
     response = inverse_ear * np.fft.rfft(lowpass_filter(), points)
@@ -168,14 +176,17 @@ def _outward_response(
 
 
 def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
-    """Compute weights that fade a spectrum out at the lower Nyquist frequency, (bins,).
+    """Compute weights that fade a spectrum out at the lower Nyquist frequency of two rates.
 
     The weights are all 1 if the outer rate is 44.1 kHz, so that nothing is resampled.
 
     Args:
         points: FFT length at 44.1 kHz.
         bins: Number of frequencies.
-        rate: Outer rate in Hz.
+        rate: Outer rate in Hz, that of input or output. The other rate is 44.1 kHz.
+
+    Returns:
+        Weights from 0 to 1, (bins,).
     """
     if rate == MSBG_RATE:
         return np.ones(bins)
@@ -183,7 +194,12 @@ def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
 
 
 def _rate_ratio(rate: int, rate_divisor: int) -> tuple[int, int]:
-    """Return the inner and the outer rate, divided by their greatest common divisor."""
+    """Return the inner and the outer rate, divided by their greatest common divisor.
+
+    Args:
+        rate: Outer rate in Hz, that of input or output.
+        rate_divisor: Divisor of 44.1 kHz for the inner rate, that of the cochlea: 1 or 2.
+    """
     inner_rate = MSBG_RATE // rate_divisor
     common = math.gcd(inner_rate, rate)
     return inner_rate // common, rate // common

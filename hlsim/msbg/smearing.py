@@ -58,9 +58,9 @@ _DIVISION_EPS = 1e-36
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
     """Compute the auditory filters of an ear: how much of each frequency each filter passes.
 
-    The filters are rounded exponentials, (1 + g) exp(-g), divided by their bandwidths. g is the
-    distance from the centre frequency in quarters of the filter's equivalent rectangular bandwidth,
-    which ``lower`` or ``upper`` widens.
+    The filters are rounded exponentials, (1 + g) exp(-g), divided by their bandwidths relative to
+    that of a normal filter at 0 Hz. g is the distance from the centre frequency in quarters of the
+    filter's equivalent rectangular bandwidth, which ``lower`` or ``upper`` widens.
 
     Args:
         lower: Factor by which the lower sides of the filters are wider than normal.
@@ -132,8 +132,8 @@ def smearing_matrix(
     Args:
         severity: Severity of the hearing loss, ``"mild"``, ``"moderate"`` or ``"severe"``.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: Highest frequency of the signals in Hz. Above it, the matrix has only the 800 Hz
-            into which smearing spreads them.
+        highest: Highest frequency of the signals in Hz. The matrix ends 800 Hz above it, because
+            smearing spreads signals that far.
 
     Returns:
         Matrix, (bins, bins), with 86 Hz from bin to bin.
@@ -217,8 +217,8 @@ class _SmearSpectrum(torch.autograd.Function):
     complex factor with f^2 = s / p, which is imaginary where s < 0, and z = f x the smeared
     spectrum. Let g be the gradient with respect to z times the conjugate of f. Then, with
     e = Re(conj(x) g), the gradient with respect to x is g + x (A^T (e / s) - e / p), because the
-    power of one frequency changes the factors of others. It grows without limit where s is near 0
-    or f is large. The matrix is a constant and has no gradient.
+    power of one frequency changes the factors of others. The gradient grows without limit where s
+    is near 0 or f is large. The matrix is a constant and has no gradient.
     """
 
     @staticmethod
@@ -272,9 +272,9 @@ def _window(rate_divisor: int) -> Tensor:
 def _cut_frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
     """Cut waveforms into windowed frames as pyclarity's ``smear3`` does, three hops late.
 
-    From the fifth frame on, frame k covers hops k - 3 to k. The first four frames are irregular, as
-    if hops 1 to 3 were repeated after the first four hops. Each frame is zero-padded to twice its
-    length by the window.
+    Counted from 0, frame k covers hops k - 3 to k from frame 4 on. The first four frames are
+    irregular, as if hops 1 to 3 were repeated after the first four hops. Each frame has four hops,
+    and the window zero-pads it to eight.
 
     Shape: (..., time), (8 * hop,) -> (..., count, 8 * hop).
     """

@@ -82,7 +82,7 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
 
 
 class _PhaseFactor(torch.autograd.Function):
-    """exp(a) z / |z| for z = 1 + x + j y, with a hand-written backward pass.
+    """The function exp(a) z / |z| of z = 1 + x + j y, with a hand-written backward pass.
 
     The backward pass needs a third of autograd's operations. Let f be the result, g the gradient
     with respect to f, and q = g conj(f). The gradient is Re q with respect to a, -y Im q / |z|^2

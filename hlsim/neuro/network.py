@@ -99,7 +99,7 @@ class EarNetwork(nn.Module):
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Convert signals to pascals at 16 kHz, process them in blocks or whole, and convert back.
 
-        Shape: (items, time), (items, 8) -> (items, time).
+        Shape: (items, time), (items, 8) in dB HL -> (items, time).
         """
         gain = gain_to_pascals(self.full_scale_spl)
         inputs = resample(signals * gain, self.sample_rate, NEURO_RATE)
@@ -131,12 +131,16 @@ class EarNetwork(nn.Module):
     def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Process signals in pascals at 16 kHz for ears with thresholds in dB HL.
 
+        Subclasses implement this method.
+
         Shape: (items, time), (items, 8) -> (items, time).
         """
         raise NotImplementedError
 
     def _finish(self, result: Tensor) -> Tensor:
-        """Post-process the result in pascals at the sample rate of the input, here not at all.
+        """Return the result, in pascals at the sample rate of the input, as it is.
+
+        Subclasses may post-process it.
 
         Shape: (items, time) -> (items, time).
         """

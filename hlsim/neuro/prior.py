@@ -134,7 +134,9 @@ class Prior(nn.Module):
         1 + learned.
 
         Args:
-            name: ``"excitation"``, ``"relative"``, ``"smoothing"`` or ``"smearing"``.
+            name: ``"excitation"``, factors from powers at frequencies to powers of channels;
+                ``"relative"``, responses of channels over their sum; ``"smoothing"``, low-passes of
+                envelopes; or ``"smearing"``, matrices.
         """
         known = getattr(self, f"{name}_known")
         learned = getattr(self, f"{name}_learned")

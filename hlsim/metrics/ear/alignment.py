@@ -199,4 +199,6 @@ class _Shift(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None, None]:
+        # The opposite delay, with the ends of input and output exchanged, returns each sample to
+        # its place.
         return shift(gradient, *ctx.settings), None, None, None, None

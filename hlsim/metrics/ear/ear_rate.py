@@ -91,7 +91,12 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
 
 
 def _reach(up: int, down: int) -> int:
-    """Return the number of input samples before an output sample that contribute to it."""
+    """Return the number of input samples before an output sample that contribute to it.
+
+    Args:
+        up: Numerator of the ratio of the rates, output to input.
+        down: Denominator of this ratio.
+    """
     return -(-ZERO_CROSSINGS * max(up, down) // up)
 
 

@@ -99,7 +99,10 @@ def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
 
 @constant
 def _smoothing() -> NDArray[np.float64]:
-    """Return a Hann window of sum 1, nine taps per column. Shape: (STRIDE, WINDOW_STRIDES)."""
+    """Return the window that smooths levels: a Hann window of 52 taps with the sum 1.
+
+    It is zero-padded and has nine successive taps per column. Shape: (STRIDE, WINDOW_STRIDES).
+    """
     window = np.hanning(WINDOW_SAMPLES + 2)[1:-1]
     padded = np.concatenate(
         (np.zeros(WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES), window / window.sum())
@@ -183,7 +186,10 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
 
 @constant
 def _cosines() -> NDArray[np.float64]:
-    """Return five cosines over the channels, of 0.5 to 2.5 periods and norm 1. Shape: (5, 32)."""
+    """Return the cosines over the channels that define the five cepstral coefficients.
+
+    They have 0.5, 1, ... 2.5 periods and the norm 1. Shape: (5, 32).
+    """
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
     waves = np.cos(np.arange(1, COSINES + 1)[:, None] * angle)
     return waves / np.linalg.norm(waves, axis=1, keepdims=True)
@@ -235,7 +241,7 @@ def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Co
 
 
 def _points(frames: int) -> int:
-    """Return a length of the Fourier transform at which even the longest filter does not wrap."""
+    """Return a length of the Fourier transform with which no filter wraps around the frames."""
     return fft_length(frames + len(_filters()[0]) // 2, 256)
 
 
@@ -349,12 +355,14 @@ def expected_correlation(clean: Tensor, output: Tensor, extent: Extent) -> Tenso
     xx, yy, xy = covariance.xx + noise, covariance.yy + noise, covariance.xy
     xx2, yy2, xy2, noise2 = _energies_filtered_twice(covariance, extent)
     noise2 = variance**2 * noise2
+    # relative variances of both energies, and covariance of the product with either energy
     spread_x = (4.0 * variance * xx2 + 2.0 * noise2) / xx.square()
     spread_y = (4.0 * variance * yy2 + 2.0 * noise2) / yy.square()
     norm = xx.sqrt() * yy.sqrt()
     both = 2.0 * variance * xy2 / norm
     quotient = xy / norm
     mean = quotient * (1.0 + 0.375 * (spread_x + spread_y)) - 0.5 * both * (1.0 / xx + 1.0 / yy)
+    # variance of the product over its norm, then of the quotient
     product = (variance * (xx2 + yy2) + noise2) / norm.square()
     spread = (
         product

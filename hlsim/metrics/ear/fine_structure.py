@@ -180,7 +180,10 @@ def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
 
 @constant
 def _cosines() -> NDArray[np.float64]:
-    """Return five cosines over the channels, with 0.5 to 2.5 periods. Shape: (5, 32)."""
+    """Return the cosines over the channels that define the five cepstral coefficients.
+
+    They have 0.5, 1, ... 2.5 periods and the amplitude 1. Shape: (5, 32).
+    """
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
     return np.cos(np.arange(1, 6)[:, None] * angle)
 
@@ -234,7 +237,8 @@ def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
 def _windows() -> NDArray[np.float64]:
     """Return the Hann window of each kind of segment. Shape: (3, SEGMENT).
 
-    The first segment has the falling half of a window, the last one the rising half.
+    The first segment has the falling half of a window, the last one the rising half; both are
+    zero-padded.
     """
     window = np.hanning(SEGMENT)
     falling = np.concatenate((window[HALF_SEGMENT:], np.zeros(HALF_SEGMENT)))

@@ -202,7 +202,7 @@ def _decay(bandwidth: Tensor, channels: slice) -> Tensor:
 
     Args:
         bandwidth: Bandwidths relative to normal hearing. Shape: (..., channels).
-        channels: The channels.
+        channels: Range of these channels among the 32 of the ear.
 
     Returns:
         Decays. Shape: (..., channels).
@@ -216,7 +216,7 @@ def _gammatones(bandwidth: Tensor, channels: slice, dtype: torch.dtype) -> Recur
     Args:
         bandwidth: Bandwidths relative to normal hearing. Shape: (channels,) if all items have the
             same ones, otherwise (items, channels).
-        channels: The channels.
+        channels: Range of these channels among the 32 of the ear.
         dtype: Precision of the filters.
 
     Returns:
@@ -274,7 +274,7 @@ def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Exte
     Args:
         control: Power of the control filters' envelopes. Shape: (items, channels, padded).
         cells: Hair cells of these channels.
-        channels: The channels.
+        channels: Range of these channels among the 32 of the ear.
         extent: Number of samples of each item before padding.
 
     Returns:
@@ -422,7 +422,7 @@ def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
 
     Args:
         bandwidth: Bandwidths of the filters, relative to normal hearing. Shape: (items, channels).
-        channels: The channels.
+        channels: Range of these channels among the 32 of the ear.
 
     Returns:
         Delays in samples at 24 kHz. Shape: (items, channels), int64.

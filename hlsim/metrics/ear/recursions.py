@@ -271,6 +271,7 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     n = torch.arange(BLOCK, dtype=decay.dtype, device=decay.device)
     gain = 2.0 * torch.expm1(-decay) ** 4 / (1.0 + 2.0 * torch.exp(-decay)) ** 2
     decay, angle = decay[..., None], angle[..., None]
+    # p(n + m) is a polynomial in m, whose coefficients (p and its derivatives at n) are the rows.
     p = torch.stack(
         (
             (n + 1) * (3 * n**2 + 3 * n + 2) / 2,

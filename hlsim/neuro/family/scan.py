@@ -77,7 +77,7 @@ def selective_scan(
 
 
 def _recur(decay: Tensor, states: Tensor) -> None:
-    """Compute h[t] = decay[t - 1] h[t - 1] + drive[t] with h[-1] = 0, in place of the drive.
+    """Compute the recurrence h[t] = decay[t - 1] h[t - 1] + drive[t] with h[-1] = 0, in place.
 
     Neighbouring times are joined in pairs. The recurrence of the pairs has half the length and the
     same form, and the times between them follow from it. This takes about three operations per time
@@ -113,7 +113,7 @@ def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Ten
 
 
 class _SelectiveScan(torch.autograd.Function):
-    """The scan with its gradient, which computes the states again instead of storing them.
+    """The selective scan with its gradient, which computes the states again, not storing them.
 
     Channels are the last dimension, so that each step of the recurrence works on whole rows.
 
@@ -139,7 +139,7 @@ class _SelectiveScan(torch.autograd.Function):
 
 
 class _ScanGradient(torch.autograd.Function):
-    """Gradients of the scan, which raise an error if they are differentiated.
+    """Gradients of the selective scan, which raise an error if they are differentiated.
 
     With ``once_differentiable`` instead, ``torch.autograd.grad`` for a subset of the inputs would
     ignore the second derivative without an error.
@@ -202,7 +202,7 @@ def _parts(A: Tensor, *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
 
 
 def _kernel_for(u: Tensor) -> Callable[..., Any] | None:
-    """Return the scan of ``mamba_ssm`` if it works for a tensor, otherwise None."""
+    """Return the scan of ``mamba_ssm`` if it supports a tensor (GPU, not float64), else None."""
     return _kernel() if u.is_cuda and u.dtype != torch.float64 else None
 
 
