@@ -54,8 +54,8 @@ def read_audio(path: str | Path) -> tuple[Tensor, int]:
         Hz.
 
     Raises:
-        ValueError: There is no such file; libsndfile cannot read it; it is empty, silent, or holds
-            NaN or infinity; or its sample rate is below 16 kHz.
+        ValueError: There is no such file; libsndfile cannot read it; it is empty, silent, or
+            contains NaN or infinity; or its sample rate is below 16 kHz.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> samples, rate = read_audio(EXAMPLE_FILE)

@@ -320,7 +320,7 @@ def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: floa
 def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
     """Raise ValueError unless a value is a floating-point tensor whose last dimension can be time.
 
-    A last dimension of up to eight values behind a longer one holds channels.
+    A last dimension of up to eight values behind a longer one is taken as channels, and rejected.
 
     Args:
         waveform: Value to validate.

@@ -4,8 +4,8 @@ An *item* is one signal for one ear. The program of a simulator processes a fixe
 with a fixed length.
 
 The program of a wearable aid (``WDRC`` or ``HearingAid``) processes one *hop* of each item, 64
-samples or 4 ms at 16 kHz, or a fixed number of hops. What the aid remembers from one call to the
-next, its *state*, is passed in and returned as tensors. All tensors are float32.
+samples or 4 ms at 16 kHz, or a fixed number of hops. The *state* of the aid, its memory of earlier
+calls, is passed in and returned as tensors. All tensors are float32.
 
 Inputs and their names:
 

@@ -208,7 +208,7 @@ def _import_file(path: Path) -> ModuleType:
     """Import a file, which can import modules from its folder.
 
     Raises:
-        ImportError: Python has no loader for the file. Errors of the file itself are raised, too.
+        ImportError: Python has no loader for the file. The file may raise other errors.
     """
     sys.path.insert(0, str(path.parent))
     spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)

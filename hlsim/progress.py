@@ -34,7 +34,7 @@ class ProgressLine:
     finished have no influence.
 
     Args:
-        unit: Plural noun for what is counted, such as "scores".
+        unit: Plural noun for the counted units of work, such as "scores".
         before: Description of the work before the first call.
         after: Description of the work after the last call.
 

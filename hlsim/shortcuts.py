@@ -56,7 +56,7 @@ def load_audio(
         their sample rate in Hz.
 
     Raises:
-        ValueError: The file cannot be read, is empty or silent, or holds NaN or infinity; or the
+        ValueError: The file cannot be read, is empty or silent, or contains NaN or infinity; or the
             level or the sample rate is not valid.
 
     Example:
@@ -182,8 +182,8 @@ def listen(
 ) -> Player:
     """Show a player in a notebook that switches between signals at the same position.
 
-    All signals have the same gain, so that what is soft for the ear is soft here, and the volume
-    starts low. The player needs the extra ``eval``.
+    All signals have the same gain, so that a sound that the ear perceives as soft is soft here. The
+    volume starts low. The player needs the extra ``eval``.
 
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.

@@ -23,7 +23,7 @@ _KNOWN_WORDS = {
 """Words that the name of a column of thresholds may contain besides the frequency."""
 
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}
-"""Words of columns that do not hold measured thresholds of air conduction."""
+"""Words in the names of columns with other levels than measured thresholds of air conduction."""
 
 # Thousands may be separated, by a blank if no letter is joined to the number ("R1 500" is none),
 # and a decimal comma is as good as a point.

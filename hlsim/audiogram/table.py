@@ -255,7 +255,8 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
         threshold: Name of the column of thresholds in dB HL.
 
     Returns:
-        One row per ear, whose columns are the listener, the ear and one column per frequency.
+        One row per ear, with the place of the first row of this ear. Its columns are the listener,
+        the ear and one column per frequency.
 
     Raises:
         ValueError: A column is missing, a frequency is not understood, an ear has two thresholds at

@@ -33,9 +33,9 @@ def as_thresholds(
 ) -> Tensor:
     """Convert any description of one or more ears into a tensor of thresholds in dB HL.
 
-    The last dimension holds the thresholds at 250, 500, 1000, 2000, 3000, 4000, 6000 and 8000 Hz,
-    the ``FREQUENCIES``. An ``Audiogram`` with other frequencies is interpolated over log frequency
-    (``Audiogram.thresholds``).
+    The last dimension contains the thresholds at the ``FREQUENCIES`` 250, 500, 1000, 2000, 3000,
+    4000, 6000 and 8000 Hz. An ``Audiogram`` with other frequencies is interpolated over log
+    frequency (``Audiogram.thresholds``).
 
     Tensors on a GPU are not validated, because that would synchronise with the GPU, and neither are
     tensors in a compiled or exported program. Instead, an ear with a level out of range becomes
@@ -51,7 +51,7 @@ def as_thresholds(
         (batch, 2, 8) for sequences of them. A floating-point tensor is returned as it is.
 
     Raises:
-        ValueError: The value does not describe ears, an ear is missing, a tensor does not hold
+        ValueError: The value does not describe ears, an ear is missing, a tensor does not have
             eight real numbers per ear, or a level is NaN or outside -10 to ``highest`` dB HL.
 
     >>> as_thresholds(["N1", "N3"]).shape

@@ -41,14 +41,14 @@ class Audiogram:
     were measured, as pyclarity does. Networks, losses, aids and metrics use ``thresholds``, the
     levels at eight frequencies. Simulators accept thresholds up to 100 dB HL.
 
-    PyTorch loads checkpoints that hold audiograms or listeners, for example as hyperparameters,
+    PyTorch loads checkpoints that contain audiograms or listeners, for example as hyperparameters,
     with ``weights_only=True`` once a loss, a simulator or an aid was imported, and otherwise inside
     ``torch.serialization.safe_globals([Audiogram, Listener])``.
 
     Args:
         levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or
             NaN was not measured, and is left out. A mapping or a ``Series`` of pandas that names
-            the frequencies is accepted, too, see ``as_audiogram``.
+            the frequencies is also accepted, see ``as_audiogram``.
         frequencies: Ascending frequencies from 100 to 20000 Hz; by default 250, 500, 1000, 2000,
             3000, 4000, 6000 and 8000, the ``FREQUENCIES``.
 

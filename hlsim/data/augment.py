@@ -95,8 +95,8 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     """Compress the dynamic range of signals, as hearing aids do.
 
     The level in a running window of 10 ms approaches the mean level of the signal: a difference of
-    d dB becomes one of about d / ratio dB. The gain of ever softer parts approaches that for 30 dB
-    below the mean level, so that silence is not amplified without limit.
+    d dB becomes one of about d / ratio dB. The gain of soft parts is at most 30 (1 - 1 / ratio) dB,
+    so that silence is not amplified without limit.
 
     Args:
         waveform: Signals with shape (items, time).

@@ -71,7 +71,7 @@ def prepare(
     folders: Sequence[str] | None = None,
     valid_share: float = 0.0,
 ) -> str:
-    """Recognise a corpus and write its manifest, the CSV file from which trainings read.
+    """Recognise a corpus and write its manifest, the CSV file that training runs read.
 
     Args:
         source: Folder of a known layout, or a CSV file, see ``read_manifest``.

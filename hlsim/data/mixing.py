@@ -21,9 +21,9 @@ def mix(
 ) -> Audio:
     """Add noise to speech at a signal-to-noise ratio.
 
-    The speech stays as it is, and the noise is scaled; silence gets no noise. The level of the
-    speech is the active level of ITU-T P.56, which leaves pauses out; the level of the noise is its
-    RMS level.
+    The speech stays as it is, and the noise is scaled. The level of the speech is the active level
+    of ITU-T P.56, which leaves pauses out; the level of the noise is its RMS level. Silent speech
+    gets inaudible noise, at -106 dB SPL.
 
     Args:
         speech: Tensor or NumPy array of speech, ``(..., time)``.
@@ -32,9 +32,9 @@ def mix(
             one per recording).
         sample_rate: Sample rate in Hz, 16000 to 48000. ``None`` takes the RMS level of the speech
             with its pauses instead of the active level.
-        channels: Whether the second last dimension holds the channels of a recording, which have
+        channels: Whether the second last dimension contains the channels of a recording, which have
             one SNR and one gain, so that the level differences between ears stay. Otherwise, each
-            channel is a signal of its own.
+            channel is a separate signal.
 
     Returns:
         Noisy speech, of the type and shape of ``speech``.

@@ -1,7 +1,7 @@
 """The scale of equivalent rectangular bandwidths (ERB) of auditory filters.
 
-The ERB at a frequency says how finely a normal ear resolves frequencies there. On the ERB-number
-scale, equal distances are equal numbers of ERBs.
+The ERB at a frequency is a measure of how finely a normal ear resolves frequencies there. On the
+ERB-number scale, equal distances are equal numbers of ERBs.
 
 Source: Glasberg and Moore (1990), Hearing Research 47, 103-138.
 """

@@ -1,7 +1,7 @@
 """Division of long signals into overlapping blocks, which bounds the memory for processing them.
 
-Results near the ends of a block lack context and are discarded. The *input* of a block is what is
-processed, and its *output* the shorter part of the result that is used.
+Results near the ends of a block lack context and are discarded. The *input* of a block is the part
+of the signal that is processed, and its *output* the shorter part of the result that is used.
 """
 
 import math

@@ -131,7 +131,7 @@ def scores_or_errors(
     ends: Sequence[int],
     **settings: Any,
 ) -> list[Tensor | ValueError]:
-    """Compute the score of each item of a batch, or the error that says why it has none.
+    """Compute the score of each item of a batch, or the error if an item cannot be scored.
 
     ``score`` raises an error for the whole batch if one item cannot be scored. In that case, each
     item is scored on its own.

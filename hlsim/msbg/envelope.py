@@ -2,8 +2,8 @@
 
 Envelopes vary so slowly that they are computed once per *step* of 24 samples only, in three stages:
 
-1. Rectify each channel. For channels at reduced rates, ``detect`` computes what the rectified
-   channel would be.
+1. Rectify each channel. For channels at reduced rates, ``detect`` computes the rectified channel
+   without the harmonics that would alias.
 2. Average the rectified samples of each step with three running means, so that few frequencies
    alias. ``partial_means`` computes the contributions of each step to its own average and to those
    of its two neighbours.
@@ -122,8 +122,8 @@ def partial_means(rectified: Tensor, weights: Tensor) -> Tensor:
     """Reduce rectified signals to three sums per step, from which ``smooth`` computes envelopes.
 
     A step is a group of neighbouring samples, 24 at 44.1 kHz, with one value of the envelope. This
-    value is a weighted average over three steps. The three sums are what the samples of a step
-    contribute to the averages of the step after, of the same step and of the step before.
+    value is a weighted average over three steps. The three sums are the contributions of the
+    samples of a step to the averages of the step after, of the same step and of the step before.
 
     Shape: (..., time), (3, samples) -> (..., 3, steps), where time is steps * samples.
 

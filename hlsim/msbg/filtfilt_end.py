@@ -3,7 +3,7 @@
 pyclarity runs the envelope's low-pass forwards and backwards with ``scipy.signal.filtfilt``. At the
 end of a signal, ``filtfilt`` adds eight samples, the last ones reflected about the last sample, and
 starts the backward pass as if the signal had been constant after them. The Fourier transforms of
-``hlsim.msbg.envelope`` let silence follow the signal instead.
+``hlsim.msbg.envelope`` treat the signal as followed by silence instead.
 
 The two envelopes differ by a *free oscillation* of the low-pass, which rings like a struck string.
 The low-pass is of second order, so that two amplitudes per channel describe the oscillation. They
@@ -37,8 +37,8 @@ def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
     """Compute the correction in Pa that is added to the envelopes of a signal that ends abruptly.
 
     pyclarity smooths envelopes with ``scipy.signal.filtfilt``, which continues a signal beyond its
-    end. ``hlsim.msbg.envelope.envelope`` lets silence follow the signal. The result is the
-    difference.
+    end. ``hlsim.msbg.envelope.envelope`` treats the signal as followed by silence. The result is
+    the difference.
 
     Shape: (..., channels, time) -> (..., channels, time // 24).
 

@@ -96,7 +96,8 @@ class MSBG(nn.Module):
             from those that lie between 2 and 8 kHz, and the threshold of each channel by linear
             interpolation in Hz. A tensor has the thresholds at the eight ``FREQUENCIES``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. At rates below 44100
-            the last 80 Hz below half the rate fade out.
+            the last 80 Hz below half the rate fade out; at rates above 44100 outputs end at
+            22.05 kHz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
         aligned: Whether the delay of the model is removed, so that the output has as many samples
             as the input. Otherwise the output is that of pyclarity, sample by sample at 44.1 kHz,

@@ -143,7 +143,7 @@ class NetworkConfig(ModelConfig):
         """Number of input samples before and after an output sample that the layers combine for it.
 
         The samples have 16 kHz. None if the output depends on the whole signal, as with layers
-        other than convolutions. What the prior adds is in ``EarNetwork.receptive_field``.
+        other than convolutions. ``EarNetwork.receptive_field`` includes the prior.
         """
         if self.block != "cnn":
             return None
@@ -169,8 +169,8 @@ class NeuroConfig(NetworkConfig):
             (its Table IV).
         phase: ``predicted``, or ``input`` for a network that changes the magnitude only (Table
             III).
-        prior: Estimate MSBG's gains by its formulae (``hlsim.neuro.prior``), and let the network
-            correct them. Otherwise the network learns everything, as in the paper.
+        prior: Estimate MSBG's gains by its formulae (``hlsim.neuro.prior``); the network corrects
+            them. Otherwise the network learns everything, as in the paper.
         level_aware: Use the log magnitude and no normalisation, so that the gain depends on the
             level as it does in an ear. Otherwise the gain does not depend on the level, as in
             MP-SENet: each signal is scaled to an RMS of 1 and back, and instance normalisation

@@ -16,9 +16,9 @@ from hlsim.neuro.model import NeuroMSBG
 class SimulatedStream:
     """Simulator for a signal that arrives in chunks.
 
-    Call it with each chunk in turn; it returns as many samples of the perceived signal. This output
-    is delayed by the simulator's look-ahead, so that it depends on past input only. Its first
-    ``latency`` samples belong to the silence before the first chunk.
+    Call the object with one chunk after another; it returns as many samples of the perceived
+    signal. This output is delayed by the simulator's look-ahead, so that it depends on past input
+    only. Its first ``latency`` samples belong to the silence before the first chunk.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz with a finite receptive field, such as ``neuro-msbg``.

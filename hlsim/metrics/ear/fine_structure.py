@@ -1,4 +1,4 @@
-"""Features of HASQI and HAAQI: what an aid changes in the sound, besides its level.
+"""Features of HASQI and HAAQI, which show the changes of a sound by an aid besides its level.
 
 Both scores compare the output of an aid with clean speech or music by:
 
