@@ -16,15 +16,15 @@ perceives, and ``R`` those of what a normal ear perceives. Each band and segment
   same part of its square root, which distinguishes a signal from its negative. It has a small
   weight, as nobody hears the sign or a delay of one millisecond; it leads a model with an arbitrary
   phase shift to one without.
-- ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope
+- ``levels``, ``10 ln(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope
   falls with the difference, so that a severe ear, which perceives 100 dB too little and 2.5 dB more
   per dB of gain, counts like a mild one.
-- ``louder``, the excess in dB of the perceived level over both the reference and the threshold of
-  audibility: too much gain, and noise in pauses.
+- ``louder``, by how many dB more than 3 the perceived level is above both the reference and the
+  threshold of audibility: too much gain, and noise in pauses.
 
-Incoherence and levels are weighted by the audibility of the reference, ``P / (P + threshold)`` of
-its power ``P``. It is above 0 wherever there is power, and so small in faint bands that they do not
-dominate the gradient.
+The first three are weighted by the audibility of the reference, ``P / (P + threshold)`` of its
+power ``P``, and ``louder`` by that of the perceived signal. It is above 0 wherever there is power,
+and so small in faint bands that they do not dominate the gradient.
 """
 
 import numpy as np
@@ -55,7 +55,7 @@ _DEPTH_DB = 41.0
 """Level in dB below the strongest band of an item at which the weight of a band is one half."""
 
 KNEE = 10.0
-"""Difference in level in dB at which one more dB costs half as much as the first."""
+"""Difference in level in dB at which one more dB costs half as much as the first dB does."""
 
 _POWER_FLOOR = 1e-22
 """Power, -126 dB SPL, added before the logarithm.
@@ -64,19 +64,19 @@ Soft speech in an N5 ear has -110, and keeps its gradient.
 """
 
 HIGHEST_PEAK = 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
-"""Pressure in pascals, 120 dB SPL, above which peaks cost."""
+"""Pressure in pascals, 120 dB SPL, above which the magnitude of a sample has a loss."""
 
 MARGIN = 3.0
 """Excess of the level in dB that does not count as louder."""
 
 FRAMES_PER_HOP = 3
-"""Frames from one segment to the next; a segment is twice as long."""
+"""Number of frames from one segment to the next; a segment has twice as many."""
 
 SIGN_WEIGHT = 0.1
 """Weight of the term of the misalignment that tells a signal from its negative."""
 
 PRODUCT_FLOOR = 1e-36
-"""Added to products of two powers; far below the products of audible bands."""
+"""Value added to products of two powers in Pa^2, far below those of audible bands."""
 
 _WEIGHT_FLOOR = 1e-9
 """Smallest sum of weights by which a part is divided: that of a reference at about -160 dB SPL."""
@@ -85,8 +85,8 @@ _WEIGHT_FLOOR = 1e-9
 def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> dict[str, Tensor]:
     """Compute four errors of perceived speech: in coherence, phase and level, and excess level.
 
-    Weights of bands and segments carry no gradient. Audible sound where the reference is silent has
-    a gradient all the same.
+    Weights of bands and segments carry no gradient. Perceived sound has a gradient even where the
+    reference is silent.
 
     Args:
         perceived: Speech that the impaired ear perceives, (items, time) in pascals.
@@ -97,8 +97,8 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
         Four parts, (items,) each, which are means over audible bands and segments:
         ``incoherence``, 0 for the reference with any gain and phase per band, about 0.9 for
         unrelated noise; ``misalignment``, the part of the coherence that a phase shift costs;
-        ``levels``, ``10 log(1 + d / 10)`` of the error d of the level in dB; ``louder``, the level
-        in dB by which a band exceeds both the reference and the threshold of audibility.
+        ``levels``, ``10 ln(1 + d / 10)`` of the error d of the level in dB; ``louder``, by how many
+        dB more than 3 a band is above both the reference and the threshold of audibility.
 
     >>> speech = torch.randn(1, 16000)
     >>> parts = coherent_band_parts(0.1 * speech, speech, sample_rate=16000)  # 20 dB too low
@@ -159,7 +159,7 @@ def peak_excess(output: Tensor) -> Tensor:
 def _average_segments(frames: Tensor) -> Tensor:
     """Average frames, which are 16 ms apart, over segments of 96 ms, every 48 ms.
 
-    Frames that the last 48 ms lack count as zeros. Up to three frames give one segment of 48 ms.
+    Zeros pad the frames to a multiple of three. Up to three frames give one segment of 48 ms.
 
     Shape: (items, frames, n) -> (items, segments, n).
     """
@@ -177,19 +177,19 @@ def _audibility(powers: Tensor, threshold: Tensor) -> Tensor:
     The weights carry no gradient.
 
     Args:
-        powers: Powers in Pa^2, (..., bands, frames).
-        threshold: Power in Pa^2 at which a band is half audible, broadcast over ``powers``.
+        powers: Powers in Pa^2, (items, segments, bands).
+        threshold: Power in Pa^2 at which a band is half audible, broadcast to ``powers``.
     """
     powers = powers.detach()
     return powers / (powers + threshold)
 
 
 def _decibels(powers: Tensor) -> Tensor:
-    """Convert powers in Pa^2 to levels in dB re 1 Pa, at least -220."""
+    """Convert powers in Pa^2 to levels in dB relative to 1 Pa, at least -220. Any shape."""
     return 10.0 * torch.log10(powers + _POWER_FLOOR)
 
 
 @constant
 def _quiet_power() -> NDArray[np.float64]:
-    """Return the power of each band at the threshold of hearing, (24,)."""
+    """Return the power in Pa^2 of each band at the threshold of normal hearing, (24,)."""
     return 10.0 ** ((threshold_in_quiet() - PASCAL_SPL) / 10.0)

@@ -1,9 +1,9 @@
 """Criteria of ``HearingLossLoss``: one entry of a table and one function each.
 
 A criterion compares the output of an aid, or what an impaired ear perceives of it, with clean
-speech or with what a normal ear perceives of that. It has one or several *parts*, whose weighted
-sum is the loss. A new criterion is a function from a ``Comparison`` to its parts, and an entry in
-``CRITERIA``.
+speech, or with what a normal ear perceives of clean speech. It has one or several *parts*, whose
+weighted sum is the loss. A new criterion is a function from a ``Comparison`` to its parts, and an
+entry in ``CRITERIA``.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Comparison:
 
     Attributes:
         output: Output of an aid.
-        limited_output: Output of an aid, whose gradient is limited in the backward pass if a
-            criterion of the loss limits it (``hlsim.losses.gradient_limit``).
+        limited_output: The same output. If a criterion of the loss has ``limits_gradient``, the
+            gradient through this tensor is limited (``hlsim.losses.gradient_limit``).
         clean: Clean speech.
         perceived: Output of the simulator for ``limited_output`` and the impaired ears.
         reference: Reference of the criterion, see ``Criterion.reference``.
@@ -68,7 +68,11 @@ class Comparison:
     sample_rate: int
 
     def without_padding(self, items: slice) -> Comparison:
-        """Return the signals of some items that have one length, cut to this length."""
+        """Return the comparison of some items, cut to the length that all of them have.
+
+        Args:
+            items: Slice of items that have the same length.
+        """
         lengths = self.lengths[items]
         signals = {name: getattr(self, name)[items, : lengths[0]] for name in _SIGNALS}
         return replace(self, **signals, ears=self.ears[items], lengths=lengths)
@@ -86,8 +90,8 @@ class Criterion:
         limits_gradient: Whether spikes of the gradient with respect to the output are limited.
         handles_padding: Whether ``compute`` takes account of ``Comparison.lengths``. Otherwise the
             items of a padded batch are cut and compared one by one, or both ears at once.
-        two_ears: Whether successive items are the left and the right ear of a listener, which have
-            the same length.
+        two_ears: Whether the criterion compares two ears. Items 0 and 1, 2 and 3, and so on, are
+            then the left and the right ear of a listener, which have the same length.
 
     >>> CRITERIA["interaural"].two_ears
     True
@@ -185,7 +189,7 @@ CRITERIA = {
         two_ears=True,
     ),
 }
-"""Criteria by name."""
+"""Criteria of ``HearingLossLoss``, each under its name."""
 
 
 def function_criterion(function: Callable[[Tensor, Tensor], Tensor]) -> Criterion:
@@ -213,9 +217,9 @@ def read_criterion(
     """Return the criteria of a loss, and the parts that they have, with their weights.
 
     Args:
-        criterion: Name of a criterion, dictionary of names and weights, or a function.
-        weights: Weight under each part's name; parts that it lacks are left out of the loss. None
-            stands for the default weights of the criteria.
+        criterion: Name of a criterion, dict from names to weights, or a function.
+        weights: Weight under each part's name; parts without a weight are left out of the loss.
+            None selects the default weights of the criteria.
 
     Returns:
         Criteria by name that have a weight above 0, where a function has the name ``criterion``;

@@ -24,7 +24,8 @@ class Reference:
     """Signal with which a criterion compares what an impaired ear perceives.
 
     Attributes:
-        signal: Clean speech, or what a normal ear perceives of it.
+        signal: ``"clean"``, clean speech, or ``"normal-hearing"``, what a normal ear perceives of
+            it.
         is_fixed: Whether ``signal`` applies even if the user of the loss chose another one.
         normal_ear: Normal ear of a simulator that emulates MSBG: ``"filter"``, one filter with
             MSBG's response for normal ears and the phase of the impaired ear's filter bank, or
@@ -47,7 +48,7 @@ NormalEar = Callable[[Tensor], Tensor]
 
 
 class FrozenSimulator:
-    """Simulator of an impaired ear that is not trained, with the normal ear that belongs to it.
+    """Simulator of hearing loss that is not trained, with the normal ear that belongs to it.
 
     The simulator stays in eval mode and has no trainable parameter. This class is not a module, so
     that the loss that owns it does not register these parameters.
@@ -65,7 +66,8 @@ class FrozenSimulator:
             instead of stored.
 
     Raises:
-        ValueError: An argument is not as described.
+        ValueError: There is no such simulator, or it was built for another rate or level, or delays
+            its output.
 
     >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, choice=None)
     >>> frozen.simulator.training
@@ -102,12 +104,15 @@ class FrozenSimulator:
         """Compute what the impaired ears perceive.
 
         Args:
-            waveform: Speech.
-            thresholds: Ears in dB HL.
+            waveform: Output of an aid, on the scale of ``full_scale_spl``.
+            thresholds: Thresholds of the ears in dB HL.
             lengths: Number of samples of each item of a padded batch, on the CPU. By default, all
                 items are as long as the batch.
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
+
+        Raises:
+            ValueError: The simulator rejects its input, or returns another shape.
         """
         if not type(self.simulator).__module__.startswith("hlsim."):
             # A module that changes its arguments in place must not change the ears of the loss.
@@ -146,6 +151,9 @@ class FrozenSimulator:
 
         Returns:
             Clean speech, or what a normal ear perceives of it, (*batch, time).
+
+        Raises:
+            ValueError: The simulator or the normal ear returns another shape.
         """
         shape = (*batch, clean.shape[-1])
         if reference is None:
@@ -167,14 +175,20 @@ class FrozenSimulator:
         return apply_bank_phase(items, ears, self.sample_rate, normal=is_normal).reshape(shape)
 
     def _simulate_normal_ear(self, clean: Tensor, lengths: Tensor | None) -> Tensor:
-        """Compute what the normal ear perceives. Shape: (..., time) -> (..., time)."""
+        """Compute what the normal ear perceives, by ``normal`` or by the simulator at 0 dB HL.
+
+        Shape: (..., time) -> (..., time).
+        """
         if self.normal is not None:
             return check_shape(self.normal(clean), "normal ear", clean.shape)
         # Thresholds whose values the CPU knows, so that it need not wait for a GPU.
         return self.simulate(clean, on_device(_normal_ear(), clean.device), lengths)
 
     def _limit_band(self, clean: Tensor) -> Tensor:
-        """Remove the frequencies above those that the simulator returns."""
+        """Remove frequencies above the highest one of the simulator's output.
+
+        Shape: (..., time) -> (..., time).
+        """
         if self._band_rate >= self.sample_rate:
             return clean
         low = resample(clean, self.sample_rate, round(self._band_rate))
@@ -188,7 +202,7 @@ def _normal_ear() -> Tensor:
 
 
 def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
-    """Return an output, or raise ValueError unless it is a tensor of a shape.
+    """Return an output, or raise ValueError unless it is a tensor of the expected shape.
 
     Args:
         output: Value to validate.

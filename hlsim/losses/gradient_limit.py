@@ -10,19 +10,19 @@ from torch.nn import functional
 from hlsim.torchtools import differentiable_once
 
 MAX_GRADIENT_RATIO = 6.0
-"""Gradients above this multiple of the item's 90th percentile are scaled down to it.
+"""Largest gradient of a block, as a multiple of the usual magnitude of the item's gradients.
 
-The percentile is that of the sounding samples.
+The usual magnitude is the 90th percentile over samples outside pauses.
 """
 
 LIMITER_SECONDS = 0.005
-"""Length of the blocks whose gradients are scaled together."""
+"""Duration in seconds of the blocks whose gradients are scaled together."""
 
 SOUNDING = 1e-3
-"""Power of a block over that of the loudest one from which it counts as sounding."""
+"""Power of a block, relative to that of the loudest block, from which it is not a pause."""
 
 LIMITER_SAMPLES = 4096
-"""Approximate number of samples from which the percentile of an item's gradients is taken."""
+"""Approximate number of an item's samples from which the percentile is computed."""
 
 
 def limit_gradient_spikes(
@@ -37,7 +37,8 @@ def limit_gradient_spikes(
     pauses, which are blocks of the waveform whose RMS is 30 dB or more below that of the loudest
     block, it may be once the usual magnitude. Where it is larger, the whole block is scaled down to
     the limit. Limiting single samples would give the gradient a non-zero mean, from which a
-    convolutional network learns an inaudible constant pressure. NaN in a gradient is passed on.
+    convolutional network learns an inaudible constant pressure. NaN in a gradient is passed on. The
+    gradient has no derivative of its own.
 
     Shape: (..., time) -> (..., time).
 
@@ -97,12 +98,12 @@ class _GradientLimiter(torch.autograd.Function):
 
 
 def _usual_sizes(candidates: Tensor, time: int, lengths: Tensor | None) -> Tensor:
-    """Compute the 90th percentile of magnitudes from about ``LIMITER_SAMPLES`` of each item.
+    """Compute the 90th percentile of magnitudes, from about ``LIMITER_SAMPLES`` of each item.
 
     Shape: (..., n) -> (..., 1).
 
     Args:
-        candidates: Magnitudes; NaN where a sample is not counted.
+        candidates: Magnitudes of the gradient; NaN where a sample is not counted.
         time: Number of samples of the batch, at most n.
         lengths: Number of samples of each item, (...), or None if each has ``time``.
     """
@@ -119,7 +120,7 @@ def _usual_sizes(candidates: Tensor, time: int, lengths: Tensor | None) -> Tenso
 
 
 def _split(samples: Tensor, block: int) -> Tensor:
-    """Split into blocks, the last one filled with zeros.
+    """Split samples into blocks, the last one padded with zeros.
 
     Shape: (..., time) -> (..., blocks, block).
     """

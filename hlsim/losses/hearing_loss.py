@@ -33,15 +33,15 @@ _Reduction = Literal["mean", "none"]
 _EarsName = Literal["mean", "better"]
 
 _TEMPERATURE = 0.1
-"""Temperature of ``ears="better"``.
+"""Temperature of the softmax of ``ears="better"``.
 
-An ear with a loss that is 0.1 lower than that of the other ear counts 2.7 times as much.
+An ear whose loss is 0.1 lower than that of the other ear counts 2.7 times as much.
 """
 
 _LEVEL_WEIGHTS = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
-"""Weights of the terms of the level in ``HASPILoss``.
+"""Weights of the parts of ``HASPILoss`` that concern the level.
 
-Excess level costs twice its default, as HASPI rewards gain.
+``louder`` has twice its default weight, because HASPI rises with gain.
 """
 
 
@@ -58,8 +58,8 @@ class HearingLossLoss(nn.Module):
     The impaired ear perceives the output of an aid, and the normal ear clean speech. A simulator
     computes both. It is frozen: it stays in eval mode and has no trainable parameter, but gradients
     pass through it to the output of the aid. It is not registered as a submodule, so that the
-    parameters and the state dict of a module that holds this loss do not include it. It moves with
-    ``.to()`` all the same. Use ``DistributedDataParallel`` instead of ``nn.DataParallel``, because
+    parameters and the state dict of a module that contains this loss do not include it. It still
+    moves with ``.to()``. Use ``DistributedDataParallel`` instead of ``nn.DataParallel``, because
     all threads of a process share one simulator.
 
     The level is not normalised: 65 dB SPL is an RMS of 0.035 at the default ``full_scale_spl``. NaN
@@ -103,14 +103,14 @@ class HearingLossLoss(nn.Module):
         sample_rate: Sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
             below 8 kHz. The criterion ``"paper"`` resamples what it compares to 16000.
         full_scale_spl: Level in dB SPL of RMS 1.0.
-        reference: Signal with which ``"paper"``, a function and ``heard`` compare: ``"clean"``, the
-            clean speech (the default for ``"paper"``), or ``"normal-hearing"``, the output of a
-            normal ear for it (the default otherwise). ``"coherent-bands"`` and ``"bands"`` always
-            compare with a normal ear, and scores and ``"interaural"`` with clean speech as it is.
-            Except for ``"bands"``, which has no phase, the reference gets the phase of MSBG's
-            filter bank for the severity of the ear (``hlsim.msbg.response``), unless ``normal`` is
-            passed or the simulator does not emulate MSBG. Without this phase, speech of the
-            opposite sign could have a lower loss.
+        reference: Signal with which ``"paper"`` and a function compare, and which ``heard``
+            returns: ``"clean"``, the clean speech (the default for ``"paper"``), or
+            ``"normal-hearing"``, what a normal ear perceives of it (the default otherwise).
+            ``"coherent-bands"`` and ``"bands"`` always compare with a normal ear, and scores and
+            ``"interaural"`` with clean speech as it is. Except for ``"bands"``, which has no phase,
+            the reference gets the phase of MSBG's filter bank for the severity of the ear
+            (``hlsim.msbg.response``), unless ``normal`` is passed or the simulator does not emulate
+            MSBG. Without this phase, speech of the opposite sign could have a lower loss.
         criterion: Criterion, as listed above.
         weights: Weight under the name of each part of ``parts``; other parts are ignored.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"`` for one value
@@ -118,15 +118,16 @@ class HearingLossLoss(nn.Module):
         normal: Normal ear that belongs to the simulator: a module, which is frozen too, or a
             function, (..., time) -> (..., time). By default, it is the filter of MSBG's normal ear
             for a simulator that emulates MSBG, and the simulator itself at 0 dB HL otherwise, and
-            for ``"bands"``. Changes that the
-            simulator makes for every ear, such as a low-pass, then apply to the reference, too. A
-            network that emulates another teacher needs the normal ear of that teacher.
+            for ``"bands"`` and ``"paper"``. With the simulator itself, changes that it makes for
+            every ear, such as a low-pass, apply to the reference, too. A network that emulates
+            another teacher needs the normal ear of that teacher.
         ears: Reduction of two ears, (..., 2, time): ``"mean"``, or ``"better"`` for a smooth choice
             of the better ear. Each ear then counts by its share, ``softmax(-loss / 0.1)`` over
             both. The shares carry no gradient, so that no ear is made worse.
         checkpoint: Compute the activations of the simulator again in the backward pass instead of
-            storing them, which takes less memory. Value and gradient are the same. A module of your
-            own gets the attribute ``checkpoint = True``, and decides itself what it does not store.
+            storing them, which takes less memory and more time. Value and gradient are the same. A
+            module of your own gets the attribute ``checkpoint = True``; what it then stores is up
+            to its code.
 
     Raises:
         ValueError: A name is unknown, a value has another type or is out of range, or the simulator
@@ -203,7 +204,7 @@ class HearingLossLoss(nn.Module):
 
         Raises:
             ValueError: There is no audiogram, or one of two ears is missing; shapes do not fit,
-                levels are outside -10 to 100 dB HL, lengths are outside 1 to time, a simulator,
+                thresholds are outside -10 to 100 dB HL, lengths are outside 1 to time, a simulator,
                 normal ear or criterion returns another shape than it should, or, with ``"haspi"``
                 or ``"hasqi"``, an item is shorter than 0.7 s.
         """
@@ -284,11 +285,12 @@ class HearingLossLoss(nn.Module):
         audiogram: AudiogramLike | None,
         lengths: Lengths | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Validate the arguments of a call.
+        """Validate the arguments of a call, see ``forward`` for them and for errors.
 
         Returns:
-            The output and the clean speech, silent after the end of each item; thresholds in dB HL;
-            and the number of samples of each item, or None if all are as long as the batch.
+            The output and the clean speech, silent after the end of each item, (..., time) each;
+            thresholds in dB HL, (..., 8); and the number of samples of each item, (...), or None if
+            all are as long as the batch.
         """
         check_waveform(output, "output", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
@@ -343,7 +345,7 @@ class HearingLossLoss(nn.Module):
         gain = gain_to_pascals(self.full_scale_spl)
 
         def as_items(waveform: Tensor) -> Tensor:
-            """Return a waveform in pascals, (items, time)."""
+            """Return a waveform in pascals with one row per item, (items, time)."""
             return waveform.expand_as(perceived).reshape(-1, time) * gain
 
         ends = torch.tensor(time) if lengths is None else lengths
@@ -365,7 +367,10 @@ class HearingLossLoss(nn.Module):
         return {name: part.reshape(batch) for name, part in parts.items()}
 
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move modules that are not registered along with the loss, but not to half precision."""
+        """Apply ``function``, such as that of ``.to()``, to modules that are not registered, too.
+
+        They move to other devices and to float64, but not to half precision.
+        """
 
         def move(tensor: Tensor) -> Tensor:
             # The function may drop the values, as ``to_empty`` does: no state dict restores those

@@ -1,15 +1,15 @@
 """The criterion ``"paper"``: the training losses of the Neuro-MSBG paper, Equations 2 to 9.
 
-They compare an estimate with its target. Simulators are trained by them. As the criterion of a
-compensator in ``HearingLossLoss`` they have faults:
+They compare an estimate with its target. In the paper, they train simulators. As the criterion of
+an aid in ``HearingLossLoss``, they have faults:
 
 - They are not balanced. The gradient on eight band gains that start at 0 dB is 6.9e-3 for N1,
   2.0e-3 for N3 and 3.5e-6 for N5, and 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for
   mild ears and loud speech. The weights come from a paper that scales its speech to unit power,
   which would balance the levels of the speech, but not the ears.
 - Of their value, 0.70 of 0.87 is phase, whose gradient is faded out in faint bins: value and
-  gradient disagree, and Adam on a free waveform raises the value. Speech with inverted polarity
-  (1.36) costs more than noise at -5 dB SNR (1.34).
+  gradient disagree, and when Adam optimises the samples of a waveform, the value rises. Speech with
+  inverted polarity (1.36) costs more than noise at -5 dB SNR (1.34).
 - Their rank correlations with HASPI and HASQI over 17 degradations are .50 and .70. A filter bank
   trained by them from zero is worse than the prescription NAL-R (HASPI .877, .950), and learns no
   compression.
@@ -25,7 +25,7 @@ from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
 
 PAPER_STFT = STFT(400, 400, 100)
-"""The paper's transform at 16 kHz: 201 frequencies."""
+"""The paper's short-time Fourier transform at 16 kHz: 201 frequencies, every 100 samples."""
 
 DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
 """Weights of MP-SENet (Lu, Ai and Ling 2023), on which the paper builds.
@@ -82,7 +82,7 @@ def anti_wrap(angle: Tensor) -> Tensor:
 
 
 def paper_parts(estimate: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """Compute the paper's four losses of waveforms at 16 kHz.
+    """Compute the paper's four losses of waveforms at 16 kHz, in pascals.
 
     They are the mean squared difference of the magnitudes of spectra (Equation 2), the error of
     their phase (``phase_loss``), twice the mean squared difference of their real and imaginary
@@ -90,7 +90,7 @@ def paper_parts(estimate: Tensor, target: Tensor) -> dict[str, Tensor]:
 
     Args:
         estimate: Waveforms to judge, (items, time).
-        target: Waveforms that they should equal, (items, time).
+        target: Waveforms that the estimate should equal, (items, time).
 
     Returns:
         ``magnitude``, ``phase``, ``complex`` and ``time`` of each item, (items,) each.
@@ -146,7 +146,8 @@ class _FadedPhaseDifference(torch.autograd.Function):
 def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:
     """Return the real and the imaginary part of spectra.
 
-    Near silence, where the angle is rounding, a small positive number replaces the real part.
+    Near silence, where rounding decides the angle, a small positive number replaces the real part.
+    Shape: complex (...) -> (...), (...).
     """
     # Contiguous, because torch takes twenty times as long with interleaved numbers.
     real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
@@ -155,12 +156,12 @@ def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _times_i(spectrum: Tensor, factor: Tensor) -> Tensor:
-    """Multiply a spectrum by i and by real numbers."""
+    """Multiply a complex spectrum by i and by real factors, element by element."""
     return torch.complex(-spectrum.imag * factor, spectrum.real * factor)
 
 
 def _fade_weight(spectrum: Tensor, other: Tensor) -> Tensor:
-    """Compute the faded 1 / |z|^2 of a spectrum z, faded by the level of the other one, too."""
+    """Compute 1 / |z|^2 of a spectrum z, faded out where it or the other spectrum is faint."""
     # 1 / |z|^2, times |z|^2 / (|z|^2 + faint), times the same factor of the other spectrum
     level = power(other)
     return level / ((level + FAINT_POWER) * (power(spectrum) + FAINT_POWER))

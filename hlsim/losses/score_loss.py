@@ -1,4 +1,4 @@
-"""HASPI and HASQI as losses, for training batches that may hold silence and clicks."""
+"""HASPI and HASQI as losses, for training batches that may contain silence and clicks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ def score_loss(
         Loss of each item, 0 to 1. Shape: (items,).
 
     Raises:
-        ValueError: An item is shorter than 0.7 s.
+        ValueError: An item is shorter than 0.7 s, or an argument is not valid; the message has the
+            index of the item.
 
     >>> speech = torch.randn(1, 16000)
     >>> loss = score_loss("haspi", speech, speech, torch.zeros(1, 8), [16000], 16000)

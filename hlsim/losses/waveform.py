@@ -35,7 +35,7 @@ def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def log_spectral_distance_db(estimate: Tensor, target: Tensor) -> Tensor:
-    """Compute the mean absolute difference between two spectrograms in dB.
+    """Compute the mean absolute difference between the levels of two spectrograms, in dB.
 
     The spectrograms are those of the Neuro-MSBG paper: 201 frequencies every 6.25 ms at 16 kHz. A
     millionth of the strongest power in the item's target is added to all powers, so that
@@ -59,13 +59,15 @@ def log_spectral_distance_db(estimate: Tensor, target: Tensor) -> Tensor:
 def band_level_distance_db(estimate: Tensor, target: Tensor, signal: Tensor) -> Tensor:
     """Compute the mean absolute difference of band levels in dB, where the input is audible.
 
-    All audible bands and frames count the same, however softly they are perceived.
+    The weight of a band in a frame is the audibility of the input for a normal ear: 0 up to the
+    threshold of audibility, and 1 from 20 dB above it. How softly the ear perceives the band does
+    not change its weight.
 
     Shape: (items, time) three times, in pascals at 16 kHz -> (items,).
 
     Args:
         estimate: Output of the network.
-        target: Output of the simulator.
+        target: Output of the simulator from which the network learns.
         signal: Input of both.
 
     >>> speech = torch.randn(1, 16000)
