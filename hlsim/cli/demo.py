@@ -1,4 +1,4 @@
-"""The command ``demo``."""
+"""The command ``demo``, which trains an aid for one ear and writes a page about it."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from hlsim.training.recipes import CompensatorRecipe
 
 
 class DurationEstimate(Callback):
-    """Callback that prints the expected duration of the demo, from the pace of the first steps.
+    """Callback that prints the expected duration of the demo, from the pace of steps 10 to 60.
 
     >>> DurationEstimate().last_step
     60
@@ -48,12 +48,12 @@ def run_demo(out: str | Path, audiogram: Audiogram, *, steps: int = 3000, **runn
 
     Args:
         out: Folder of the page and of the training.
-        audiogram: The ear.
+        audiogram: Audiogram of the ear.
         steps: Number of training steps.
         running: Arguments ``jobs`` and ``progress`` of ``run_study``.
 
     Returns:
-        Verdict, table and address of the page, for a terminal.
+        Text for a terminal: the verdict, the table of results, and the address of the page.
     """
     ear = f"{ear_name(audiogram)} (pure-tone average {audiogram.pta:.0f} dB HL)"
     print(f"Training an aid for the ear {ear}, {steps} steps")

@@ -31,7 +31,7 @@ STORE = "scores.jsonl"
 """Name of the file of scores in the folder of the results."""
 
 _PLAYED_ITEMS = 3
-"""Number of items that a page plays."""
+"""Number of items whose sounds a page plays."""
 
 _CHECKPOINTS = "by name or folder; LABEL=FOLDER sets the name in the tables to LABEL"
 """End of the help text of arguments that name checkpoints."""
@@ -243,9 +243,10 @@ def _clarity(options: argparse.Namespace) -> None:
 
 
 def _read_labels(texts: Sequence[str]) -> dict[str, str]:
-    """Return names or folders by their label in tables, from texts NAME or LABEL=NAME.
+    """Parse texts NAME or LABEL=NAME, and return the names or folders by their label in tables.
 
-    A folder that exists, such as ``runs/lr=0.1``, has no label.
+    Without LABEL, the name is the label. The path of an existing file or folder that contains
+    ``=``, such as ``runs/lr=0.1``, is a name.
 
     Raises:
         ValueError: Two names have the same label.
@@ -263,10 +264,10 @@ def _read_labels(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _named_folder(text: str) -> tuple[str, Path]:
-    """Convert NAME=FOLDER to the name and the folder.
+    """Convert the text NAME=FOLDER to the name and the folder.
 
     Raises:
-        argparse.ArgumentTypeError: The text has no ``=``.
+        argparse.ArgumentTypeError: The text has another form, or the folder does not exist.
     """
     name, _, folder = text.partition("=")
     if not name or not folder:
@@ -275,10 +276,14 @@ def _named_folder(text: str) -> tuple[str, Path]:
 
 
 def _by_name(named_folders: Sequence[tuple[str, Path]], option: str) -> dict[str, Path]:
-    """Return folders by their names, which must differ.
+    """Return a dict of named folders.
+
+    Args:
+        named_folders: Name and folder of each.
+        option: Name of the option that they come from, for the message.
 
     Raises:
-        ValueError: Two of them have the same name.
+        ValueError: Two folders have the same name.
     """
     folders = dict(named_folders)
     if len(folders) < len(named_folders):
@@ -308,7 +313,7 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
 
 
 def _declare_precision(parser: Parser) -> None:
-    """Declare ``--precision`` of the scores for an ear."""
+    """Declare ``--precision``, the number of bits for HASPI, HASQI and HAAQI."""
     text = (
         "bits of the numbers with which HASPI, HASQI and HAAQI are computed, 32 or 64; with 64 "
         "they are those of pyclarity, in twice the time"
@@ -340,13 +345,15 @@ def _run_study(
 ) -> None:
     """Run an evaluation, write its page, and print its verdict and its first table.
 
+    If scores are missing, their number and the first reason are printed to stderr.
+
     Args:
-        options: Options of the command. Each is passed under its name, except the names of aids or
-            simulators, the folder of the results, and further measures, which join the others.
-        evaluate: Function that returns the evaluation.
-        make_page: Function that returns its page.
-        notes: Sentences with which the page begins.
-        changes: Arguments that replace options, and further ones.
+        options: Options of the command. Each becomes an argument of ``evaluate`` under its name,
+            except ``names`` and ``out``; measures of ``--measure`` are appended to ``measures``.
+        evaluate: Function that runs the study and returns its evaluation.
+        make_page: Function from the evaluation to its page.
+        notes: Sentences with which the page begins, before those of the evaluation.
+        changes: Arguments of ``evaluate`` that replace options or are added to them.
     """
     from hlsim.report.writing import write_results
 

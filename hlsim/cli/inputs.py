@@ -1,6 +1,6 @@
-"""Conversion of options into ears, listeners and compensators, for several commands.
+"""Conversion of options into ears, listeners, simulators and compensators, for several commands.
 
-Functions import what needs torch only when they are called.
+Modules that need torch are imported in the functions, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ PACKAGES = {
 
 
 def use_one_thread() -> None:
-    """Let a command that has not imported torch run it in one thread, unless a user chose a number.
+    """Make torch, which is not imported yet, compute in one thread.
 
-    On a busy machine, threads wait for each other for longer than their short computations last.
+    It has no effect if the user has set OMP_NUM_THREADS. On a busy machine, threads wait for each
+    other for longer than their short computations last.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def check_extras(*extras: str) -> None:
-    """Raise MissingExtraError unless extras of hlsim, such as ``"eval"``, are installed.
+    """Raise MissingExtraError unless the packages of extras, such as ``"eval"``, are installed.
 
-    So a command does not work for hours before it needs the package that is missing.
+    Otherwise, a command could fail after hours of work, when it first needs a missing package.
     """
     for extra in extras:
         for package in PACKAGES[extra]:
@@ -45,7 +46,7 @@ def check_extras(*extras: str) -> None:
 
 
 def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
-    """Return the ear of ``--audiogram``, or both ears of the listener that ``--listener`` names.
+    """Return the ear of ``--audiogram``, or the listener with two ears that ``--listener`` names.
 
     Args:
         options: Parsed options of a command.
@@ -64,14 +65,17 @@ def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
 
 
 def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
-    """Return the ears of a repeated ``--audiogram`` by their names, or the one of ``--listener``.
+    """Return the ears of a repeated ``--audiogram``, or the listener of ``--listener``.
 
-    The name of a standard ear is its own. That of others consists of the levels, such as
-    "10-20-30-40-50-60-70-80" or "500_30-4000_60". A compensator that was trained for one other ear
-    causes a warning.
+    Prints a warning if the compensator of the options was trained for another ear.
 
     Args:
         options: Parsed options of a command.
+
+    Returns:
+        Ears by their names. A standard ear has its own name, and any other ear one that consists
+        of its levels, such as "10-20-30-40-50-60-70-80" or "500_30-4000_60". A listener has the
+        name "listener".
 
     Raises:
         ValueError: There is no such file or listener, an audiogram is not valid, or two have the
@@ -99,7 +103,7 @@ def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
 
 
 def _read_listener(text: str) -> Listener:
-    """Read the value of ``--listener``: FILE, which has exactly one listener, or FILE:NAME.
+    """Read the listener of ``--listener``: that of FILE, if it has only one, or of FILE:NAME.
 
     Raises:
         ValueError: NAME is missing although the file has several listeners, the listener lacks an
@@ -133,7 +137,7 @@ def warn_of_other_ears(
 
     Args:
         checkpoints: Names or folders of compensators, by the name to use in the warning.
-        ears: Ear or listener who uses them; None stands for several ears.
+        ears: Ear or listener for whom they are used; None if there are several ears.
 
     Returns:
         The warnings.
@@ -152,7 +156,15 @@ def warn_of_other_ears(
 
 
 def build_simulator(options: argparse.Namespace, sample_rate: int) -> Any:
-    """Load the simulator that ``--simulator`` names, for signals at a sample rate in Hz."""
+    """Load the simulator that ``--simulator`` names.
+
+    Args:
+        options: Options of the command.
+        sample_rate: Sample rate in Hz of the signals to process.
+
+    Raises:
+        ValueError: There is no such simulator, or the sample rate is out of range.
+    """
     from hlsim.simulators import load_simulator
 
     return load_simulator(
@@ -187,6 +199,6 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
-    """Return ``noise_reduction`` and ``amplification``, if a user has set them, by name."""
+    """Return those of ``noise_reduction`` and ``amplification`` that a user has set, by name."""
     values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}
     return {name: value for name, value in values.items() if value is not None}

@@ -94,13 +94,16 @@ def _listen(options: argparse.Namespace) -> None:
 
 
 def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> Section:
-    """Return the section of a file, with its player.
+    """Return the section of the page for one audio file, with its player.
 
     Args:
         options: Options of the command.
         file: Audio file.
-        make_sounds: Function from samples at the scale of the file and their rate in Hz to the
-            sounds by their labels.
+        make_sounds: Function from samples (channels, time), at the scale of
+            ``options.full_scale_spl``, and their rate in Hz to a dict from label to sound.
+
+    Raises:
+        ValueError: The file cannot be read or processed; the message names it.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""The command ``live``, from microphone to headphones."""
+"""The command ``live``, which runs an aid or a simulator from microphone to headphones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def live(parser: Parser) -> None:
 
 
 def _read_device(text: str) -> int | str:
-    """Return the number of a device, or a part of its name."""
+    """Convert a text of digits to the number of a device; return any other text, part of a name."""
     return int(text) if text.isdecimal() else text
 
 

@@ -28,11 +28,11 @@ _HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which MSBG works at 22.05 kHz."""
 
 _BLOCK_SECONDS = 8.0
-"""Duration of the output of a block, and of a part that is only read."""
+"""Duration in seconds of the output of a block, and of the parts that ``read_all`` yields."""
 
 
 class Meter:
-    """Mean square and peak of a signal that passes part by part.
+    """Mean square and peak of a signal, measured while its parts pass through ``measure``.
 
     Attributes:
         power: Mean square of all samples of all channels.
@@ -54,7 +54,7 @@ class Meter:
     def measure(
         self, parts: Iterable[Tensor], samples: int, show: Callable[[float], None]
     ) -> Iterator[Tensor]:
-        """Yield all parts unchanged.
+        """Yield all parts unchanged, and update ``power`` and ``peak``.
 
         Args:
             parts: Parts of the signal, (channels, time).
@@ -76,16 +76,16 @@ def process_recording(
 ) -> Iterator[Tensor]:
     """Yield the output of a simulator or an aid for a recording, one part after the other.
 
-    The parts together are the output for the whole recording: by simulators at 16 kHz bit by bit,
-    by MSBG above 20 kHz to 5e-4 of the peak (in frames that smearing leaves nearly empty, which
-    depend on the last bits), otherwise to 2e-5. The memory does not depend on the
-    length, except for simulators of your own and networks with layers other than convolutions,
-    whose output at any time depends on the whole recording.
+    The parts together are the output for the whole recording: for simulators at 16 kHz bit by bit,
+    for MSBG above 20 kHz to 5e-4 of the peak (in frames that smearing leaves nearly empty, which
+    depend on the last bits), otherwise to 2e-5. The memory does not depend on the length, except
+    for simulators of your own and networks with layers other than convolutions, whose output at any
+    time depends on the whole recording.
 
     Args:
         model: Simulator or aid at the sample rate of the recording.
-        recording: AudioInfo from ``scan_audio``.
-        gain: Factor on the input, by which the output is divided.
+        recording: Description of the file, from ``scan_audio``.
+        gain: Factor by which the input is multiplied, and the output divided again.
         ears: Audiogram, or listener for a stereo recording.
         sliders: Further arguments of an aid, each under its name.
 
@@ -110,7 +110,10 @@ def process_recording(
 
 
 def _process_all(model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]) -> Tensor:
-    """Return the output of a model, (channels, time)."""
+    """Return the output of a model for all channels at once.
+
+    Shape: (channels, time) -> (channels, time).
+    """
     output: Tensor = model(part, ears, **sliders)
     return output
 
@@ -118,7 +121,7 @@ def _process_all(model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, f
 def _process_channels(
     model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]
 ) -> Tensor:
-    """Return the output of a model, channel by channel, as models process long signals themselves.
+    """Return the output of a model, channel by channel, as a model itself processes long signals.
 
     Shape: (channels, time) -> (channels, time).
     """
@@ -133,7 +136,7 @@ def _process_channels(
 
 
 def read_all(recording: AudioInfo) -> Iterator[Tensor]:
-    """Yield consecutive parts of a recording, (channels, time)."""
+    """Yield consecutive parts of a recording, (channels, time), of about 8 s each."""
     hop = round(_BLOCK_SECONDS * recording.sample_rate)
     blocks = split_into_blocks(recording.samples, hop, 0, 0)
     return read_parts(recording, [(block.input_start, block.input_stop) for block in blocks])
@@ -145,11 +148,11 @@ def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
     Args:
         model: ``MSBG``, ``Attenuation``, ``NALR`` or a network of ``cnn`` blocks; for any other,
             the recording is one block.
-        samples: Length of the recording.
+        samples: Length of the recording in samples.
         rate: Sample rate in Hz.
 
     Returns:
-        Blocks with bounds in samples, each with about 8 s of output (4 s for MSBG above 22.05 kHz).
+        Blocks with bounds in samples, each with about 8 s of output (4 s for MSBG above 20 kHz).
 
     >>> [block.output_start for block in divide_recording(NALR(), 320000, 16000)]
     [0, 128000]

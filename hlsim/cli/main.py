@@ -44,13 +44,13 @@ GROUPS = {
         "train-compensator": ("training", "train a hearing aid through a frozen simulator"),
     },
 }
-"""Module in ``hlsim.cli`` and description of each command, by group.
+"""Commands by group, each with its module in ``hlsim.cli`` and its description.
 
 The module has a function of the command's name that declares the options.
 """
 
 COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
-"""Module and description of each command."""
+"""Module and description of each command, by its name."""
 
 TRACEBACK_VARIABLE = "HLSIM_TRACEBACK"
 """Environment variable that, unless empty, adds the traceback to the message of an error."""
@@ -68,6 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         Exit status: 0 after success, 2 after an error, and 130 after Ctrl-C.
+
+    Raises:
+        SystemExit: Help was printed (status 0), or the command or an option is not valid (2).
     """
     # NumPy solves only small systems here, for which threads of OpenBLAS wait longer than they
     # compute.
@@ -113,7 +116,8 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         arguments: Command and options. Without any, the help is printed.
 
     Returns:
-        Values of the options, and the function ``run`` of them that runs the command.
+        Values of the options as attributes; the attribute ``run`` is the function that runs the
+        command with them.
 
     Raises:
         SystemExit: Help was printed, or the command or an option is not valid.
@@ -142,7 +146,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def make_parser(command: str) -> Parser:
-    """Make the parser of a command, after importing the module that declares its options.
+    """Make the parser of a command, such as ``prepare``, and declare its options.
 
     >>> make_parser("prepare").prog
     'hlsim prepare'

@@ -1,6 +1,6 @@
-"""Live processing from microphone to headphones: the function per block, and the loop around it.
+"""Live processing from microphone to headphones: a function for each block, and its loop.
 
-A *stream* is a function from a block of samples to its output, which remembers what it needs of
+A *stream* is a function from a block of samples to its output, which stores what it needs of
 earlier blocks: a ``compensators.wearable.Stream`` or a ``hlsim.neuro.stream.SimulatedStream``.
 """
 
@@ -37,14 +37,14 @@ class Live:
 
     Args:
         stream: Function from a block to its output, both with shape (time,) for one ear or
-            (2, time) for two. If it has attributes ``noise_reduction`` and ``amplification``, keys
-            of the keyboard change them while it runs.
+            (2, time) for two. If it has an attribute ``sliders`` and a method ``set``, as the
+            stream of an aid, keys of the keyboard move its sliders.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, at microphone and headphones.
         ears: Number of ears, 1 or 2. If there are two microphones, each ear has its own.
         latency: Delay of the stream's output in samples, which is displayed.
 
     Attributes:
-        drop_outs: Number of lost blocks.
+        drop_outs: Number of blocks of which samples were lost, and of restarts of the devices.
         error: Message of an exception in the stream; empty if there was none.
 
     >>> from compensators import WDRC
@@ -69,11 +69,11 @@ class Live:
         self._blocks: list[Tensor] = []
 
     def __call__(self, recorded: Any, played: Any, frames: int, clock: Any, status: Any) -> None:
-        """Process a block, as sounddevice calls it.
+        """Process a block; sounddevice calls this method with its arguments.
 
         Args:
-            recorded: Array (frames, microphones), the input.
-            played: Array (frames, channels), which receives the output.
+            recorded: Input from the microphones, an array (frames, microphones).
+            played: Array (frames, channels) into which the output is written, limited to -1 to 1.
             frames: Number of samples per channel.
             clock: Times of the block, which are not used.
             status: Flags of lost samples.
@@ -93,7 +93,7 @@ class Live:
 
     @property
     def _sliders(self) -> dict[str, float]:
-        """Values of the stream's sliders by their names; a simulator has none."""
+        """Values of the stream's sliders by their names, empty for a simulator."""
         return getattr(self.stream, "sliders", {})
 
     def press(self, key: str) -> None:
@@ -146,7 +146,7 @@ def play(
 
     Args:
         live: Function that processes the blocks.
-        devices: Microphone and headphones, by number or part of their names. None stands for the
+        devices: Microphone and headphones, by number or part of their names; None for the default
             device of the system.
         block: Number of samples per block at 16 kHz.
         buffer: Length of the buffer of each device in seconds. Longer ones prevent drop-outs.
@@ -198,7 +198,16 @@ def play(
 
 
 def _show_status(live: Live, audio: Any, read_key: Callable[[float], str], end: float) -> None:
-    """Show a status line five times per second, or once per second outside a terminal."""
+    """Show a status line and move sliders by keys, until ``q``, an error or the end of the time.
+
+    The line is shown five times per second, or once per second outside a terminal.
+
+    Args:
+        live: Function that processes the blocks.
+        audio: Running stream of sounddevice, which is restarted if it has stopped.
+        read_key: Function from ``_key_reader``.
+        end: Time of ``time.monotonic`` at which to stop.
+    """
     interval = 0.2 if sys.stdout.isatty() else 1.0
     key = ""
     while key != "q" and not live.error and time.monotonic() < end:
@@ -213,9 +222,9 @@ def _show_status(live: Live, audio: Any, read_key: Callable[[float], str], end: 
 
 @contextmanager
 def _key_reader() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits for a key for up to some seconds.
+    """Yield a function that waits for a key for at most a number of seconds, and returns the key.
 
-    The function returns the key. If none was pressed, or stdin is no terminal, it returns "".
+    It returns an empty text if no key was pressed or stdin is no terminal.
     """
 
     try:
@@ -240,6 +249,6 @@ def _key_reader() -> Iterator[Callable[[float], str]]:
 
 
 def _wait(seconds: float) -> str:
-    """Wait for some seconds, and return that no key was pressed."""
+    """Wait for a number of seconds, and return an empty text: no key was pressed."""
     time.sleep(seconds)
     return ""

@@ -39,8 +39,8 @@ class Parser(argparse.ArgumentParser):
         settings: Arguments of ``argparse.ArgumentParser``.
 
     Attributes:
-        prefix: Beginning of the names of options that are accepted without being declared. They
-            are appended, with their values, to the list ``settings`` of the parsed options.
+        prefix: Beginning of the names of options that are accepted without being declared, or None.
+            They are appended, with their values, to the list ``settings`` of the parsed options.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -54,8 +54,8 @@ class Parser(argparse.ArgumentParser):
         """Set the function that runs the command, and the examples in the help.
 
         Args:
-            run: Function of the parsed options.
-            examples: Options of each example, without the name of the command.
+            run: Function that is called with the parsed options.
+            examples: Arguments and options of each example, without the name of the command.
         """
         self.set_defaults(run=run)
         self._examples = examples
@@ -114,7 +114,7 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
-        """Declare an option without a value, which is True if a user gives it and otherwise False.
+        """Declare an option without a value, which is True if a user passes it, else False.
 
         Args:
             name: Name, such as ``--linked``.
@@ -124,7 +124,7 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, action="store_true", help=text)
 
     def teacher(self, text: str) -> None:
-        """Declare ``--teacher``, a simulator with which others are compared or which they learn.
+        """Declare ``--teacher``, the simulator whose output others should match.
 
         Args:
             text: Beginning of the help text.
@@ -191,7 +191,7 @@ class Parser(argparse.ArgumentParser):
         self.listener("both ears, for stereo files, left first", group=group)
 
     def simulator(self, default: str) -> None:
-        """Declare ``--simulator``, the simulator of what an ear perceives."""
+        """Declare ``--simulator``, the simulator of hearing loss, with its default."""
         text = (
             "msbg (exact), msbg-unsmeared, attenuation (a linear ear), a checkpoint's name or "
             "folder, or a simulator of your own, package.module:name or file.py:name"
@@ -213,7 +213,7 @@ class Parser(argparse.ArgumentParser):
         self.option("--spl", sound_level, f"level in dB SPL of {signal}", group=group)
 
     def linked(self, condition: str) -> None:
-        """Declare ``--linked``, which gives both ears the same gains.
+        """Declare ``--linked``, with which one level sets the gains of both ears.
 
         Args:
             condition: Beginning of the restriction in the help text, such as "stereo files; ".
@@ -222,10 +222,10 @@ class Parser(argparse.ArgumentParser):
         self.flag("--linked", text)
 
     def enhancers(self, waveforms: str) -> None:
-        """Declare ``--enhancer``, noise reductions of the user.
+        """Declare ``--enhancer``, functions of the user that reduce noise.
 
         Args:
-            waveforms: Shape and unit of their input and output, for the help text.
+            waveforms: Shape and unit of the functions' input and output, for the help text.
         """
         text = (
             "noise reduction of your own before each aid, package.module:name or "
@@ -273,8 +273,9 @@ def ear(text: str) -> str | list[float] | dict[float, float]:
     Args:
         text: A name, levels, or frequencies with levels.
 
-    Returns: The name, a list of levels in dB HL at the audiometric frequencies, or a dictionary
-    from frequencies in Hz to levels in dB HL.
+    Returns:
+        The name; a list of levels in dB HL at the eight audiometric frequencies; or a dict from
+        frequency in Hz to level in dB HL.
 
     Raises:
         argparse.ArgumentTypeError: A frequency occurs twice, or a level is not a number.

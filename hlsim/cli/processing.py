@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hlsim.audiogram.listener import Listener
 
 PLAYED_PEAK = 0.9
-"""Peak of an output that ``--no-clipping`` makes softer, where 1.0 is full scale."""
+"""Peak to which ``--no-clipping`` scales an output that exceeds full scale, 1.0."""
 
 
 def simulate(parser: Parser) -> None:
@@ -67,7 +67,7 @@ def _declare_files(
 
     Args:
         parser: Parser of the command.
-        run: Function of the parsed options.
+        run: Function that is called with the parsed options.
         examples: Options of each example in the help.
         ears: Names of the standard ears that the command accepts, for the help text.
     """
@@ -96,7 +96,7 @@ def _compensate(options: argparse.Namespace) -> None:
 def _process(
     options: argparse.Namespace, build_model: Callable[[argparse.Namespace, int], Any]
 ) -> None:
-    """Process the file or each file of the folder for each ear, and print a line per output.
+    """Process one file, or each file of a folder, for each ear, and print one line per output.
 
     A file of a folder that fails causes a warning, and the others are processed.
 
@@ -146,7 +146,7 @@ def _process_file(
     sliders: dict[str, float],
     show: Callable[[float], None],
 ) -> str:
-    """Process one file block by block, write the output, and return a line with its level.
+    """Process one file block by block, write the output, and return a line with both levels.
 
     Args:
         options: Options of the command.
@@ -156,6 +156,9 @@ def _process_file(
         build: Function from a sample rate in Hz to a simulator or compensator.
         sliders: Further arguments of the simulator or compensator, each under its name.
         show: Function that shows the finished share of the output, 0 to 1.
+
+    Raises:
+        ValueError: The file cannot be read, processed or written.
     """
     import torch
 
@@ -192,13 +195,13 @@ def _process_file(
 def _plan_outputs(source: Path, target: Path, names: Sequence[str]) -> list[tuple[Path, Path, str]]:
     """Return, for each output, the file to read, the file to write and the name of the ear.
 
+    Outputs of a folder keep their subfolders, and end in .wav. If there are several ears, the name
+    of each output ends with that of its ear.
+
     Args:
         source: File, or folder of files, to read.
         target: File to write, or folder for the files to write.
-        names: Names of the ears. If there are several, the name of each output ends with that of
-            its ear.
-
-    Outputs of a folder keep their subfolders, and end in .wav.
+        names: Names of the ears.
 
     Raises:
         ValueError: The target is a folder and the source is a file, one of two folders contains the

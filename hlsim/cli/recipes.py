@@ -60,7 +60,8 @@ def describe_settings(recipe: type[TrainingRecipe]) -> dict[str, str]:
         recipe: Class of the recipe.
 
     Returns:
-        Sentences without a full stop, by the name of the setting.
+        Sentences by the name of the setting, with a small first letter and without full stop and
+        backticks.
     """
     descriptions: dict[str, str] = {}
     for kind in reversed(recipe.mro()[:-1]):
@@ -82,7 +83,7 @@ def format_default(setting: Field[Any]) -> str:
 
 
 def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]) -> Recipe:
-    """Make a recipe of a file and of settings, which override those of the file.
+    """Build a recipe from a file and from settings, which override those of the file.
 
     Args:
         recipe: Class of the recipe.

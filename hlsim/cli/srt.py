@@ -78,6 +78,11 @@ def _srt(options: argparse.Namespace) -> None:
 
 
 def _format_estimate(estimate: Any, number: int) -> str:
-    """Return an estimate of one of several ears with its 95 % interval."""
+    """Return a text with the estimate for one of several ears, in dB, and its 95 % interval.
+
+    Args:
+        estimate: ``Estimate`` with one value per ear.
+        number: Index of the ear.
+    """
     value, low, high = (values[number] for values in estimate)
     return f"{value:.1f} dB [{low:.1f}, {high:.1f}]"

@@ -97,7 +97,9 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
 
 def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keyword arguments that both training functions have.
+    """Return the keyword arguments of ``train_simulator`` and ``train_compensator`` as a dict.
+
+    They are the data and the settings that both functions have.
 
     Raises:
         ValueError: There is a root without a manifest.

@@ -23,8 +23,8 @@ perceives, and ``R`` those of what a normal ear perceives. Each band and segment
   threshold of audibility: too much gain, and noise in pauses.
 
 The first three are weighted by the audibility of the reference, ``P / (P + threshold)`` of its
-power ``P``, and ``louder`` by that of the perceived signal. It is above 0 wherever there is power,
-and so small in faint bands that they do not dominate the gradient.
+power ``P``, and ``louder`` by that of the perceived signal. A weight is above 0 wherever there is
+power, and so small in faint bands that they do not dominate the gradient.
 """
 
 import numpy as np

@@ -1,1 +1,1 @@
-"""Commands around the gains of a fitted aid."""
+"""Commands about the gains of an aid that is fitted to an ear."""
