@@ -46,7 +46,7 @@ SIMULATORS: dict[str, Callable[[], nn.Module]] = {
     "MSBG": MSBG,
     "MSBG without smearing": lambda: MSBG(smearing=False),
     "linear ear": Attenuation,
-    "neuro-msbg-cnn-narrow": lambda: load_pretrained("neuro-msbg-cnn-narrow"),
+    "neuro-msbg": lambda: load_pretrained("neuro-msbg"),
 }
 
 THREE_EARS = ("MSBG", "MSBG without smearing", "linear ear")
@@ -239,8 +239,14 @@ def compare_recruitment(path: Path, out: Path) -> None:
             row["not reached"] = f"{(part.ucl >= recruitment.NOT_REACHED).mean():.0%}"
             for name in names:
                 row[name] = with_interval(part, lambda p, name=name: bias(p, name), 1)
+            row["MSBG minus line"] = with_interval(
+                part, lambda p: bias(p, "MSBG") - bias(p, "line"), 1
+            )
             table.append(row)
         print_table("UCL minus that of people in dB, even numbers", pd.DataFrame(table))
+
+    difference = (rows["neuro-msbg"] - rows["MSBG"]).abs().median()
+    print(f"Median difference between neuro-msbg and MSBG: {difference:.2f} dB")
 
     draw_recruitment(rows, out / "people-recruitment.png")
 
@@ -384,6 +390,7 @@ def draw_loudness(rows: pd.DataFrame, path: Path) -> None:
 def compare_tuning(path: Path, out: Path) -> None:
     """Compare the tuning depth of simulated ears with that of people."""
     rows = tuning.read_tuning(path)
+    rows["person"] = rows.ear
     stored = out / "simulated-tuning.csv"
     ears, hz = list(rows.audiogram), list(rows.hz)
     simulate(
@@ -407,6 +414,9 @@ def compare_tuning(path: Path, out: Path) -> None:
         row["line on the threshold"] = f"{-part.depth.corr(part.threshold):.2f}"
         for name in names:
             row[name] = correlation(part, name)
+        row["MSBG minus line"] = with_interval(
+            part, lambda p: p.depth.corr(p["MSBG"]) + p.depth.corr(p.threshold)
+        )
         table.append(row)
     print_table("r with the measured tuning depth", pd.DataFrame(table))
 
@@ -416,7 +426,7 @@ def compare_tuning(path: Path, out: Path) -> None:
         row = {
             "threshold (dB SPL)": label,
             "values": len(part),
-            "people": f"{part.depth.mean():.1f}",
+            "people": with_interval(part, lambda p: p.depth.mean(), 1),
         }
         for name in names:
             row[name] = f"{part[name].mean():.1f}"
@@ -491,7 +501,6 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
     simulated = pd.read_csv(path)
 
     rows["mean loss"] = [mean_loss(ear) for ear in rows.audiogram]
-    rows["person"] = rows.ear
     table = []
     for name in ("depth", "MSBG", "MSBG without smearing", "intended smearing"):
         row = {"tuning depth of": "people" if name == "depth" else name}
@@ -501,6 +510,16 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
             row[f"at {limit:g} dB HL"] = "{:.1f} [{:.1f}, {:.1f}]".format(*values)
         table.append(row)
     print_table("Step of the tuning depth at a mean loss, in dB", pd.DataFrame(table))
+
+    table = []
+    for name in ("MSBG", "MSBG without smearing"):
+        curves = [part.set_index("threshold")[name] for _, part in simulated.groupby("hz")]
+        row = {"tuning depth of": name}
+        for limit in SEVERITY_LIMITS:
+            steps = [flat_step(curve, limit) for curve in curves]
+            row[f"at {limit:g} dB HL"] = f"{min(steps):.1f} to {max(steps):.1f}"
+        table.append(row)
+    print_table("Fall at a flat loss beyond the slope, 0.5 to 4 kHz, in dB", pd.DataFrame(table))
 
     figure = Figure(figsize=(9.2, 6.4), layout="constrained")
     places = figure.subplots(2, 2).ravel()
@@ -521,6 +540,20 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
         axes.set(ylim=(-12, 42))
     places[0].legend(fontsize="small", loc="upper right")
     save(figure, out / "people-tuning.png")
+
+
+def flat_step(curve: pd.Series, limit: float) -> float:
+    """Return by how much a curve falls at a limit beyond its mean slope just below and above.
+
+    >>> flat_step(pd.Series({10: 9.0, 14: 8.0, 16: 6.5, 20: 5.5}), limit=15)
+    1.0
+    """
+    below, above = curve[: limit - 0.5][-2:], curve[limit + 0.5 :][:2]
+    falls = [side.iloc[0] - side.iloc[1] for side in (below, above)]
+    spans = [side.index[1] - side.index[0] for side in (below, above)]
+    slope = sum(falls) / sum(spans)
+    fall = below.iloc[1] - above.iloc[0]
+    return float(fall - slope * (above.index[0] - below.index[1]))
 
 
 def mean_loss(ear: Audiogram) -> float:

@@ -5,7 +5,7 @@
 The table has a row per person with audiograms (``left_500``, ..., dB HL) and the threshold of a
 test with digit triplets in noise of 65 dB SPL, free field (``srt_db_snr``). It was made from the
 Oldenburg Hearing Health Record (Jafri et al. 2025, doi 10.5281/zenodo.16919812, CC BY 4.0). Each
-person is tested with the ear of the lower pure-tone average (PTA), behind three simulators.
+person is tested with the ear of the lower pure-tone average (PTA), behind four simulators.
 ``--every 3`` takes every third person in the order of PTA. Tests that OUT.jsonl has are not
 repeated. docs/digits-people.png is the figure.
 
@@ -35,6 +35,7 @@ SIMULATORS = {
     "attenuation": "linear ear",
     "msbg-unsmeared": "MSBG without smearing",
     "msbg": "MSBG",
+    "neuro-msbg": "default network",
 }
 """Names for the tables by simulator."""
 
@@ -188,7 +189,34 @@ def report(tests: dict[str, list[dict]]) -> None:
     print_table("source | slope below the bend | above | bend (dB HL)", slopes)
     head = "ear | PTA (dB HL) | people | bias | median absolute error | RMSE"
     print_table(f"{head} | rank r | rank r of PTA | SD of the ear | SD of people", groups)
+    if len({len(rows) for rows in tests.values() if rows}) == 1:
+        print_differences(labels, tests)
     print_limits(labels, tests)
+
+
+def print_differences(labels: dict[str, str], tests: dict[str, list[dict]]) -> None:
+    """Print how far other predictors of people's thresholds lie from MSBG."""
+    if "msbg" not in labels:
+        return
+    pta, people, msbg = (
+        np.array([row[key] for row in tests["msbg"]]) for key in ("pta", "people", "hlsim")
+    )
+    rows = []
+    for name, label in {**labels, "pta": "PTA"}.items():
+        if name == "msbg":
+            continue
+        values = pta if name == "pta" else np.array([row["hlsim"] for row in tests[name]])
+
+        def difference(i: Array, values: Array = values) -> list[float]:
+            return [
+                spearmanr(values[i], people[i])[0] - spearmanr(msbg[i], people[i])[0],
+                np.corrcoef(values[i], people[i])[0, 1] - np.corrcoef(msbg[i], people[i])[0, 1],
+                np.median(np.abs(values[i] - msbg[i])),
+            ]
+
+        columns = intervals(difference, len(pta))
+        rows.append([label, *columns[:2], "" if name == "pta" else columns[2]])
+    print_table("minus MSBG | rank r | r | median absolute difference (dB)", rows)
 
 
 def print_limits(labels: dict[str, str], tests: dict[str, list[dict]]) -> None:
@@ -248,7 +276,9 @@ def draw(tests: dict[str, list[dict]], everybody: list[Person]) -> None:
         smooth = [
             np.convolve([row[key] for row in rows], window, "valid") for key in ("pta", "hlsim")
         ]
-        axes.plot(smooth[0], smooth[1] + offset, label=label)
+        # The network lies upon MSBG, so its line is dashed.
+        style = {"linestyle": "--", "color": "black"} if name == "neuro-msbg" else {}
+        axes.plot(smooth[0], smooth[1] + offset, label=label, **style)
     axes.set(xlabel="pure-tone average of the better ear (dB HL)", ylabel="threshold (dB SNR)")
     axes.set(title="Digits in noise, unaided", ylim=(-13.0, 16.0))
     axes.legend(fontsize="small")
@@ -271,7 +301,7 @@ def main() -> None:
     path = options.out.with_suffix(".jsonl")
     run_tests(people, options.simulators, options.triplets, options.seed, path)
     names = {person for person, _, _ in people}
-    everything = sorted(read_tests(path), key=lambda row: row["pta"])
+    everything = sorted(read_tests(path), key=lambda row: (row["pta"], row["person"]))
     rows = [row for row in everything if row["seed"] == options.seed and row["person"] in names]
     tests = {name: [row for row in rows if row["simulator"] == name] for name in SIMULATORS}
     report(tests)
