@@ -61,6 +61,13 @@ def test_slopes_of_a_known_full_recruitment_give_it_back() -> None:
     assert abs(people.full_recruitment_of_slopes(rows) - 120.0) < 0.01
 
 
+def test_a_curve_with_a_step_on_a_slope_gives_the_step_back() -> None:
+    people = load_example("people.py")
+    loss = np.array([10, 14, 15, 16, 20])
+    curve = pd.Series(9.0 - 0.25 * loss - 1.5 * (loss > 15), index=loss)
+    assert people.flat_step(curve, limit=15.0) == pytest.approx(1.5)
+
+
 def test_slopes_are_read_with_the_mean_threshold_of_their_frequencies(tmp_path: Path) -> None:
     recruitment = load_example("people_recruitment.py")
     columns = ["left_500", "left_1500", "left_4000", "right_1500", "right_4000"]
