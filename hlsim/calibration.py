@@ -6,6 +6,7 @@ dB SPL of an RMS of 1.0.
 """
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -20,6 +21,9 @@ NEURO_RATE = 16000
 
 LOWEST_SPL, HIGHEST_SPL = -20.0, 140.0
 """Range of levels in dB SPL of recordings: from inaudible to a level that damages ears at once."""
+
+Loudness = float | Mapping[float, float]
+"""Loudness in dB relative to a normal ear, one number or numbers by the level of the input."""
 
 POWER_FLOOR = 1e-20
 """Power of -106 dB SPL in Pa^2, to which lower powers are raised, so that all levels are finite."""
@@ -122,6 +126,56 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
     is_silent = samples.square().mean(-1) <= POWER_FLOOR
     gain = torch.where(is_silent, torch.ones_like(gain_db), 10.0 ** (gain_db / 20.0))
     return (samples * gain.unsqueeze(-1).to(samples.dtype)).to(waveform.dtype)
+
+
+def check_loudness(loudness: Loudness) -> Loudness:
+    """Validate a target of loudness, and return it with ascending levels.
+
+    Args:
+        loudness: Loudness in dB relative to a normal ear, -40 to 20: a number, or a mapping from
+            levels in dB SPL, 0 to 120, to such numbers.
+
+    Raises:
+        ValueError: A number is out of range, or the mapping is empty.
+
+    >>> check_loudness({80: -9, 50: 0})
+    {50.0: 0.0, 80.0: -9.0}
+    """
+    if not isinstance(loudness, Mapping):
+        check_number("loudness", loudness, -40.0, 20.0)
+        return float(loudness)
+    if not loudness:
+        raise ValueError("expected at least one level in loudness, got an empty mapping")
+    for level, value in loudness.items():
+        check_number("a level of loudness", level, 0.0, 120.0)
+        check_number("loudness", value, -40.0, 20.0)
+    return {float(level): float(loudness[level]) for level in sorted(loudness)}
+
+
+def loudness_at(loudness: Loudness, levels: Tensor) -> Tensor:
+    """Return the target of loudness for inputs of some levels.
+
+    A curve is linear between its levels, and constant beyond them.
+
+    Args:
+        loudness: Loudness in dB relative to a normal ear, see ``check_loudness``.
+        levels: Levels of the inputs in dB SPL. Any shape.
+
+    Returns:
+        Loudness in dB relative to a normal ear, in the shape of ``levels``.
+
+    >>> loudness_at({50: 0, 65: -5, 80: -9}, torch.tensor([40.0, 62.0, 90.0]))
+    tensor([ 0., -4., -9.])
+    """
+    if not isinstance(loudness, Mapping):
+        return torch.full_like(levels, loudness)
+    points = levels.new_tensor(list(loudness))
+    values = levels.new_tensor(list(loudness.values()))
+    end = torch.bucketize(levels.detach(), points).clamp(1, max(len(points) - 1, 1))
+    start, end = end - 1, end.clamp_max(len(points) - 1)
+    width = (points[end] - points[start]).clamp_min(1e-6)
+    share = ((levels - points[start]) / width).clamp(0.0, 1.0)
+    return torch.lerp(values[start], values[end], share)
 
 
 def dbfs(waveform: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from hlsim.cli.options import (
     count,
     full_scale,
     input_path,
+    loudness,
     positive_number,
     seed,
     sound_level,
@@ -102,6 +103,11 @@ def evaluate_compensator(parser: Parser) -> None:
         "the threshold at 2 kHz is above 90 dB HL, and otherwise nal-r"
     )
     option("--rival", str, text, "nal-r", choices=["nal-r", "nal-rp", "camfit", "for-ear"])
+    text = (
+        "loudness in dB relative to a normal ear at which the loudness error is 0, a number or "
+        "numbers by level, such as 50:0,65:-5,80:-9"
+    )
+    option("--loudness", loudness, text, 0.0)
     _declare_study(parser)
 
 

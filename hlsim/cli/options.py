@@ -302,6 +302,29 @@ def ear(text: str) -> str | list[float] | dict[float, float]:
     return levels
 
 
+def loudness(text: str) -> float | dict[float, float]:
+    """Convert the text of ``--loudness`` to a number, or to numbers by level.
+
+    Args:
+        text: A number, or levels in dB SPL with numbers.
+
+    Raises:
+        argparse.ArgumentTypeError: It is neither.
+
+    >>> loudness("-5"), loudness("50:0,80:-9")
+    (-5.0, {50.0: 0.0, 80.0: -9.0})
+    """
+    try:
+        if ":" not in text:
+            return float(text)
+        points = [point.split(":") for point in text.split(",")]
+        return {float(level): float(value) for level, value in points}
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a number of dB, or numbers by level such as 50:0,65:-5,80:-9"
+        ) from None
+
+
 def _limited(
     read: Callable[[str], Any], noun: str, lowest: float, highest: float
 ) -> Callable[[str], Any]:

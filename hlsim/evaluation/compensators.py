@@ -14,7 +14,7 @@ from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram, as_audiogram
 from hlsim.audiogram.value import EarLike
-from hlsim.calibration import NEURO_RATE, PASCAL_SPL
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, Loudness, check_loudness, loudness_at
 from hlsim.checks import check_attributes
 from hlsim.data.clips import Clips
 from hlsim.evaluation.aid_properties import (
@@ -70,6 +70,7 @@ def evaluate_compensators(
     seed: int = 0,
     listen: int = 0,
     rival: Rival = "nal-r",
+    loudness: Loudness = 0.0,
     **running: Any,
 ) -> Evaluation:
     """Compare compensators with no aid, NAL-R and WDRC, and with two rivals at their output level.
@@ -111,6 +112,8 @@ def evaluate_compensators(
         rival: Prescription for the planned comparison: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or
             ``"for-ear"``, which is NAL-RP for ears with a profound loss at 2 kHz, and otherwise
             NAL-R. One that is not NAL-R is a further condition, which takes time.
+        loudness: Loudness at which an output has no loudness error, in dB relative to a normal ear:
+            a number, or numbers by the level of the input, as in ``HearingLossLoss``.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
@@ -136,6 +139,7 @@ def evaluate_compensators(
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
     rival_name, rival_aid = load_rival(rival)
+    loudness = check_loudness(loudness)
     for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION, rival_name}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")
     for name, aid in compensators.items():
@@ -171,6 +175,10 @@ def evaluate_compensators(
         "steady_tones": measure_aids(with_unaided, ears_of_aids, measure_steady_tones, levels),
         "wearing": measure_aids(wearable, ears_of_aids, measure_wearability, utterances[0]),
     }
+    targets = loudness_at(loudness, torch.tensor(levels, dtype=torch.float64)).tolist()
+    for row in details["steady_tones"]:
+        errors = zip(row["loudness_error_db"], targets, strict=True)
+        row["loudness_error_db"] = [[tone - target for tone in tones] for tones, target in errors]
     if srt:
         details["reception_thresholds"] = measure_reception_thresholds(
             with_unaided, ears_of_aids, UNAIDED, DigitTest.draw(seed=seed)
@@ -191,6 +199,7 @@ def evaluate_compensators(
             **settings,
             "precision": precision,
             "rival": rival_name,
+            "loudness": loudness,
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),
         },
@@ -198,7 +207,14 @@ def evaluate_compensators(
     )
     table = evaluation.table
     relative_loss = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0)
-    evaluation = replace(evaluation, table=table.assign(gap=relative_loss - 1.0), details=details)
+    item_targets = loudness_at(loudness, torch.tensor(table["input_level"].to_numpy(float)))
+    nal_r_levels = table[table["condition"] == NAL_R].set_index("item")["level"]
+    table = table.assign(
+        gap=relative_loss - 1.0,
+        loudness_error=table["loudness_error"] - item_targets.numpy(),
+        level_over_nal_r=table["level"] - table["item"].map(nal_r_levels),
+    )
+    evaluation = replace(evaluation, table=table, details=details)
     groups = _make_groups(evaluation)
     same_level = next(c.name for c in conditions if c.kind == "same level")
     sounds = perceive_items(

@@ -15,7 +15,16 @@ from hlsim.audiogram.thresholds import (
     resolve_thresholds,
     store_thresholds,
 )
-from hlsim.calibration import NEURO_RATE, PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.calibration import (
+    NEURO_RATE,
+    PASCAL_SPL,
+    Loudness,
+    check_full_scale,
+    check_loudness,
+    gain_to_pascals,
+    level_spl,
+    loudness_at,
+)
 from hlsim.checks import (
     Lengths,
     check_choice,
@@ -128,10 +137,16 @@ class HearingLossLoss(nn.Module):
             storing them, which takes less memory and more time. Value and gradient are the same. A
             module of your own gets the attribute ``checkpoint = True``; what it then stores is up
             to its code.
+        loudness: Target of the perceived loudness, in dB relative to a normal ear: one number, or a
+            dictionary of numbers by the level of the clean speech in dB SPL, such as
+            ``{50: 0, 65: -5, 80: -9}``, which is interpolated. The reference gets this gain. Each
+            of two ears has this target; both together are louder than one, so that two ears need a
+            lower number. Most people prefer less than normal loudness, see the guide about levels.
 
     Raises:
-        ValueError: A name is unknown, a value has another type or is out of range, or the simulator
-            was built for another rate or level, or delays its output.
+        ValueError: A name is unknown, a value has another type or is out of range, ``loudness`` is
+            passed for criteria that compare no perceived level, or the simulator was built for
+            another rate or level, or delays its output.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()[:16000]
@@ -156,6 +171,7 @@ class HearingLossLoss(nn.Module):
         normal: NormalEar | None = None,
         ears: _EarsName = "mean",
         checkpoint: bool = False,
+        loudness: Loudness = 0.0,
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
@@ -167,6 +183,13 @@ class HearingLossLoss(nn.Module):
         self.reduction = reduction
         self.ears = ears
         self.criteria, self.weights = read_criterion(criterion, weights)
+        self.loudness = check_loudness(loudness)
+        has_level = any(entry.reference is not None for entry in self.criteria.values())
+        if self.loudness and not has_level:
+            raise ValueError(
+                f"expected a criterion that compares perceived levels for loudness={loudness!r}, "
+                f"got {', '.join(self.criteria)}; add coherent-bands, or leave out loudness"
+            )
         self._two_ears = has_listeners(audiogram)
         self._has_warned_of_order = False
         self._frozen = FrozenSimulator(
@@ -267,7 +290,7 @@ class HearingLossLoss(nn.Module):
         with torch.autocast(clean.device.type, enabled=False):
             perceived = self._frozen.simulate(output, ears, ends)
             batch = perceived.shape[:-1]
-            reference = self._frozen.compute_reference(Reference(), clean, ears, batch, ends)
+            reference = self._compute_reference(Reference(), clean, ears, batch, ends)
             if ends is not None:
                 perceived = silence_after(perceived, ends)
                 reference = silence_after(reference, ends)
@@ -360,11 +383,31 @@ class HearingLossLoss(nn.Module):
         }
         parts: dict[str, Tensor] = {}
         for criterion in self.criteria.values():
-            reference = self._frozen.compute_reference(
-                criterion.reference, clean, ears, batch, lengths
-            )
+            reference = self._compute_reference(criterion.reference, clean, ears, batch, lengths)
             parts |= criterion.parts(Comparison(**signals, reference=as_items(reference)))
         return {name: part.reshape(batch) for name, part in parts.items()}
+
+    def _compute_reference(
+        self,
+        reference: Reference | None,
+        clean: Tensor,
+        ears: Tensor,
+        batch: torch.Size,
+        lengths: Tensor | None,
+    ) -> Tensor:
+        """Compute the reference of a criterion at the chosen loudness, (*batch, time).
+
+        Arguments are those of ``FrozenSimulator.compute_reference``.
+        """
+        signal = self._frozen.compute_reference(reference, clean, ears, batch, lengths)
+        if reference is None or not self.loudness:
+            return signal
+        levels = level_spl(clean, self.full_scale_spl)
+        if lengths is not None:
+            shares = lengths.to(levels) / clean.shape[-1]
+            levels = levels - 10.0 * shares.log10()
+        gain_db = loudness_at(self.loudness, levels.detach())
+        return signal * 10.0 ** (gain_db / 20.0).unsqueeze(-1)
 
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Apply ``function``, such as that of ``.to()``, to modules that are not registered, too.
@@ -416,7 +459,7 @@ class HASPILoss(HearingLossLoss):
         quality: Weight of 1 minus HASQI, beside 1 for 1 minus HASPI.
         level: Weight of level and peaks. With 0 a model learns to be as loud as it can.
         options: ``simulator``, ``sample_rate``, ``full_scale_spl``, ``reduction``, ``normal``,
-            ``ears`` and ``checkpoint`` of ``HearingLossLoss``.
+            ``ears``, ``checkpoint`` and ``loudness`` of ``HearingLossLoss``.
 
     Raises:
         ValueError: A weight is negative or not finite, or an option of ``HearingLossLoss`` is not

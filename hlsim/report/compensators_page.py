@@ -39,6 +39,7 @@ from hlsim.report.verdict import verdict
 _GROUPS = {"clean": "Clean speech", "noisy": "Speech in noise"}
 
 _COLUMNS: Columns = {
+    "Output level minus NAL-R's (dB)": (statistic("level_over_nal_r"), "+.1f"),
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
     "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     "Mean absolute loudness error (dB)": (statistic("loudness_error", "mean absolute"), ".1f"),
@@ -55,7 +56,9 @@ _GAP_COLUMNS: Columns = {
 
 _COLUMN_NOTES = (
     "The loudness error is the level that the impaired ear perceives after the exact MSBG minus "
-    "the level that a normal ear perceives of the same input, with its noise. The band error is "
+    "the level that a normal ear perceives of the same input, with its noise, and minus the "
+    "target of --loudness. Its default of 0 dB, normal loudness, is louder than most people "
+    "prefer. The band error is "
     "the median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
     "perceived by the impaired ear and, for clean speech, by a normal ear, both by the exact "
     "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0.",

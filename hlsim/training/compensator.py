@@ -52,7 +52,11 @@ class CompensatorTraining(TrainingModule):
         self.denoising = weights.pop("denoising", 0.0)
         self.intelligibility = weights.pop("intelligibility", 0.0)
         self.trains_amplification = bool(weights)
-        self.loss = HearingLossLoss(simulator=simulator, criterion=weights or "coherent-bands")
+        self.loss = HearingLossLoss(
+            simulator=simulator,
+            criterion=weights or "coherent-bands",
+            loudness=recipe.loudness,
+        )
         if not self.trains_amplification:
             network.correct.requires_grad_(False)
         elif isinstance(network, HearingAid) and not recipe.trains_noise_reduction():

@@ -157,6 +157,8 @@ class CompensatorRecipe(TrainingRecipe):
         babble: Share of noisy clips whose noise is up to four other voices.
         snr: Lowest and highest signal-to-noise ratio in dB.
         unreduced: Share of items for which a hearing aid's noise reduction is off.
+        loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
+            or numbers by level, see ``HearingLossLoss``.
 
     >>> CompensatorRecipe(kind="hearing-aid", weights={"denoising": 1.0}).steps
     3000
@@ -173,6 +175,7 @@ class CompensatorRecipe(TrainingRecipe):
     babble: float = 0.0
     snr: tuple[float, float] = (0.0, 20.0)
     unreduced: float = 0.0
+    loudness: float | dict[float, float] = 0.0
     validate_every: int = 50
     validation_items: int = 8
 

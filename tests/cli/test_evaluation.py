@@ -22,7 +22,7 @@ CALLS = {
     ),
     "hlsim.evaluation.compensators:evaluate_compensators": (
         f"evaluate-compensator nalr --audiograms standard --audiogram N3 {ITEMS} --enhancer my:e "
-        f"--simulator neuro-msbg --gain-ears n1 --srt --rival for-ear {STUDY}"
+        f"--simulator neuro-msbg --gain-ears n1 --srt --rival for-ear --loudness 50:0,80:-9 {STUDY}"
     ),
     "hlsim.evaluation.recordings:haspi_report": (
         "haspi-report --clean {a} --before {b} --after {c} --manifest {d} --root {e} --audiogram "
@@ -41,7 +41,8 @@ EXPECTED: dict[str, Any] = {
     "speech": "a", "noise": "b", "items": 5, "seconds": 1.5, "levels": [55.0, 75.0],
     "teacher": "my:teacher", "inputs": ["as-is", "compensated"], "enhancers": ["my:e"],
     "simulator": "neuro-msbg", "gain_ears": ["N1"],
-    "rival": "for-ear", "srt": True, "clean": "a", "before": "b", "after": "c",
+    "rival": "for-ear", "loudness": {50.0: 0.0, 80.0: -9.0},
+    "srt": True, "clean": "a", "before": "b", "after": "c",
     "manifest": "d", "root": "e", "baseline": "noisy", "better_ear": True, "spl": 60.0,
     "conditions": {"A": "a", "B": "b"}, "outputs": {"A": "a", "B": "b"},
     "microphones": [1, 3], "scenes": "a", "listeners": "b", "scenes_listeners": "c",

@@ -120,8 +120,19 @@ def test_another_prescription_may_be_the_rival(
 ) -> None:
     monkeypatch.setattr("hlsim.report.plots._draw_svg", lambda *_: b"<svg></svg>")
     study = evaluate_compensators(
-        {"mine": Gain()}, **options, audiogram=N3, items=2, rival="for-ear"
+        {"mine": Gain()}, **options, audiogram=N3, items=2, rival="for-ear", loudness={65: -4}
     )
+    usual = evaluate_compensators({"mine": Gain()}, **options, audiogram=N3, items=2)
+    for name in ("unaided", "mine"):  # whose errors are 4 dB higher than against normal loudness
+        errors = [table.wide("loudness_error")[name].to_numpy() for table in (study, usual)]
+        assert errors[0] - errors[1] == pytest.approx(4.0, abs=1e-6)
+    tones, usual_tones = (
+        torch.tensor([row["loudness_error_db"] for row in table.details["steady_tones"]][:1])
+        for table in (study, usual)
+    )
+    torch.testing.assert_close(tones, usual_tones + 4.0)
+    relative = study.wide("level_over_nal_r")
+    assert not relative["NAL-R"].any() and abs(relative["mine"]).min() > 0.1
     rival = "prescription for the ear"
     assert study.names[1:5] == ["NAL-R", rival, "WDRC", f"{rival} at mine's level"]
     scores = study.wide("hasqi")

@@ -20,6 +20,7 @@ from hlsim.losses.frozen_simulator import Reference
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics.band_levels import band_level_loss
 from hlsim.msbg.response import apply_bank_phase
+from hlsim.shortcuts import example_speech
 from hlsim.training.recipes import CompensatorRecipe
 from tests.helpers import mostly_slow
 from tests.losses.signals import add_noise, excerpt, gain_slope
@@ -603,3 +604,59 @@ def test_bad_settings_calls_and_outputs_raise_value_error() -> None:
             HearingLossLoss(N3, criterion=lambda *_, result=result: result)(SIGNAL, SIGNAL)
     with pytest.raises(ValueError, match="the normal ear to return"):
         HearingLossLoss(N3, normal=lambda waveform: waveform[..., 1:])(SIGNAL, SIGNAL)
+
+
+CURVE = {50.0: 0.0, 65.0: -5.0, 80.0: -9.0}
+
+
+@pytest.mark.parametrize("criterion", ["coherent-bands", "bands"])
+def test_the_least_loss_is_at_the_chosen_loudness(criterion: str) -> None:
+    """Behind a linear ear without loss, the best gain is the target."""
+    clean = torch.stack([set_level(example_speech()[8000:20000], spl) for spl in (50.0, 72.5)])
+    options: dict[str, Any] = {"simulator": "attenuation", "reduction": "none"}
+    loss = HearingLossLoss("NH", criterion=criterion, loudness=CURVE, **options)
+    for gain_db, targets in ((0.0, [True, False]), (-7.0, [False, True])):
+        output = clean * 10.0 ** (gain_db / 20.0)
+        assert (loss(output, clean) < 1e-3).tolist() == targets
+    at_once = HearingLossLoss("NH", criterion=criterion, loudness=-7.0, **options)
+    assert (at_once(10.0 ** (-7.0 / 20.0) * clean, clean) < 1e-3).all()
+    lower, higher = (loss(10.0 ** (db / 20.0) * clean[1:], clean[1:]) for db in (-10.0, -4.0))
+    assert float(lower) > 0.01 and float(higher) > 0.01
+
+
+def test_loudness_0_changes_no_bit_and_a_reference_has_the_chosen_level() -> None:
+    clean = example_speech()[8000:16000]
+    output = 3.0 * clean
+    values = [
+        HearingLossLoss("N3", simulator="attenuation", **options)(output, clean)
+        for options in ({}, {"loudness": 0.0}, {"loudness": {50: 0.0, 80: 0.0}})
+    ]
+    assert torch.equal(values[0], values[1])
+    torch.testing.assert_close(values[2], values[0])
+    loss = HearingLossLoss("N3", simulator="attenuation", loudness={40: -3.0})
+    normal = HearingLossLoss("N3", simulator="attenuation").heard(output, clean)[1]
+    torch.testing.assert_close(loss.heard(output, clean)[1], normal * 10.0 ** (-3.0 / 20.0))
+
+
+def test_padding_does_not_change_the_level_to_which_loudness_belongs() -> None:
+    clean = set_level(example_speech()[8000:16000], 65.0)
+    loss = HearingLossLoss("N3", simulator="attenuation", loudness=CURVE)
+    padded = torch.nn.functional.pad(clean, (0, 8000))
+    value = loss(2.0 * padded, padded, lengths=torch.tensor(8000))
+    torch.testing.assert_close(value, loss(2.0 * clean, clean), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"criterion": "haspi", "loudness": -5.0}, "add coherent-bands"),
+        ({"criterion": {"hasqi": 1.0, "interaural": 1.0}, "loudness": -5.0}, "hasqi, interaural"),
+        ({"loudness": 30.0}, "loudness"),
+        ({"loudness": {}}, "at least one level"),
+        ({"loudness": {200.0: -5.0}}, "a level of loudness"),
+        ({"loudness": "soft"}, "loudness"),
+    ],
+)
+def test_bad_loudness_is_rejected(options: dict[str, Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        HearingLossLoss("N3", simulator="attenuation", **options)
