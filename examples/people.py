@@ -548,7 +548,8 @@ def flat_step(curve: pd.Series, limit: float) -> float:
     >>> flat_step(pd.Series({10: 9.0, 14: 8.0, 16: 6.5, 20: 5.5}), limit=15)
     1.0
     """
-    below, above = curve[: limit - 0.5][-2:], curve[limit + 0.5 :][:2]
+    below = curve.loc[: limit - 0.5].tail(2)
+    above = curve.loc[limit + 0.5 :].head(2)
     falls = [side.iloc[0] - side.iloc[1] for side in (below, above)]
     spans = [side.index[1] - side.index[0] for side in (below, above)]
     slope = sum(falls) / sum(spans)
