@@ -1,4 +1,4 @@
-"""Gains that published prescriptions give to an ear: NAL-R, NAL-RP and CAMFIT.
+"""Gains of published prescriptions for an ear: NAL-R, NAL-RP and CAMFIT.
 
 - NAL-R: Byrne and Dillon 1986, Ear and Hearing 7(4), with the gain for severe losses of Byrne,
   Parkinson and Newall 1990, Ear and Hearing 11(1), as in pyclarity.
@@ -30,16 +30,16 @@ PROFOUND_FROM = 90.0
 """Threshold in dB HL at 2 kHz above which NAL-RP corrects its gains for a profound loss."""
 
 SPEECH_RANGE_DB = 38.0
-"""Range in dB below the level of average speech that CAMFIT makes audible.
+"""Range in dB below the level of average speech at 65 dB SPL that CAMFIT makes audible.
 
 At its lower end are the softest parts of speech at 45 dB SPL.
 """
 
 LOWEST_CAMFIT_SLOPE = 13.0 / SPEECH_RANGE_DB - 1.0
-"""Lowest slope of CAMFIT's gain over the level in dB/dB: a compression ratio of 38 / 13 = 2.92."""
+"""Lowest slope of CAMFIT's gain over the level in dB per dB: a compression ratio of 38 / 13."""
 
 CAMFIT_LIMIT_SPL = 100.0
-"""Level of a band in dB SPL beyond which CAMFIT does not amplify it."""
+"""Level in dB SPL beyond which CAMFIT amplifies no band."""
 
 # Level in dB SPL of 0 dB HL, for tones in a free field from the front: ISO 389-7:2005
 FREE_FIELD_THRESHOLD_SPL = {
@@ -58,15 +58,17 @@ CAMBRIDGE_INTERCEPTS = {
 class CompressiveGains(NamedTuple):
     """Gain of each band of a compressive prescription, a straight line over the band's level.
 
+    ``compressed_gains_db`` computes the gain for a level. Shape of both attributes: (..., bands).
+
     >>> CompressiveGains(torch.tensor([20.0]), torch.tensor([-0.5])).slope
     tensor([-0.5000])
     """
 
     at_speech_level: Tensor
-    """Gain in dB for the level that the band has in average speech at 65 dB SPL."""
+    """Gain in dB at the level of the band in average speech at 65 dB SPL."""
 
     slope: Tensor
-    """Change of the gain in dB per dB of the level."""
+    """Change of the gain in dB per dB of the level, negative for compression."""
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
@@ -98,21 +100,23 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
 
 @constant
 def _bias() -> list[float]:
-    """Return the constant in dB of NAL-R's formula at 250, 500, 1000, 2000, 4000 and 6000 Hz."""
+    """Return the constants in dB of NAL-R's formula at 250, 500, 1000, 2000, 4000 and 6000 Hz."""
     return [-17.0, -8.0, 1.0, -1.0, -2.0, -2.0]
 
 
 def nalrp_gains_db(
     thresholds: Tensor, points: Frequencies = FREQUENCIES, frequencies: Frequencies = FREQUENCIES
 ) -> Tensor:
-    """Return the gains that NAL-RP prescribes.
+    """Compute the gains that NAL-RP prescribes, at any frequencies.
 
-    NAL-RP has NAL-R's formula, with a constant for 1500 Hz. If the threshold at 2 kHz is above 90
-    dB HL, low frequencies get more gain and high ones less; the steps of 5 dB of the published
-    table are interpolated linearly.
+    NAL-RP has NAL-R's formula, with an additional constant for 1500 Hz, and a correction for
+    profound losses: if the threshold at 2 kHz is above 90 dB HL, low frequencies get more gain and
+    high ones less. The published table of this correction, in steps of 5 dB, is interpolated
+    linearly.
 
-    The formula is for 250 to 6000 Hz. Below, the gain is constant; above, it falls to 0 at 10 kHz.
-    Thresholds and gains are interpolated over log frequency. An ear without any loss has no gain.
+    The formula is for 250 to 6000 Hz. Below 250 Hz the gain is constant; above 6000 Hz it falls to
+    0 at 10 kHz. Thresholds and gains are interpolated over log frequency. An ear without any loss
+    has no gain.
 
     Args:
         thresholds: Thresholds in dB HL.
@@ -144,12 +148,13 @@ def camfit_gains(
     points: Frequencies = FREQUENCIES,
     frequencies: Frequencies = FREQUENCIES,
 ) -> CompressiveGains:
-    """Return the gains that CAMFIT prescribes for bands, before their limits.
+    """Compute the gains that CAMFIT prescribes for bands, as lines over the level of each band.
 
-    A band of average speech at 65 dB SPL gets the gain of the Cambridge formula, 0.48 of the loss
-    plus a constant. A band that is 38 dB softer is amplified to the threshold. Between and beyond,
-    the gain is a straight line over the level. Where the compression ratio would exceed 2.92, the
-    line goes through the softer point with this ratio. ``compressed_gains_db`` computes the gains.
+    The line of a band goes through two points. A band of average speech at 65 dB SPL gets the gain
+    of the Cambridge formula, 0.48 of the loss plus a constant, in dB. A band that is 38 dB softer
+    is amplified to the threshold. If the compression ratio would exceed 2.92, the line goes through
+    the second point only, with this ratio. ``compressed_gains_db`` computes the gain for a level,
+    and limits it.
 
     Args:
         thresholds: Thresholds in dB HL, which are interpolated over log frequency.
@@ -179,13 +184,13 @@ def compressed_gains_db(
     range_db: float = SPEECH_RANGE_DB,
     limit_spl: float = CAMFIT_LIMIT_SPL,
 ) -> Tensor:
-    """Compute the gains of a compressive prescription for bands of some levels.
+    """Compute the gain of each band at its level, from the lines of a compressive prescription.
 
     Args:
-        gains: Gains of each band.
+        gains: Gain of each band as a line over its level.
         levels: Level of each band in dB SPL.
         speech_levels: Level in dB SPL of each band in average speech at 65 dB SPL.
-        range_db: Level below that of average speech in dB from which softer sounds get no more
+        range_db: Distance in dB below ``speech_levels`` from which on softer sounds get no more
             gain.
         limit_spl: Level in dB SPL beyond which no band is amplified.
 
@@ -203,7 +208,11 @@ def compressed_gains_db(
 
 
 def _common_gain(three_frequency_sum: Tensor) -> Tensor:
-    """Return the gain in dB at all frequencies for the sum of three thresholds in dB HL."""
+    """Return the gain in dB that NAL-R adds at all frequencies.
+
+    Args:
+        three_frequency_sum: Sum of the thresholds at 500, 1000 and 2000 Hz in dB HL. Any shape.
+    """
     return torch.where(
         three_frequency_sum <= 180.0,
         0.05 * three_frequency_sum,
@@ -215,6 +224,11 @@ def _interpolate_over_log(values: Tensor, grid: Frequencies, points: Frequencies
     """Interpolate values linearly over log frequency, constant below the grid and above it.
 
     Shape: (..., grid) -> (..., points).
+
+    Args:
+        values: Values such as thresholds or gains.
+        grid: Frequencies of the values in Hz, ascending.
+        points: Frequencies of the result in Hz.
     """
     return (values.unsqueeze(-1) * _log_weights(grid, points, like=values)).sum(-2)
 
@@ -228,13 +242,16 @@ def _log_weights(grid: Frequencies, points: Frequencies) -> NDArray[np.float64]:
 
 @constant
 def _nalrp_bias() -> list[float]:
-    """Return the constant in dB of NAL-RP's formula at ``NALRP_FREQUENCIES``."""
+    """Return the constants in dB of NAL-RP's formula at ``NALRP_FREQUENCIES``."""
     return [-17.0, -8.0, 1.0, 1.0, -1.0, -2.0, -2.0, -2.0]
 
 
 @constant
 def _profound_corrections() -> list[list[float]]:
-    """Return NAL-RP's corrections in dB for 90, 95, ... 120 dB HL at 2 kHz, (7, 8)."""
+    """Return NAL-RP's corrections in dB for profound losses. Shape: (7, 8).
+
+    The rows are thresholds of 90, 95, ... 120 dB HL at 2 kHz, the columns ``NALRP_FREQUENCIES``.
+    """
     return [
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         [4.0, 3.0, 0.0, -1.0, -2.0, -2.0, -2.0, -2.0],
@@ -248,7 +265,10 @@ def _profound_corrections() -> list[list[float]]:
 
 @constant
 def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
-    """Return the level of 0 dB HL in dB SPL, interpolated linearly over frequency."""
+    """Return the level of 0 dB HL in dB SPL at some frequencies in Hz, in a free field.
+
+    It is interpolated linearly over frequency.
+    """
     return np.interp(
         points, list(FREE_FIELD_THRESHOLD_SPL), list(FREE_FIELD_THRESHOLD_SPL.values())
     )
@@ -256,7 +276,10 @@ def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
 
 @constant
 def _cambridge_intercepts(points: Frequencies) -> NDArray[np.float64]:
-    """Return the constant of the Cambridge formula in dB, interpolated over log frequency."""
+    """Return the constants in dB of the Cambridge formula at some frequencies in Hz.
+
+    They are interpolated over log frequency.
+    """
     grid = np.log(list(CAMBRIDGE_INTERCEPTS))
     lowest = min(CAMBRIDGE_INTERCEPTS)
     return np.interp(np.log(np.maximum(points, lowest)), grid, list(CAMBRIDGE_INTERCEPTS.values()))

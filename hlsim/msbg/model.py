@@ -92,9 +92,9 @@ class MSBG(nn.Module):
     Args:
         audiogram: Ear or ears; they may be passed with each call instead. The standard audiogram
             ``"N7"`` is not accepted, because it has thresholds above 100 dB HL. Like pyclarity, the
-            model takes an ``Audiogram`` at the frequencies at which it was measured: the severity
-            from those that lie between 2 and 8 kHz, and the threshold of each channel by linear
-            interpolation in Hz. A tensor has the thresholds at the eight ``FREQUENCIES``.
+            model uses the measured thresholds of an ``Audiogram`` at any frequencies: the severity
+            follows from those from 2 to 8 kHz, and the threshold of each channel is interpolated
+            linearly in Hz. A tensor has the thresholds at the eight ``FREQUENCIES``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. At rates below 44100
             the last 80 Hz below half the rate fade out; at rates above 44100 outputs end at
             22.05 kHz.

@@ -40,7 +40,8 @@ def in_blocks(
     """Apply a function to overlapping blocks of long signals, and join its outputs.
 
     The overlap, 0.75 s before and 0.55 s after each block, covers the memory of MSBG, so the joined
-    output equals that for the whole signal to about 1e-6.
+    output equals that for the whole signal to about 1e-6. If a gradient is needed, blocks of long
+    signals use gradient checkpointing.
 
     Args:
         process: Function of the signals of a block, of the ears, and of whether the signals end

@@ -73,6 +73,7 @@ def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     The gain of a channel of the filter bank is (envelope / pressure at 105 dB SPL) ** (ratio - 1).
     It is computed once per step, a group of neighbouring samples with one value of the envelope.
+    Envelopes are limited to 2e-8 Pa to 105 dB SPL, so that gains are above 0 and at most 1.
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
 

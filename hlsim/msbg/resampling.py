@@ -62,7 +62,7 @@ def from_spectrum(
     gain: float,
     delay: int,
 ) -> Tensor:
-    """Compute the output of MSBG from the spectrum of what leaves the cochlea.
+    """Compute the output of MSBG from the spectrum of the signal that leaves the cochlea.
 
     This applies the inverse of the outer and middle ear, the final low-pass and a gain, removes the
     delay, and resamples to the rate of the output.

@@ -37,7 +37,8 @@ def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
 class AudiogramEncoder(nn.Module):
     """Encoder of an audiogram to one value per frequency, an input channel of the networks.
 
-    It consists of a convolution with 16 feature maps, a ReLU, average pooling and a linear layer.
+    The encoder consists of a convolution with 16 feature maps, a ReLU, average pooling and a linear
+    layer.
 
     Source: the Neuro-MSBG paper, Equation 1.
 

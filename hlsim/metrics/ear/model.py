@@ -436,7 +436,7 @@ def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
 
 
 def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tensor:
-    """Compute the longest group delay of all channels.
+    """Compute the longest group delay of all channels for each item.
 
     The scores delay all other channels by the difference, so that the channels are synchronous. The
     longest delay is that of the narrowest filter, which is one of the first three: the first filter
