@@ -53,7 +53,7 @@ def follow_peaks(
     # p is the largest of the averages that begin at any of the frames: p = e + d, where e is the
     # average with r, and d[n] = max(x[n] - e[n], r d[n - 1]).
     average, excess, result = memory.unbind(1)
-    averages = _average(values, average, fall)
+    averages = exponential_average(values, average, fall)
     blocks = []
     for block in (values - averages).split(BLOCK_FRAMES, 1):
         powers = _powers(block.shape[1], fall, like=values)
@@ -61,7 +61,7 @@ def follow_peaks(
         blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
         excess = blocks[-1][:, -1]
     peaks = averages + torch.cat(blocks, 1)
-    results = _average(peaks, result, rise)
+    results = exponential_average(peaks, result, rise)
     return results, torch.stack((averages[:, -1], excess, results[:, -1]), 1)
 
 
@@ -70,15 +70,18 @@ def _weight_of_past(seconds: float) -> float:
     return math.exp(-HOP / (RATE * seconds)) if seconds > 0.0 else 0.0
 
 
-def _average(values: Tensor, before: Tensor, past: float) -> Tensor:
+def exponential_average(values: Tensor, before: Tensor, past: float) -> Tensor:
     """Compute the exponential average y[n] = past y[n - 1] + (1 - past) x[n].
 
     Args:
-        values: Values x of each frame.
-        before: Average y before the first frame.
+        values: Values x of each frame, or of each sample.
+        before: Average y before the first one.
         past: Weight of the past, 0 to below 1.
 
     Shape: (items, frames, n), (items, n) -> (items, frames, n).
+
+    >>> exponential_average(torch.ones(1, 3, 1), torch.zeros(1, 1), 0.5).flatten()
+    tensor([0.5000, 0.7500, 0.8750])
     """
     if past == 0.0:
         return values

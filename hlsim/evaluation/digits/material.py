@@ -43,8 +43,9 @@ class Triplets(NamedTuple):
     """Triplets of digits with their noises, which all ears and aids of a test share.
 
     Attributes:
-        speech: Digits without noise, each with RMS 1, (triplets, time).
-        noise: Masking noise with RMS 1 and the long-term spectrum of the digits, (triplets, time).
+        speech: Digits without noise, each with RMS 1, (triplets, time), or at several microphones,
+            (triplets, ..., time).
+        noise: Masking noise with RMS 1 and the long-term spectrum of the digits, likewise.
         internal: Internal noise of a normal ear in pascals, (triplets, time).
         digits: Spoken digits, 0 to 9, (triplets, 3).
 
@@ -101,15 +102,16 @@ def present(triplets: Triplets, snr: Tensor, noise_spl: float | Tensor) -> Tenso
         noise_spl: Level of the noise in dB SPL, for all triplets or per triplet.
 
     Returns:
-        Samples in pascals at 16 kHz, (triplets, time).
+        Samples in pascals at 16 kHz, of the shape of the digits.
 
     >>> triplets = draw_triplets(1, torch.Generator().manual_seed(0))
     >>> present(triplets, torch.tensor([0.0]), 65.0).shape
     torch.Size([1, 48000])
     """
     noise_gain = 10.0 ** ((torch.as_tensor(noise_spl) - PASCAL_SPL) / 20.0)
-    mixture = triplets.noise + triplets.speech * 10.0 ** (snr[:, None] / 20.0)
-    return mixture * noise_gain.reshape(-1, 1)
+    like_signals = (-1, *[1] * (triplets.speech.ndim - 1))
+    mixture = triplets.noise + triplets.speech * 10.0 ** (snr.reshape(like_signals) / 20.0)
+    return mixture * noise_gain.reshape(like_signals)
 
 
 def perceive(signals: Tensor, thresholds: Tensor, simulator: nn.Module, internal: Tensor) -> Tensor:

@@ -67,7 +67,10 @@ More of them fill the cache and take about an eighth more time.
 """
 
 AidFunction = Callable[..., Tensor]
-"""Function of signals in pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL."""
+"""Function of signals in pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL.
+
+With ``DigitTest``, the signals may be those of several microphones, (items, ..., time).
+"""
 
 
 @dataclass(frozen=True)
@@ -222,9 +225,10 @@ def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) ->
     """
     inputs = signals[portion]
     outputs = aid(inputs, ear)
-    if outputs.shape != inputs.shape or not bool(outputs.isfinite().all()):
+    expected = len(inputs), inputs.shape[-1]
+    if outputs.shape != expected or not bool(outputs.isfinite().all()):
         raise ValueError(
-            f"expected the aid to return finite samples of shape {tuple(inputs.shape)}, "
+            f"expected the aid to return finite samples of shape {expected}, "
             f"got shape {tuple(outputs.shape)}; return as many samples as the input has, "
             "without NaN or infinity"
         )

@@ -1,0 +1,427 @@
+"""Directional microphones: front ends that turn the signals of several microphones into one per ear.
+
+Inputs have the shape (..., microphones, ears, time): at each side of the head, a front and a rear
+microphone, left side first. Outputs have the shape (..., ears, time), which any aid of two ears
+takes. For sounds from the front, the output is the signal of the front microphone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import scipy
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from compensators.smoothing import exponential_average
+from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import NEURO_RATE
+from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.dsp.fft import fft_length
+from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
+
+LOOK_AHEAD = 0.001
+"""Look-ahead of the filters in s."""
+
+FILTER_SECONDS = 0.008
+"""Length of the filters in s."""
+
+PATTERNS = {"dipole": 0.0, "hypercardioid": 1.0 / 3.0, "supercardioid": 0.577, "cardioid": 1.0}
+"""Delay of the rear microphone for each directional pattern, relative to that of the spacing.
+
+The pattern has its null where the cosine of the angle to the front is minus this number.
+"""
+
+_NOISE_DIRECTIONS = 200
+"""Number of directions of the sounds in the model of diffuse noise."""
+
+_DISTORTION_WEIGHT = 1e3
+"""Weight of the power of the error of sound from the front, relative to that of diffuse noise."""
+
+_POWER_FLOOR = 1e-12
+"""Power in Pa^2, about -26 dB SPL, that is added to denominators."""
+
+State = dict[str, Tensor]
+
+
+class FilterAndSum(nn.Module):
+    """Fixed filters, one per microphone and ear, whose outputs are added up.
+
+    Args:
+        taps: Impulse responses from each microphone to each ear of the output, (ears,
+            microphones, ears of the microphones, length).
+        look_ahead: Number of samples of the impulse responses that come before time 0.
+        sample_rate: Sample rate in Hz.
+
+    Attributes:
+        latency: Delay of streams in samples, the look-ahead.
+        takes_microphones: True, as for each aid that gets the signals of all microphones.
+
+    >>> mean = FilterAndSum(torch.eye(2).reshape(2, 1, 2, 1).repeat(1, 2, 1, 1) / 2)
+    >>> mean(torch.ones(2, 2, 100)).shape
+    torch.Size([2, 100])
+    """
+
+    takes_microphones = True
+
+    taps: Tensor
+
+    def __init__(
+        self,
+        taps: Tensor | NDArray[np.float64],
+        look_ahead: int = 0,
+        sample_rate: int = NEURO_RATE,
+    ) -> None:
+        super().__init__()
+        self.sample_rate = check_rate(sample_rate)
+        self.latency = look_ahead
+        self.register_buffer("taps", torch.as_tensor(taps).float())
+
+    @property
+    def microphones(self) -> int:
+        """Number of microphones at each side."""
+        return self.taps.shape[1]
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+        """Return the output for whole signals, time-aligned with the front microphones.
+
+        Args:
+            waveform: Signals of the microphones.
+            audiogram: Ignored, so that the module can be called as an aid.
+
+        Shape: (..., microphones, ears, time) -> (..., ears, time).
+
+        Raises:
+            ValueError: The waveform has another number of microphones or ears.
+        """
+        self.check_microphones(waveform)
+        padded = functional.pad(waveform, (0, self.latency))
+        return self.process(padded, self.initial_state(waveform))[0][..., self.latency :]
+
+    def check_microphones(self, waveform: Tensor) -> None:
+        """Raise ValueError unless a waveform has the right numbers of microphones and ears."""
+        check_waveform(waveform)
+        expected = tuple(self.taps.shape[1:3])
+        if waveform.shape[-3:-1] != expected:
+            raise ValueError(
+                f"expected signals of {expected[0]} microphones at {expected[1]} ears, (..., "
+                f"{expected[0]}, {expected[1]}, time), got shape {tuple(waveform.shape)}; stack "
+                "the microphones of each side from front to rear, the left side first"
+            )
+
+    def initial_state(self, waveform: Tensor) -> State:
+        """Return the state before the first sample, for signals like ``waveform``.
+
+        Returns: The earlier samples that the filters need, by the name "past".
+        """
+        return {"past": waveform.new_zeros(*waveform.shape[:-1], self.taps.shape[-1] - 1)}
+
+    def process(self, waveform: Tensor, state: State) -> tuple[Tensor, State]:
+        """Return the output, delayed by ``latency`` samples, and the state after the last sample.
+
+        Shape: (..., microphones, ears, time) -> (..., ears, time).
+        """
+        samples = torch.cat((state["past"], waveform), -1)
+        past = samples[..., waveform.shape[-1] :]
+        return self.filter(samples, self.taps), {"past": past}
+
+    @staticmethod
+    def filter(samples: Tensor, taps: Tensor) -> Tensor:
+        """Filter the microphones, and add them up, from the first sample with a complete past.
+
+        Shape: (..., microphones, ears, length - 1 + time), (ears, microphones, ears, length)
+            -> (..., ears, time).
+        """
+        points = fft_length(samples.shape[-1])
+        precise = samples.to(torch.promote_types(samples.dtype, torch.float32))
+        spectra = torch.fft.rfft(precise, points).unsqueeze(-4)
+        products = spectra * torch.fft.rfft(taps.to(precise), points)
+        output = torch.fft.irfft(products.sum((-3, -2)), points)
+        return output[..., taps.shape[-1] - 1 : samples.shape[-1]].to(samples.dtype)
+
+    def stream(self, audiogram: AudiogramLike | None = None) -> MicrophoneStream:
+        """Return a stream, which processes signals that arrive in chunks.
+
+        Args:
+            audiogram: Ignored, as in ``forward``.
+        """
+        return MicrophoneStream(self)
+
+
+class MicrophoneStream:
+    """A front end for signals that arrive in chunks: a function from a chunk to the next output.
+
+    The output is that of the whole signal, delayed by ``front_end.latency`` samples, without
+    gradients.
+
+    Args:
+        front_end: Front end with ``process`` and ``initial_state``.
+
+    >>> stream = DifferentialMicrophone().stream()
+    >>> stream(torch.zeros(2, 2, 100)).shape
+    torch.Size([2, 100])
+    """
+
+    def __init__(self, front_end: FilterAndSum) -> None:
+        self._front_end = front_end
+        self._state: State | None = None
+
+    @torch.no_grad()
+    def __call__(self, chunk: Tensor) -> Tensor:
+        """Return the next output. Shape: (..., microphones, ears, time) -> (..., ears, time).
+
+        Raises:
+            ValueError: The chunk has another number of microphones or ears.
+        """
+        self._front_end.check_microphones(chunk)
+        state = self._front_end.initial_state(chunk) if self._state is None else self._state
+        output, self._state = self._front_end.process(chunk, state)
+        return output
+
+
+class DifferentialMicrophone(FilterAndSum):
+    """A fixed directional microphone at each side: front minus delayed rear microphone.
+
+    The difference falls by 6 dB per octave towards low frequencies, for which a filter compensates
+    down to ``lowest``. Below, the output falls, so that the noise of microphones is not amplified
+    further. Source: Elko 2004, in Huang and Benesty (editors), Audio Signal Processing for
+    Next-Generation Multimedia Communication Systems, chapter 2.
+
+    Args:
+        pattern: "cardioid", "supercardioid", "hypercardioid" or "dipole".
+        spacing: Distance between the two microphones of a side in m.
+        lowest: Frequency in Hz at which the output is 3 dB softer.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+
+    Raises:
+        ValueError: A value is out of range.
+
+    >>> front_end = DifferentialMicrophone("cardioid")
+    >>> front_end(torch.zeros(2, 2, 16000)).shape
+    torch.Size([2, 16000])
+    """
+
+    def __init__(
+        self,
+        pattern: str = "hypercardioid",
+        *,
+        spacing: float = 0.01,
+        lowest: float = 200.0,
+        sample_rate: int = NEURO_RATE,
+    ) -> None:
+        if pattern not in PATTERNS:
+            known = ", ".join(PATTERNS)
+            raise ValueError(f"expected a pattern out of {known}, got {pattern!r}")
+        check_number("spacing", spacing, 0.002, 0.1)
+        check_number("lowest", lowest, 20.0, 2000.0)
+        rate = check_rate(sample_rate)
+        one_side = differential_taps(PATTERNS[pattern], spacing, lowest, rate)
+        taps = np.einsum("ef,ml->emfl", np.eye(2), one_side)
+        super().__init__(taps, look_ahead_samples(rate), rate)
+
+
+class AdaptiveDifferentialMicrophone(FilterAndSum):
+    """An adaptive directional microphone at each side, whose null follows the loudest noise behind.
+
+    Of a cardioid to the front, a share of a cardioid to the rear is subtracted, from 0 to 1, which
+    moves the null from 180 to 90 degrees. The share minimises the power of the output. Source: Elko
+    and Nguyen Pong 1995, IEEE ASSP Workshop on Applications of Signal Processing to Audio and
+    Acoustics; here, the average powers of the recent past give the share, instead of an LMS
+    algorithm.
+
+    Args:
+        seconds: Time constant of the averages in s.
+        spacing: Distance between the two microphones of a side in m.
+        lowest: Frequency in Hz at which the output is 3 dB softer.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+
+    Raises:
+        ValueError: A value is out of range.
+
+    >>> AdaptiveDifferentialMicrophone()(torch.zeros(2, 2, 16000)).shape
+    torch.Size([2, 16000])
+    """
+
+    def __init__(
+        self,
+        *,
+        seconds: float = 0.02,
+        spacing: float = 0.01,
+        lowest: float = 200.0,
+        sample_rate: int = NEURO_RATE,
+    ) -> None:
+        check_number("seconds", seconds, 0.001, 10.0)
+        check_number("spacing", spacing, 0.002, 0.1)
+        check_number("lowest", lowest, 20.0, 2000.0)
+        rate = check_rate(sample_rate)
+        one_side = differential_taps(PATTERNS["cardioid"], spacing, lowest, rate)
+        forward = np.einsum("ef,ml->emfl", np.eye(2), one_side)
+        super().__init__(forward, look_ahead_samples(rate), rate)
+        self.past_weight = math.exp(-1.0 / (rate * seconds))
+
+    def initial_state(self, waveform: Tensor) -> State:
+        powers = waveform.new_zeros(*waveform.shape[:-3], 2, waveform.shape[-2])
+        return {**super().initial_state(waveform), "powers": powers}
+
+    def process(self, waveform: Tensor, state: State) -> tuple[Tensor, State]:
+        samples = torch.cat((state["past"], waveform), -1)
+        to_front = self.filter(samples, self.taps)
+        to_rear = self.filter(samples, self.taps.flip(1))
+        products = torch.stack((to_front * to_rear, to_rear.square()), -3)
+        flat = products.flatten(0, -2).T.unsqueeze(0)
+        averages = exponential_average(flat, state["powers"].reshape(1, -1), self.past_weight)
+        common, rear = averages[0].T.reshape(products.shape).unbind(-3)
+        share = (common / (rear + _POWER_FLOOR)).clamp(0.0, 1.0)
+        powers = torch.stack((common, rear), -3)[..., -1]
+        past = samples[..., waveform.shape[-1] :]
+        return to_front - share * to_rear, {"past": past, "powers": powers}
+
+
+class BinauralMVDR(FilterAndSum):
+    """A fixed beamformer that combines the microphones of both sides to the front.
+
+    Of all filters that pass sound from the front as the front microphone of each ear receives it,
+    these let least of diffuse noise through (minimum variance, distortionless response). The model
+    of the head is a rigid sphere, with noise of equal power from all directions. Level and
+    time differences between the ears are kept for the front only: remaining noise gets those of the
+    front.
+
+    Args:
+        loading: Power of the noise of each microphone relative to the diffuse noise, which limits
+            how much the former is amplified.
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+
+    Raises:
+        ValueError: A value is out of range.
+
+    >>> BinauralMVDR()(torch.zeros(2, 2, 16000)).shape
+    torch.Size([2, 16000])
+    """
+
+    def __init__(
+        self, *, loading: float = 1e-4, spacing: float = 0.01, sample_rate: int = NEURO_RATE
+    ) -> None:
+        check_number("loading", loading, 1e-6, 1.0)
+        check_number("spacing", spacing, 0.002, 0.1)
+        rate = check_rate(sample_rate)
+        super().__init__(mvdr_taps(loading, spacing, rate), look_ahead_samples(rate), rate)
+
+
+class DirectionalAid(nn.Module):
+    """A directional front end, followed by an aid of two ears.
+
+    Args:
+        front_end: Module from (..., microphones, ears, time) to (..., ears, time).
+        aid: Aid of two ears, such as those of ``load_compensator``.
+
+    >>> from compensators import NALR
+    >>> aid = DirectionalAid(DifferentialMicrophone(), NALR())
+    >>> aid(torch.zeros(2, 2, 16000), ["N2", "N4"]).shape
+    torch.Size([2, 16000])
+    """
+
+    takes_microphones = True
+
+    def __init__(self, front_end: FilterAndSum, aid: nn.Module) -> None:
+        super().__init__()
+        self.front_end = front_end
+        self.aid = aid
+
+    def forward(
+        self, waveform: Tensor, audiogram: AudiogramLike | None = None, **sliders: Any
+    ) -> Tensor:
+        """Return the output for whole signals.
+
+        Args:
+            waveform: Signals of the microphones.
+            audiogram: Ears of the listener, by default those of the aid.
+            sliders: Further arguments of the aid, such as ``noise_reduction=0.0``.
+
+        Shape: (..., microphones, ears, time) -> (..., ears, time).
+        """
+        output: Tensor = self.aid(self.front_end(waveform), audiogram, **sliders)
+        return output
+
+
+def look_ahead_samples(sample_rate: int) -> int:
+    """Return the look-ahead of the filters in samples, at most 1 ms."""
+    return int(LOOK_AHEAD * sample_rate)
+
+
+def filter_length(sample_rate: int) -> int:
+    """Return the length of the filters in samples, with the look-ahead."""
+    return look_ahead_samples(sample_rate) + int(FILTER_SECONDS * sample_rate)
+
+
+def design_frequencies(sample_rate: int) -> NDArray[np.float64]:
+    """Return the frequencies in Hz at which filters are designed, from 0 to half the rate."""
+    return np.fft.rfftfreq(4 * filter_length(sample_rate), 1.0 / sample_rate)
+
+
+def differential_taps(
+    delay: float, spacing: float, lowest: float, sample_rate: int
+) -> NDArray[np.float64]:
+    """Design the filters of the front and rear microphone of a differential microphone.
+
+    Args:
+        delay: Delay of the rear microphone, relative to the time in which sound passes the spacing.
+        spacing: Distance between the microphones in m.
+        lowest: Frequency in Hz at which the output for sound from the front is 3 dB softer.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Impulse responses, (2, length).
+    """
+    omega = 2.0 * np.pi * design_frequencies(sample_rate)
+    travel = spacing / SPEED_OF_SOUND
+    # Sound from the front passes the pair in the travel time, and is then delayed once more.
+    total = travel * (1.0 + delay)
+    decay = np.exp(-2.0 * np.pi * lowest * total)
+    front = 0.5 * (1.0 + decay) / (1.0 - decay * np.exp(-1j * omega * total))
+    rear = -front * np.exp(-1j * omega * travel * delay)
+    return _impulse_responses(np.stack((front, rear)), sample_rate)
+
+
+def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.float64]:
+    """Design the filters of ``BinauralMVDR`` by least squares over their coefficients (Frost 1972).
+
+    Returns: (ears, microphones, ears, length).
+    """
+    frequencies = design_frequencies(sample_rate)
+    noise = head_responses(evenly_spread_directions(_NOISE_DIRECTIONS), frequencies, spacing)
+    noise = noise.reshape(_NOISE_DIRECTIONS, 4, -1)
+    front = head_responses(unit_vectors([0.0]), frequencies, spacing).reshape(4, -1)
+    covariance = np.einsum("dif,djf->ijf", noise, noise.conj()) / _NOISE_DIRECTIONS
+    covariance += loading * np.eye(4)[..., None]
+    covariance += _DISTORTION_WEIGHT * front[:, None] * front.conj()
+    before = look_ahead_samples(sample_rate)
+    length = filter_length(sample_rate)
+    lags = np.arange(length) - np.arange(length)[:, None]
+    matrix = np.fft.irfft(covariance)[..., lags]
+    matrix = matrix.transpose(0, 2, 1, 3).reshape(4 * length, 4 * length)
+    delay = np.exp(-2j * np.pi * frequencies * before / sample_rate)
+    wanted = front[:2, None] * delay * front.conj()
+    goal = _DISTORTION_WEIGHT * np.fft.irfft(wanted)[..., :length]
+    taps = scipy.linalg.solve(matrix, goal.reshape(2, -1).T, assume_a="pos").T
+    return np.asarray(taps, dtype=np.float64).reshape(2, 2, 2, length)
+
+
+def _impulse_responses(responses: NDArray[np.complex128], sample_rate: int) -> NDArray[np.float64]:
+    """Convert frequency responses to impulse responses that begin ``LOOK_AHEAD`` before time 0.
+
+    The highest eighth of the frequencies fades out, so that little of the responses lies before.
+
+    Shape: (..., frequencies) -> (..., length).
+    """
+    bins = responses.shape[-1]
+    fade_bins = bins // 8
+    fade = np.ones(bins)
+    fade[-fade_bins:] = np.cos(np.linspace(0.0, 0.5 * np.pi, fade_bins)) ** 2
+    impulses = np.fft.irfft(responses * fade)
+    before = look_ahead_samples(sample_rate)
+    return np.roll(impulses, before, -1)[..., : filter_length(sample_rate)]

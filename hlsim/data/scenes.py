@@ -1,0 +1,187 @@
+"""Scenes for several microphones: talkers and noise around a spherical head, without a room."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.calibration import NEURO_RATE
+from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.data.mixing import mix
+from hlsim.dsp.sphere import evenly_spread_directions, head_responses, unit_vectors
+
+DIFFUSE_DIRECTIONS = 64
+"""Number of directions from which diffuse noise comes."""
+
+_LEAD_SECONDS = 0.002
+"""Length of the impulse responses before the time at which sound passes the centre of the head."""
+
+_RESPONSE_SECONDS = 0.032
+"""Length of the impulse responses."""
+
+
+class Scene(NamedTuple):
+    """Signals of the microphones of a scene.
+
+    Attributes:
+        input: Target and maskers at the microphones, (microphones, ears, time).
+        target: Target alone, likewise.
+
+    >>> Scene(torch.zeros(2, 2, 10), torch.zeros(2, 2, 10)).input.shape
+    torch.Size([2, 2, 10])
+    """
+
+    input: Tensor
+    target: Tensor
+
+    @property
+    def reference(self) -> Tensor:
+        """The target at the front microphones, (ears, time), the clean speech of losses."""
+        return self.target[0]
+
+
+def make_scene(
+    target: Tensor,
+    maskers: Sequence[Tensor] = (),
+    azimuths: Sequence[float] = (),
+    *,
+    diffuse: Tensor | None = None,
+    snr: float,
+    target_azimuth: float = 0.0,
+    spacing: float = 0.01,
+    sample_rate: int = NEURO_RATE,
+    seed: int = 0,
+) -> Scene:
+    """Place a talker, maskers and diffuse noise around a listener with two microphones a side.
+
+    All sounds come as plane waves from the horizontal plane to a rigid sphere, see
+    ``hlsim.dsp.sphere``; there is no room. Diffuse noise comes from 64 directions that are evenly
+    spread over the sphere, with another part of the recording from each.
+
+    Args:
+        target: Speech at its level at the centre of the head without the head, (time,).
+        maskers: Other talkers or noises at their relative levels, (time,) or longer.
+        azimuths: Azimuth of each masker in degrees, 0 in front, 90 on the left.
+        diffuse: Recording of noise with the level of a masker that becomes diffuse, at least as
+            long as the target.
+        snr: Signal-to-noise ratio at the microphones in dB: the active level of the target minus
+            the level of all other sounds, with the powers of all microphones averaged.
+        target_azimuth: Azimuth of the target in degrees.
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate of all signals in Hz, 16000 to 48000.
+        seed: Seed of the parts of the recording for diffuse noise, 0 or more.
+
+    Returns:
+        The scene. Sound from the front arrives at the time it has in ``target``.
+
+    Raises:
+        ValueError: A signal is not valid, silent or too short, there is no masker and no diffuse
+            noise, there is not one azimuth for each masker, or a number is out of range.
+
+    >>> import hlsim
+    >>> speech = hlsim.example_speech()
+    >>> scene = make_scene(speech, [speech.flip(-1)], [120.0], snr=0.0)
+    >>> scene.input.shape
+    torch.Size([2, 2, 64320])
+    """
+    rate = check_rate(sample_rate)
+    check_number("snr", snr, -100.0, 100.0)
+    check_number("seed", seed, 0, 2**32 - 1, whole=True)
+    if len(maskers) != len(azimuths):
+        raise ValueError(
+            f"expected one azimuth for each of {len(maskers)} maskers, got {len(azimuths)}"
+        )
+    if not maskers and diffuse is None:
+        raise ValueError("expected a masker or diffuse noise; pass one of them")
+    check_waveform(target, "target")
+    if target.ndim != 1:
+        raise ValueError(f"expected a target of shape (time,), got {tuple(target.shape)}")
+    time = len(target)
+    target_at_ears = sound_at_microphones(
+        target[None], unit_vectors([target_azimuth]), spacing, rate
+    )
+    noise_at_ears = torch.zeros_like(target_at_ears)
+    for masker, azimuth in zip(maskers, azimuths, strict=True):
+        sound, direction = _cut(masker, time)[None], unit_vectors([azimuth])
+        noise_at_ears += sound_at_microphones(sound, direction, spacing, rate)
+    if diffuse is not None:
+        _cut(diffuse, time)
+        shifts = np.random.default_rng(seed).integers(diffuse.shape[-1], size=DIFFUSE_DIRECTIONS)
+        parts = torch.stack([diffuse.roll(int(shift))[:time] for shift in shifts])
+        directions = evenly_spread_directions(DIFFUSE_DIRECTIONS)
+        gain = DIFFUSE_DIRECTIONS**-0.5
+        noise_at_ears += gain * sound_at_microphones(parts, directions, spacing, rate)
+    channels = target_at_ears.flatten(0, 1)
+    mixture = mix(channels, noise_at_ears.flatten(0, 1), snr, rate, channels=True)
+    return Scene(mixture.reshape(target_at_ears.shape), target_at_ears)
+
+
+def _cut(signal: Tensor, time: int) -> Tensor:
+    """Validate a masker, (at least time,), and return its beginning."""
+    check_waveform(signal, "masker")
+    if signal.ndim != 1 or len(signal) < time:
+        raise ValueError(
+            f"expected maskers of shape (time,) with at least {time} samples as the target has, "
+            f"got {tuple(signal.shape)}; repeat a short masker"
+        )
+    return signal[:time]
+
+
+def sound_at_microphones(
+    signals: Tensor,
+    directions: NDArray[np.float64],
+    spacing: float = 0.01,
+    sample_rate: int = NEURO_RATE,
+) -> Tensor:
+    """Compute the sound of plane waves at the microphones on a spherical head.
+
+    Args:
+        signals: Sound from each direction at the centre of the head without the head, (...,
+            directions, time).
+        directions: Unit vectors of the directions, (directions, 3), see ``hlsim.dsp.sphere``.
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        The sum over the directions, (..., microphones, ears, time).
+
+    >>> sound_at_microphones(torch.zeros(3, 1, 100), unit_vectors([90.0])).shape
+    torch.Size([3, 2, 2, 100])
+    """
+    time = signals.shape[-1]
+    responses = head_impulse_responses(directions, spacing, sample_rate)
+    lead = int(_LEAD_SECONDS * sample_rate)
+    points = scipy.fft.next_fast_len(time + responses.shape[-1], real=True)
+    spectra = np.fft.rfft(signals.detach().double().cpu().numpy(), points)
+    filters = np.fft.rfft(responses, points)
+    sums = np.einsum("...df,dmef->...mef", spectra, filters)
+    filtered = np.fft.irfft(sums, points)[..., lead : lead + time]
+    return torch.from_numpy(filtered).to(signals)
+
+
+def head_impulse_responses(
+    directions: NDArray[np.float64], spacing: float = 0.01, sample_rate: int = NEURO_RATE
+) -> NDArray[np.float64]:
+    """Compute impulse responses from directions to the microphones on a spherical head.
+
+    Args:
+        directions: Unit vectors of the directions, (directions, 3).
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Impulse responses, (directions, microphones, ears, length). Sound passes the centre of the
+        head 2 ms after their beginning.
+
+    >>> head_impulse_responses(unit_vectors([0.0])).shape
+    (1, 2, 2, 512)
+    """
+    points = int(_RESPONSE_SECONDS * sample_rate)
+    frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
+    lead = int(_LEAD_SECONDS * sample_rate)
+    delay = np.exp(-2j * np.pi * frequencies * lead / sample_rate)
+    return np.fft.irfft(head_responses(directions, frequencies, spacing) * delay, points)

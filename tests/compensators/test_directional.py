@@ -1,0 +1,198 @@
+"""Tests of directional microphones against the theory of arrays."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import hlsim
+from compensators import NALR
+from compensators.directional import (
+    AdaptiveDifferentialMicrophone,
+    BinauralMVDR,
+    DifferentialMicrophone,
+    DirectionalAid,
+    FilterAndSum,
+)
+from hlsim.data.scenes import make_scene
+from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
+
+HERTZ = np.array([500.0, 1000.0, 2000.0, 4000.0])
+FRONT_ENDS = [DifferentialMicrophone, AdaptiveDifferentialMicrophone, BinauralMVDR]
+
+# Directivity index in dB and angle of the null in degrees of the first-order patterns, for instance
+# in Elko 2004: 10 log10(3) for dipole and cardioid, 10 log10(4) for the hypercardioid
+PATTERNS = {
+    "dipole": (4.77, 90.0),
+    "cardioid": (4.77, 180.0),
+    "supercardioid": (5.72, 125.0),
+    "hypercardioid": (6.02, 109.5),
+}
+
+
+def filter_responses(front_end: FilterAndSum, hertz: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Compute the frequency responses. Returns: (ears, microphones, ears, frequencies)."""
+    taps = front_end.taps.double().numpy()
+    samples = np.arange(taps.shape[-1]) - front_end.latency
+    return np.asarray(taps @ np.exp(-2j * np.pi * np.outer(samples, hertz) / 16000.0))
+
+
+def free_field(directions: NDArray[np.float64], spacing: float) -> NDArray[np.complex128]:
+    """Compute the responses of two microphones without a head, (directions, 2, frequencies)."""
+    towards_front = directions[:, :1] * [0.0, -spacing]
+    return np.asarray(np.exp(2j * np.pi * towards_front[..., None] / SPEED_OF_SOUND * HERTZ))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_patterns_have_the_directivity_and_the_null_of_theory(pattern: str) -> None:
+    index, null = PATTERNS[pattern]
+    weights = filter_responses(DifferentialMicrophone(pattern), HERTZ)[0, :, 0]
+
+    def response(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.abs((weights * free_field(directions, 0.01)).sum(1)) ** 2
+
+    front = response(unit_vectors([0.0]))[0]
+    diffuse = response(evenly_spread_directions(1000)).mean(0)
+    np.testing.assert_allclose(10.0 * np.log10(front / diffuse), index, atol=0.5)
+    np.testing.assert_allclose(10.0 * np.log10(front[1:]), 0.0, atol=0.2)
+    assert (response(unit_vectors([null]))[0] / front).max() < 10.0**-2.5
+
+
+def test_low_frequencies_fall_by_3_db_at_the_lowest() -> None:
+    weights = filter_responses(DifferentialMicrophone(lowest=300.0), np.array([300.0]))[0, :, 0]
+    spacing = 0.01 / SPEED_OF_SOUND
+    waves = np.exp(-2j * np.pi * 300.0 * np.array([[0.0], [spacing]]))
+    assert 20.0 * np.log10(abs((weights * waves).sum())) == pytest.approx(-3.0, abs=0.1)
+
+
+def test_mvdr_reaches_the_directivity_that_its_microphones_allow() -> None:
+    weights = filter_responses(BinauralMVDR(loading=1e-3), HERTZ)
+    directions = evenly_spread_directions(500)
+    noise, front = head_responses(directions, HERTZ), head_responses(unit_vectors([0.0]), HERTZ)[0]
+    passed = (weights * front).sum((1, 2))
+    np.testing.assert_allclose(passed, front[0], rtol=0.01)
+
+    output = np.abs(np.einsum("emsf,dmsf->def", weights, noise)) ** 2
+    gain = 10.0 * np.log10((np.abs(noise[:, 0]) ** 2).mean(0) / output.mean(0))
+    flat = noise.reshape(len(directions), 4, -1)
+    covariance = np.einsum("dif,djf->fij", flat, flat.conj()) / len(directions)
+    steering = front.reshape(4, -1).T
+    solved = np.linalg.solve(covariance + 1e-3 * np.eye(4), steering[..., None])[..., 0]
+    best = (steering.conj() * solved).sum(-1).real * covariance[:, 0, 0].real
+    best /= np.abs(steering[:, 0]) ** 2
+    np.testing.assert_allclose(gain[0], 10.0 * np.log10(best), atol=0.5)
+    assert (gain > 6.0).all()
+
+
+@pytest.fixture(scope="module")
+def speech() -> Tensor:
+    return hlsim.example_speech()[8000:24000]
+
+
+@pytest.fixture(scope="module")
+def noise(speech: Tensor) -> Tensor:
+    """Noise with the spectrum of the speech, (48000,)."""
+    white = np.random.default_rng(0).normal(size=3 * len(speech))
+    spectrum = np.fft.rfft(white) * abs(np.fft.rfft(speech.numpy(), len(white)))
+    return torch.from_numpy(np.fft.irfft(spectrum)).float()
+
+
+def benefit(front_end: FilterAndSum, **masker: Tensor | list[Tensor] | list[float]) -> float:
+    """Return by how much the SNR of both ears rises in dB (Hagerman and Olofsson 2004)."""
+    target = hlsim.example_speech()[8000:24000]
+    scene = make_scene(target, snr=0.0, **masker)  # type: ignore[arg-type]  # by name
+    noise = scene.input - scene.target
+    plus, minus = front_end(scene.input), front_end(scene.target - noise)
+    after = (plus + minus).square().mean() / (plus - minus).square().mean()
+    before = scene.target[0].square().mean() / noise[0].square().mean()
+    return float(10.0 * (after / before).log10())
+
+
+def test_directional_microphones_reduce_noise_from_behind_and_diffuse_noise(noise: Tensor) -> None:
+    for front_end in FRONT_ENDS:
+        assert benefit(front_end(), diffuse=noise) > 3.0
+        assert benefit(front_end(), maskers=[noise], azimuths=[135.0]) > 5.0
+
+
+def test_the_null_of_the_adaptive_microphone_follows_the_noise(noise: Tensor) -> None:
+    adaptive, cardioid = AdaptiveDifferentialMicrophone(), DifferentialMicrophone("cardioid")
+    at_side: dict[str, list[Tensor] | list[float]] = {"maskers": [noise], "azimuths": [95.0]}
+    assert benefit(adaptive, **at_side) > benefit(cardioid, **at_side) + 2.0
+    behind: dict[str, list[Tensor] | list[float]] = {"maskers": [noise], "azimuths": [180.0]}
+    assert benefit(adaptive, **behind) > benefit(cardioid, **behind) - 1.0
+
+
+@pytest.mark.parametrize("build", FRONT_ENDS)
+def test_stream_is_the_whole_signal_delayed(build: Callable[[], FilterAndSum]) -> None:
+    front_end = build()
+    signals = torch.from_numpy(np.random.default_rng(1).normal(size=(3, 2, 2, 3000)))
+    stream = front_end.stream()
+    output = torch.cat([stream(chunk) for chunk in signals.split([1, 700, 63, 64, 2172], -1)], -1)
+    latency = front_end.latency
+    assert 0 < latency <= 16
+    torch.testing.assert_close(output[..., latency:], front_end(signals)[..., :-latency])
+
+
+@pytest.mark.parametrize("build", FRONT_ENDS)
+def test_gradients_reach_the_microphones(build: Callable[[], FilterAndSum]) -> None:
+    signals = torch.from_numpy(np.random.default_rng(2).normal(size=(1, 2, 2, 40)))
+    signals.requires_grad_()
+    assert torch.autograd.gradcheck(build(), signals, nondet_tol=1e-10)
+
+
+@pytest.mark.parametrize("build", FRONT_ENDS)
+def test_another_rate_passes_the_front(build: Callable[..., FilterAndSum]) -> None:
+    rate = 22050
+    time = rate // 4
+    tone = torch.from_numpy(np.sin(2.0 * np.pi * 1000.0 * np.arange(time) / rate))
+    scene = make_scene(tone, [tone.flip(-1)], [180.0], snr=100.0, sample_rate=rate)
+    output = build(sample_rate=rate)(scene.target)
+    middle = slice(time // 4, -time // 4)
+    ratio = output[..., middle].square().mean() / scene.reference[..., middle].square().mean()
+    assert abs(float(10.0 * ratio.log10())) < 1.0
+
+
+def test_silence_gives_silence_and_finite_gradients() -> None:
+    signals = torch.zeros(2, 2, 100, requires_grad=True)
+    output = AdaptiveDifferentialMicrophone()(signals)
+    output.sum().backward()
+    assert not output.any()
+    assert signals.grad is not None
+    assert signals.grad.isfinite().all()
+
+
+def test_directional_aid_is_a_front_end_and_an_aid(speech: Tensor, noise: Tensor) -> None:
+    scene = make_scene(speech, [noise], [120.0], snr=0.0)
+    front_end = DifferentialMicrophone()
+    output = DirectionalAid(front_end, NALR())(scene.input, ["N2", "N4"])
+    torch.testing.assert_close(output, NALR()(front_end(scene.input), ["N2", "N4"]))
+
+
+def test_filters_can_be_trained_through_the_loss(speech: Tensor, noise: Tensor) -> None:
+    scene = make_scene(speech, [noise], [120.0], snr=0.0)
+    front_end = BinauralMVDR()
+    front_end.taps = torch.nn.Parameter(front_end.taps)
+    loss = hlsim.HearingLossLoss(["N2", "N3"], simulator="msbg")
+    optimiser = torch.optim.SGD(front_end.parameters(), lr=1e-4)
+    before = loss(front_end(scene.input), scene.reference)
+    before.backward()
+    optimiser.step()
+    assert float(loss(front_end(scene.input), scene.reference)) < float(before)
+
+
+def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
+    front_end = DifferentialMicrophone()
+    for shape in [(3, 2, 100), (2, 1, 100), (2, 100), (100,)]:
+        with pytest.raises(ValueError, match="2 microphones at 2 ears"):
+            front_end(torch.zeros(shape))
+    with pytest.raises(ValueError, match="2 microphones at 2 ears"):
+        front_end.stream()(torch.zeros(2, 100))
+    with pytest.raises(ValueError, match="expected a pattern out of dipole"):
+        DifferentialMicrophone("omni")
+    with pytest.raises(ValueError, match="spacing"):
+        AdaptiveDifferentialMicrophone(spacing=1.0)
+    with pytest.raises(ValueError, match="loading"):
+        BinauralMVDR(loading=0.0)
