@@ -1,4 +1,4 @@
-"""Directional microphones: front ends that turn the signals of several microphones into one per ear.
+"""Directional microphones: front ends that turn several microphones into one signal per ear.
 
 Inputs have the shape (..., microphones, ears, time): at each side of the head, a front and a rear
 microphone, left side first. Outputs have the shape (..., ears, time), which any aid of two ears
@@ -360,7 +360,8 @@ def filter_length(sample_rate: int) -> int:
 
 def design_frequencies(sample_rate: int) -> NDArray[np.float64]:
     """Return the frequencies in Hz at which filters are designed, from 0 to half the rate."""
-    return np.fft.rfftfreq(4 * filter_length(sample_rate), 1.0 / sample_rate)
+    points = 4 * filter_length(sample_rate)
+    return np.linspace(0.0, sample_rate / 2.0, points // 2 + 1)
 
 
 def differential_taps(

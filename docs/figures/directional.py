@@ -2,11 +2,11 @@
 
     python docs/figures/directional.py [TRIPLETS]
 
-Digits come from the front, and noise with their spectrum at 65 dB SPL from one direction on the left
-or from all directions (64), to a rigid sphere with two microphones a side. The left ear is tested
-with `hearing-aid` without noise reduction, behind each front end. A signal-to-noise ratio is that at
-the centre of the head without the head. The table has the speech reception threshold with the front
-microphone alone, and how far each front end lowers it, in dB with 95 % intervals.
+Digits come from the front, and noise with their spectrum at 65 dB SPL from one direction on the
+left or from all directions (64), to a rigid sphere with two microphones a side. The left ear is
+tested with `hearing-aid` without noise reduction, behind each front end. A signal-to-noise ratio is
+that at the centre of the head without the head. The table has the speech reception threshold with
+the front microphone alone, and how far each front end lowers it, in dB with 95 % intervals.
 """
 
 import sys
@@ -79,12 +79,12 @@ def main(triplets: str = "120") -> None:
         )
         for label in EARS:
             ear = torch.tensor(Audiogram.standard(label).thresholds)
-            front, *others = [
+            front, *directional = [
                 placed.measure(ear, partial(aided, front_end)) for front_end in FRONT_ENDS.values()
             ]
             cells = [f"{front.value:.1f} [{front.low:.1f}, {front.high:.1f}]"]
-            for other in others:
-                benefit = subtract(front, other)
+            for threshold in directional:
+                benefit = subtract(front, threshold)
                 cells.append(f"{benefit.value:.1f} [{benefit.low:.1f}, {benefit.high:.1f}]")
             print(f"| {label}, {name} | {' | '.join(cells)} |", flush=True)
 
