@@ -59,7 +59,7 @@ _COLUMN_NOTES = (
     "the level that a normal ear perceives of the same input, with its noise, and minus the "
     "target of --loudness. Its default of 0 dB, normal loudness, is louder than most people "
     "prefer. The band error is "
-    "the median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms, "
+    "the median absolute difference between the levels of 24 bands in frames of 32 ms, "
     "perceived by the impaired ear and, for clean speech, by a normal ear, both by the exact "
     "MSBG, where the latter is audible. A peak of 94 dB SPL is a sample of 1.0.",
     "A condition at a compensator's level is a prescription (NAL-R, unless --rival chose another "
@@ -86,7 +86,7 @@ _GAP = (
     "network has a lower loss under the network."
 )
 _GAINS = (
-    f"Output power over input power in ERB-wide bands, for {UTTERANCES} clips of speech. A linear "
+    f"Output power over input power in 24 bands, for {UTTERANCES} clips of speech. A linear "
     "prescription has one curve for all levels; less gain for louder speech is compression."
 )
 _TONES = (
@@ -113,11 +113,11 @@ _DIGITS = (
 
 
 def compensators_page(evaluation: Evaluation) -> Page:
-    """Return the page about compensators.
+    """Return the page of ``evaluate-compensator``.
 
     Its sections are scores, sounds, gains, digits in noise if their thresholds were measured,
-    "Could it be worn?" and details. The players have items
-    of the first group, which is clean speech if there is any.
+    "Could it be worn?" and details. The players have items of the first group, which is clean
+    speech if there is any.
 
     Args:
         evaluation: Evaluation of ``evaluate_compensators``.
@@ -154,7 +154,7 @@ def compensators_page(evaluation: Evaluation) -> Page:
 
 
 def _about(evaluation: Evaluation) -> str:
-    """Return sentences about the items and the scores."""
+    """Return a text about items, ears, levels and scores for the section "Scores"."""
     settings = evaluation.settings
     levels = ", ".join(f"{level:g}" for level in settings["levels"])
     ears = evaluation.table["ear"].nunique()
@@ -166,12 +166,15 @@ def _about(evaluation: Evaluation) -> str:
 
 
 def _columns(group: Evaluation) -> Columns:
-    """Return the columns of a table of scores."""
+    """Return the columns of a table of scores: those of all pages, and ``_COLUMNS``."""
     return {**score_columns(group), **_COLUMNS}
 
 
 def _details(evaluation: Evaluation) -> Section:
-    """Return the folded section with tables, pictures and tests of each group, and tones."""
+    """Return the folded section "Details".
+
+    It has tables, tests and the surrogate gap of each group, and pictures of steady tones.
+    """
     gap = _GAP.format(simulator=evaluation.settings["simulator"])
     sections = []
     for name, group in evaluation.groups.items():
@@ -207,7 +210,7 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
 
 
 def _digit_sections(evaluation: Evaluation) -> list[Section]:
-    """Return the section with a table and a picture of thresholds in noise, if there are any."""
+    """Return a list with the section about reception thresholds, or an empty list without them."""
     results = evaluation.details.get("reception_thresholds")
     if results is None:
         return []
@@ -231,13 +234,13 @@ def _digit_sections(evaluation: Evaluation) -> list[Section]:
 
 
 def _format_estimate(estimate: Estimate, spec: str) -> str:
-    """Format an estimate with its interval."""
+    """Format an estimate with its interval in brackets; ``spec`` is the format of the numbers."""
     value, low, high = (format(number, spec) for number in estimate)
     return f"{value} [{low}, {high}]"
 
 
 def _tone_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw the loudness error of tones at the middle level over frequency, for each ear."""
+    """Return one picture per ear: loudness errors of tones at the middle level, for each aid."""
     colours = condition_colours(evaluation.conditions)
     curves: dict[str, dict[str, Any]] = {}
     for row in evaluation.details["steady_tones"]:

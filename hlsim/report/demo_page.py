@@ -47,7 +47,7 @@ _ABOUT_PICTURES = (
 def demo_page(evaluation: Evaluation) -> Page:
     """Return the page of ``hlsim demo``: verdict, sounds, pictures, details and three numbers.
 
-    The numbers are HASPI, the share of words understood and the error of loudness.
+    The numbers are HASPI, the share of words understood and the loudness error.
 
     Args:
         evaluation: Evaluation of ``evaluate_trained_aid``.
@@ -87,7 +87,7 @@ def result_table(evaluation: Evaluation) -> Table:
     understood, the mean output level in dB SPL, and the mean loudness error in dB.
 
     Args:
-        evaluation: Study of the demo's conditions.
+        evaluation: Evaluation of ``evaluate_trained_aid``.
     """
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),
@@ -100,7 +100,7 @@ def result_table(evaluation: Evaluation) -> Table:
 
 
 def _cards(evaluation: Evaluation) -> list[Card]:
-    """Return the cards with HASPI, words understood and loudness error of all conditions."""
+    """Return the three cards of the page: HASPI, words understood and loudness error."""
     columns = ["haspi", "loudness_error", "level"]
     means = evaluation.table.groupby("condition", sort=False)[columns].mean()
     haspi, errors = means["haspi"], means["loudness_error"]
@@ -141,7 +141,7 @@ def _decibels(value: float) -> str:
 
 
 def _draw_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw the levels that the ear perceives, those of speech over its thresholds, and the gain."""
+    """Return three pictures: perceived levels, speech beside the ear's thresholds, and gains."""
     details = evaluation.details
     ear = evaluation.sounds[0].ear
     colours = condition_colours(evaluation.conditions)

@@ -23,7 +23,7 @@ from hlsim.files import atomic_path, write_atomically
 from hlsim.progress import track
 
 SPECTROGRAM_LEVELS = (0.0, 90.0)
-"""Lowest and highest level of all spectrograms in dB SPL, for a bin of 50 Hz."""
+"""Levels in dB SPL of a bin of 50 Hz at the lower and the upper end of the colour scale."""
 
 SPECTROGRAM_COLOURS = ("#000004", "#3b0f70", "#8c2981", "#de4968", "#fe9f6d", "#fcfdbf")
 """Colours from the lowest level of a spectrogram to the highest, those of matplotlib's magma."""
@@ -38,7 +38,7 @@ class Table:
     Attributes:
         caption: Caption.
         header: Titles of the columns.
-        rows: Texts of each row, of which the first is the name of the row.
+        rows: Texts of each row, one per column. The first is the name of the row.
 
     >>> Table.from_rows("Scores", [{"Aid": "NAL-R", "HASPI": "0.93"}]).header
     ['Aid', 'HASPI']
@@ -50,18 +50,19 @@ class Table:
 
     @classmethod
     def from_rows(cls, caption: str, rows: Sequence[Mapping[str, str]]) -> Table:
-        """Return the table of these rows, without columns that are "n/a" in all rows.
+        """Build a table from rows, without columns that are "n/a" in all rows.
 
         Args:
             caption: Caption.
-            rows: Texts, each under the title of its column, with the same titles in each row.
+            rows: One dict per row from the title of a column to its text. All rows have the same
+                titles.
         """
         titles = rows[0] if rows else ()
         header = [title for title in titles if any(row[title] != "n/a" for row in rows)]
         return cls(caption, header, [[row[title] for title in header] for row in rows])
 
     def text(self) -> str:
-        """Return the table for a terminal, without the caption and the title of the first column.
+        """Return the table as text for a terminal, without caption and title of the first column.
 
         >>> print(Table("Scores", ("Aid", "HASPI"), [("none", "0.27"), ("NAL-R", "0.9")]).text())
               HASPI
@@ -104,9 +105,9 @@ class Sound:
         label: Name on the button.
         level: Level in dB SPL, which is shown beside the name.
         audio: Contents of a WAV file.
-        loudness: Level in dB relative to full scale with which the sound is played.
-        spectrogram: Contents of a PNG file whose edges are the edges of the spectrogram.
-        note: Text on the spectrogram, which says why it is black.
+        loudness: RMS level of the WAV file in dB relative to full scale.
+        spectrogram: Contents of a PNG file with the spectrogram, without axes or margins.
+        note: Text on the spectrogram, which says why it is black; empty if it is not.
 
     >>> Sound("unaided", 10.2, b"RIFF", -30.0, b"\\x89PNG").label
     'unaided'
@@ -128,10 +129,10 @@ class Player:
     one before.
 
     Attributes:
-        groups: Sounds by the heading of their group, which may be empty. The sounds of a group are
-            played with one gain.
-        seconds: Length of the sounds in seconds.
-        full_scale: Level in dB SPL for which full scale stands in the sounds of the first group.
+        groups: Sounds by the heading of their group, which may be empty. The sounds of a group have
+            one gain.
+        seconds: Duration of the longest sound in seconds.
+        full_scale: Level in dB SPL of a signal with RMS 1.0 in the WAV files of the first group.
 
     >>> sounds = [Sound("unaided", 10.2, b"RIFF", -30.0, b"\\x89PNG")]
     >>> player = Player({"": sounds}, seconds=4.0, full_scale=94.0)
@@ -179,8 +180,8 @@ class Card:
         title: Name of the number.
         value: The number, as text.
         meaning: Sentence that explains the number.
-        bars: For each condition its name, its number as text, and the length of its bar from 0 to
-            1. The bar of the last condition is highlighted.
+        bars: Name, number as text, and length of the bar from 0 to 1 of each condition. The bar of
+            the last condition is highlighted.
 
     >>> card = Card("HASPI", "0.93", "Predicted intelligibility.", [("NAL-R", "0.93", 0.93)])
     >>> "width: 93.0%" in Page("Aids", "", [], [card]).html()
@@ -226,7 +227,7 @@ class Page:
     Attributes:
         title: Heading.
         verdict: Result in one sentence, below the heading.
-        sections: Sections that support it.
+        sections: Sections of the page, in their order.
         cards: Numbers to remember, above the verdict.
 
     >>> print(Page("Aids", "NAL-R is better.", [Section("Scores", ["See below."])]).markdown())
@@ -250,7 +251,10 @@ class Page:
         return _render("page.html", page=self)
 
     def markdown(self) -> str:
-        """Return text and tables in Markdown, without sounds and pictures. Marks stay text."""
+        """Return text and tables in Markdown, without sounds and pictures.
+
+        Characters of the texts that have a meaning in Markdown are escaped.
+        """
         return _render("page.md", page=self)
 
 
@@ -265,10 +269,10 @@ def write_page(
     No file is replaced before all are on the disk, so that a full disk leaves all as they were.
 
     Args:
-        page: The page.
+        page: Page to write.
         data: Results for programs, such as those of ``Evaluation.to_dict``.
         out: Folder of the files. Files of these names are replaced; others stay.
-        further_files: Contents of further files of the folder by name.
+        further_files: Texts of further files in the folder, by the name of the file.
 
     Returns: The path of ``report.html``.
 
@@ -335,16 +339,16 @@ def _render(template: str, **values: Any) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """Return a text in which no character has a meaning in Markdown, such as that of an image.
+    """Escape the characters of a text that have a meaning in Markdown.
 
-    Brackets have one only before a parenthesis, a colon or other brackets.
+    Closing brackets have a meaning only before a parenthesis, a colon or other brackets.
     """
     marks = r"([\\`*|~]|(?<!\w)_|_(?!\w)|^>|^[#+-](?=[\s#])|(?<=\])[(:\[])"
     return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", re.sub(marks, r"\\\1", " ".join(text.split())))
 
 
 def _data_uri(data: bytes) -> str:
-    """Return the contents of a file as a URI: PNG or WAV by its first bytes, or else SVG."""
+    """Return the contents of a PNG, WAV or SVG file as a data URI, with base64."""
     types = {b"\x89PNG": "image/png", b"RIFF": "audio/wav"}
     media_type = types.get(data[:4], "image/svg+xml")
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"

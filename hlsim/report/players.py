@@ -38,7 +38,7 @@ def listening_sections(evaluation: Evaluation, about: str = _EXPLANATION) -> lis
     """Return the section "Listen" of a page, with one player per item that has sounds.
 
     Args:
-        evaluation: The evaluation of the page.
+        evaluation: Evaluation of the page, whose attribute ``sounds`` is played.
         about: Sentences about the sounds.
 
     Returns: The section, or an empty list if no item has sounds.
@@ -57,7 +57,14 @@ def listening_sections(evaluation: Evaluation, about: str = _EXPLANATION) -> lis
 
 
 def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> Section:
-    """Return the player of an item, with its rank by the headline comparison."""
+    """Return the section with the player of an item, and facts about its ear.
+
+    The heading has the name of the item, and the change of its score and its rank, if it has one.
+
+    Args:
+        headline: Comparison by which items are ranked, or None.
+        sounds: Sounds of the item.
+    """
     title = sounds.name
     if headline is not None and sounds.change is not None:
         place, count = sounds.rank
@@ -80,8 +87,9 @@ def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) ->
     different gains, because the output of an aid is much louder than what the ear perceives of it.
 
     Args:
-        groups: For each group, under its heading, which may be empty, the signals in pascals, each
-            under the label of its button. Shape of each signal: (time,) or (channels, time).
+        groups: Signals in pascals, as a dict from the heading of a group, which may be empty, to a
+            dict from the label of a button to a signal. Shape of each signal: (time,) or (channels,
+            time).
         sample_rate: Sample rate in Hz.
 
     Raises:
@@ -109,13 +117,13 @@ def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) ->
 
 
 def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> Sound:
-    """Encode a signal in pascals, and draw its spectrogram.
+    """Encode a signal as a WAV file, and draw its spectrogram.
 
     Args:
         label: Name on the button.
-        signal: The signal. Shape: (time,) or (channels, time).
+        signal: Signal in pascals. Shape: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
-        peak: Largest sample of all signals of the group, which is played as 0.9.
+        peak: Largest magnitude in pascals of all signals of the group, which becomes 0.9.
     """
     level = float(level_spl(signal.flatten()))
     levels = spectrogram_levels(signal, sample_rate)
@@ -130,7 +138,7 @@ def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> So
 
 
 def _describe_black(levels: Tensor) -> str:
-    """Return why a spectrogram looks black, or an empty text if it does not.
+    """Return the reason why a spectrogram looks black, or an empty text if it does not.
 
     Args:
         levels: Levels in dB SPL. Shape: (bins, frames).
@@ -142,7 +150,7 @@ def _describe_black(levels: Tensor) -> str:
 
 
 def _peak(group: Mapping[str, Tensor]) -> float:
-    """Return the largest magnitude of a sample in a group of signals.
+    """Return the largest magnitude of a sample in a group of signals by label.
 
     Raises:
         ValueError: All signals are silent.
@@ -157,20 +165,20 @@ def _peak(group: Mapping[str, Tensor]) -> float:
 
 
 def _full_scale(peak: float) -> float:
-    """Return the level in dB SPL of full scale if a peak in pascals is played as 0.9."""
+    """Return the level in dB SPL of an RMS of 1.0, if a peak in pascals becomes 0.9."""
     return PASCAL_SPL + 20.0 * math.log10(peak / _PEAK)
 
 
 def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     """Compute the spectrogram of a signal up to 8 kHz, in windows of 20 ms every 10 ms.
 
-    The powers of several channels are averaged.
+    If there are several channels, their powers are averaged.
 
     Args:
         signal: Signal in pascals. Shape: (time,) or (channels, time).
         sample_rate: Sample rate in Hz.
 
-    Returns: Levels in dB SPL in bins of 50 Hz, at least -46. Shape: (bins, frames).
+    Returns: Levels in dB SPL in bins of 50 Hz, from 0 Hz, at least -46. Shape: (bins, frames).
 
     >>> spectrogram_levels(torch.zeros(16000), 16000).shape
     torch.Size([161, 101])
@@ -186,7 +194,11 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
 
 
 def _spectrogram_png(levels: Tensor) -> bytes:
-    """Return a PNG file with one pixel per bin and frame, of levels in dB SPL (bins, frames)."""
+    """Return the contents of a PNG file with one pixel per bin and frame, low frequencies below.
+
+    Args:
+        levels: Levels in dB SPL. Shape: (bins, frames).
+    """
     image = require("PIL.Image", "eval")
     colours = require("matplotlib.colors", "eval").LinearSegmentedColormap
     lowest, highest = SPECTROGRAM_LEVELS

@@ -24,7 +24,7 @@ from hlsim.extras import require
 from hlsim.report.page import Picture
 
 INK = "#010203"
-"""Stand-in for the colour of text, which is dark on a light page and light on a dark page."""
+"""Placeholder for the colour of text, which is dark on a light page and light on a dark page."""
 
 _COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
 """Colours of lines and their labels, which can be read on white and on black."""
@@ -36,7 +36,7 @@ _LINE_STYLES = ("-", "--", ":", "-.")
 """Styles of the curves of one aid, from the lowest level to the highest."""
 
 _LINEAR_DB = 0.5
-"""Difference between the gains at two levels below which they are drawn as one curve."""
+"""Largest difference in dB between gains at several levels that are drawn as one curve."""
 
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH_INCHES = 4.2
@@ -66,16 +66,17 @@ _STYLE: dict[str, Any] = {
 _CSS = b"svg { color: #1a1c20 } @media (prefers-color-scheme: dark) { svg { color: #e6e8eb } }"
 
 Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mapping[str, Any]]
-"""Horizontal and vertical values of a curve, and keyword arguments of matplotlib for its line."""
+"""Horizontal values, vertical values, and matplotlib's properties of a line, such as ``color``."""
 
 
 def _draw_picture(
     draw: Callable[[Any], None], title: str, note: str = "", height: float = 3.2
 ) -> Picture:
-    """Return an SVG picture for a page, which a function draws on matplotlib axes.
+    """Return an SVG picture for a page, whose contents a function draws with matplotlib.
 
     Args:
-        draw: Function that is called with the axes when the picture is needed (``Picture.data``).
+        draw: Function that is called with matplotlib's axes when the picture is needed
+            (``Picture.data``).
         title: Heading above the picture.
         note: Sentence below the picture.
         height: Height in inches.
@@ -102,10 +103,10 @@ def _draw_svg(draw: Callable[[Any], None], height: float) -> bytes:
 
 
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
-    """Return the names of conditions with a colour of matplotlib for each.
+    """Return a colour of matplotlib for each condition, by its name.
 
     A condition that belongs to another one by its attribute ``of``, such as NAL-R at an aid's
-    level, has a paler version of that one's colour.
+    level, has the colour of that one, but paler.
 
     >>> condition_colours([Condition("unaided", kind="unaided"), Condition("mine")])
     {'unaided': '#7d828a', 'mine': '#2f7ed8'}
@@ -131,11 +132,12 @@ def curves_picture(
     """Draw curves over frequency in Hz, with a legend below them.
 
     Args:
-        curves: Frequencies, vertical values and a dictionary of matplotlib's line properties
-            for each curve, under the name that the legend shows.
+        curves: Frequencies in Hz, vertical values and matplotlib's line properties of each curve,
+            under the name that the legend shows.
         title: Heading above the picture.
         axis: Title of the vertical axis.
-        axis_range: Lower and upper end of the vertical axis; None is that of the curves.
+        axis_range: Values at the lower and the upper end of the vertical axis; None fits an end to
+            the curves.
         note: Sentence below the picture.
 
     >>> curves = {"aid": ([250, 1000, 4000], [5.0, 10.0, 20.0], {"color": "#2f7ed8"})}
@@ -156,7 +158,12 @@ def curves_picture(
 
 
 def verification_picture(result: Verification) -> Picture:
-    """Draw the percentiles of an aid's output between threshold and uncomfortable level.
+    """Draw the percentiles of an aid's output, their targets, threshold and uncomfortable level.
+
+    All are levels in dB SPL over frequency.
+
+    Args:
+        result: Result of ``verify``.
 
     >>> import hlsim
     >>> from hlsim.evaluation.fitting.verification import verify
@@ -187,8 +194,8 @@ def gain_picture(
 
     Args:
         title: Heading above the picture.
-        results: For each aid, a dictionary of its name ``aid``, ``levels`` in dB SPL,
-            ``frequencies`` in Hz, and ``gain_db`` with shape (levels, frequencies).
+        results: One dict per aid with its name ``aid``, ``levels`` in dB SPL, ``frequencies`` in
+            Hz, and ``gain_db`` with shape (levels, frequencies).
         colours: Colour of matplotlib for each aid.
 
     >>> curve = {"aid": "mine", "levels": [65.0], "frequencies": [250, 4000], "gain_db": [[5, 20]]}
@@ -212,12 +219,13 @@ def ears_picture(
     values: Sequence[tuple[str, str, Sequence[float]]],
     colours: Mapping[str, Any],
 ) -> Picture:
-    """Draw a value with its interval for each ear and aid, the aids of an ear side by side.
+    """Draw a value with its interval for each ear and aid, with the aids of an ear side by side.
 
     Args:
         title: Heading above the picture.
         axis: Title of the vertical axis.
-        values: Names of an ear and an aid, and the value with the limits of its interval.
+        values: Tuples (ear, aid, value), where the value has three numbers: the value itself, and
+            the lower and the upper limit of its interval.
         colours: Colour of matplotlib for each aid.
 
     >>> values = [("N3", "mine", (-5.0, -6.0, -4.0)), ("N4", "mine", (2.0, 1.0, 3.0))]
@@ -248,11 +256,11 @@ def ears_picture(
 
 
 def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
-    """Draw the mean of the most important score under each condition, with its 95 % interval.
+    """Draw the mean of the first score under each condition, with its 95 % interval.
 
     Args:
-        evaluation: The evaluation.
-        part: Name of the part of the items, for the title.
+        evaluation: Evaluation with the scores.
+        part: Name of the part of the items, such as "Clean speech", for the title.
 
     Returns: The picture, or an empty list if fewer than two conditions have scores.
 
@@ -298,7 +306,10 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
 
 
 def scores_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Draw both scores of each item by which an evaluation's conditions are compared.
+    """Draw each item's scores under the two conditions of ``evaluation.headline`` as a point.
+
+    Args:
+        evaluation: Evaluation with comparisons.
 
     Returns: The picture, or an empty list if there is no comparison of two or more items.
 

@@ -61,7 +61,7 @@ def write_report(evaluation: Evaluation, out: str | Path) -> Path:
 
 
 def report_page(evaluation: Evaluation) -> Page:
-    """Return the page about recorded speech: verdict, scores, sounds, details.
+    """Return the page of ``haspi-report``: verdict, scores, sounds and details.
 
     Args:
         evaluation: Evaluation of ``haspi_report``.
@@ -98,7 +98,7 @@ def report_page(evaluation: Evaluation) -> Page:
 
 
 def _words(evaluation: Evaluation, c: ConditionComparison) -> list[str]:
-    """Return sentences about the words understood, if the headline is that of HASPI."""
+    """Return sentences that predict the words understood, or none if ``c`` is not about HASPI."""
     if c.measure != "haspi":
         return []
     words = evaluation.words(c.before, c.after)
@@ -114,7 +114,7 @@ def _words(evaluation: Evaluation, c: ConditionComparison) -> list[str]:
 
 
 def scenes_page(evaluation: Evaluation) -> Page:
-    """Return the page about scenes: verdict, conditions, sounds, details.
+    """Return the page of ``clarity``: verdict, conditions, sounds and details.
 
     Args:
         evaluation: Evaluation of ``evaluate_scenes``.
@@ -149,9 +149,9 @@ def scenes_page(evaluation: Evaluation) -> Page:
 def _conditions_table(evaluation: Evaluation) -> Table:
     """Return a table with one row per condition.
 
-    The columns are mean scores, the level of the output, and the look-ahead in ms. Only those pairs
-    of scene and listener are used for which all conditions have scores, except conditions that have
-    no score at all.
+    The columns are mean scores, the output level in dB SPL, and the look-ahead in ms. Means are
+    over the pairs of scene and listener that have scores under all conditions. A condition without
+    any score does not count for this.
     """
     combined = evaluation.wide("combined").dropna(axis=1, how="all")
     scored = combined.notna().all(axis=1)

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
 
 
 def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float | None]:
-    """Return a function that computes a statistic of ``agreement`` for a column of a table."""
+    """Return a function that computes a statistic of ``agreement`` from the rows of a simulator.
+
+    Args:
+        score: ``"stoi"`` or ``"pesq"``.
+        statistic: ``"lcc"``, ``"srcc"`` or ``"mse"``.
+    """
     return lambda rows: agreement(rows, score)[statistic]
 
 
@@ -63,7 +68,7 @@ _FACTS = {
 
 
 def simulators_page(evaluation: Evaluation) -> Page:
-    """Return the page about simulators: verdict, side by side, sounds, details.
+    """Return the page of ``evaluate-simulator``: verdict, tables, sounds and details.
 
     Args:
         evaluation: Evaluation of ``evaluate_simulators``.
@@ -95,16 +100,16 @@ def simulators_page(evaluation: Evaluation) -> Page:
 
 
 def _teacher(evaluation: Evaluation) -> str:
-    """Return the name of the teacher for a sentence."""
+    """Return words for the teacher in a sentence: its name, or "the exact MSBG"."""
     teacher: str = evaluation.settings["teacher"]
     return "the exact MSBG" if teacher == "msbg" else teacher
 
 
 def _verdict(evaluation: Evaluation) -> str:
-    """Return a sentence about the simulator closest to the teacher for the first treatment.
+    """Return a sentence about the SNRs of the simulators for the first treatment, in dB.
 
-    The simulator with the highest median SNR is named with its worst tenth; the others with their
-    medians, in dB.
+    It names the simulator with the highest median first, with its worst tenth, and then the medians
+    of the others.
     """
     first = next(iter(evaluation.groups.values()))
     snr = first.wide("snr").dropna(axis=1, how="all")
@@ -121,7 +126,7 @@ def _verdict(evaluation: Evaluation) -> str:
 
 
 def _about(evaluation: Evaluation) -> str:
-    """Return sentences about the items and the columns of the tables."""
+    """Return a text about the items and the columns of the tables, for the section "Details"."""
     settings = evaluation.settings
     levels = ", ".join(f"{level:g}" for level in settings["levels"])
     text = (

@@ -44,9 +44,10 @@ SEVERITY_NOTE = (
 VERSION_NOTE = "HASPI and HASQI are computed in version 2, as by pyclarity 0.9."
 
 Columns = dict[str, tuple[Callable[["DataFrame"], Any], str]]
-"""Columns of a page's table by title: a function of some rows of the study's table, and a format.
+"""Columns of a page's table: a dict from title to a pair of a function and a format.
 
-The function returns a number, None or a text, and the format is that of Python's f-strings.
+The function computes the cell, a number, None or a text, from the rows of a study's table for one
+condition. The format is that of Python's f-strings, such as ``".1f"``.
 """
 
 _STATISTICS: dict[str, Callable[[Series], Any]] = {
@@ -88,10 +89,13 @@ def mean_level(score: str) -> Callable[[DataFrame], Any]:
 
 
 def score_columns(evaluation: Evaluation) -> Columns:
-    """Return the columns of a table of scores.
+    """Return the columns of a table of scores, for ``summary_table``.
 
     They are the number of items, mean and standard deviation of each score, and the mean output
     level in dB SPL. Number and level are those of the items that have the first score.
+
+    Args:
+        evaluation: Evaluation with the scores.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES, Condition
@@ -108,12 +112,15 @@ def score_columns(evaluation: Evaluation) -> Columns:
 
 
 def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
-    """Split a study's table into the rows of each condition, under its name.
+    """Split a study's table into the rows of each condition, and optionally of each value.
 
     Args:
-        table: The table.
+        table: Table of the study.
         fact: Column with a property of the items, such as ``"snr"`` or ``"severity"``, by whose
-            values the rows are split, too, in ascending order.
+            values the rows are split, too, in ascending order. Empty for conditions alone.
+
+    Returns:
+        Rows of the table by the name of the condition, which follows the value of ``fact``.
 
     >>> import pandas
     >>> rows = [("unaided", 5.0), ("aid", 5.0), ("unaided", 0.0), ("aid", 0.0)]
@@ -140,7 +147,7 @@ def summary_table(
     Args:
         caption: Caption of the table.
         table: Table of the study.
-        columns: Statistics by the title of their column.
+        columns: Functions that compute the cells, see ``Columns``.
         fact: Column by whose values the rows are split, too, see ``split_rows``.
         first: Title of the first column, which contains the names.
 
@@ -161,12 +168,14 @@ def summary_table(
 def fact_tables(
     table: DataFrame, columns: Columns, captions: Mapping[str, str], first: str = "Items"
 ) -> list[Table]:
-    """Return a table of statistics by each property of the items that has several values.
+    """Return one table of statistics for each property of the items that has several values.
+
+    A table has one row per value and condition.
 
     Args:
         table: Table of the study.
-        columns: Statistics by the title of their column.
-        captions: Caption of the table by the column with the property, such as ``"snr"``.
+        columns: Functions that compute the cells, see ``Columns``.
+        captions: Captions of the tables by the column with the property, such as ``"snr"``.
         first: Title of the first column, see ``summary_table``.
 
     >>> import pandas
@@ -199,7 +208,7 @@ def format_number(value: Any, form: str) -> str:
 
 
 def _mean_and_deviation(mean: float, deviation: float | None) -> str:
-    """Format a mean and its standard deviation, if there is one."""
+    """Format a mean, and its standard deviation unless it is None or NaN."""
     text = format_number(mean, ".3f")
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 
@@ -213,7 +222,11 @@ def comparison_table(
     number of pairs n, the means under both conditions, their change with its 95 % interval, the
     t-test, Wilcoxon's test, Cohen's d, and the p value of the t-test over the means of listeners or
     another unit. The other p values are those of the sentences on the page: adjusted by Holm's
-    method unless the comparison was planned.
+    method unless the comparison was planned. Columns that are "n/a" in all rows are left out.
+
+    Args:
+        comparisons: Comparisons, one per row.
+        caption: Caption of the table.
 
     >>> import pandas
     >>> from hlsim.evaluation import compare
@@ -235,7 +248,12 @@ def comparison_table(
 
 
 def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> dict[str, str]:
-    """Return the cells of a paired comparison by title, with p values that may be adjusted."""
+    """Return the cells of a paired comparison by the title of their column.
+
+    Args:
+        c: Statistics over the items.
+        p_t, p_w: P values of the t-test and of Wilcoxon's test to show, adjusted or not.
+    """
     interval = "" if c.ci_low is None else f" [{c.ci_low:+.3f}, {c.ci_high:+.3f}]"
     return {
         "n": str(c.n),
@@ -251,11 +269,11 @@ def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> 
 
 
 def _comparison_sections(evaluation: Evaluation) -> list[Section]:
-    """Return the sections of a page with all comparisons, and with the verdict's by unit.
+    """Return sections with all comparisons, and with the headline comparison by unit.
 
-    The first section is a table of all comparisons, if there is more than one. The second one
-    compares the verdict's pair over all items and over the means of a unit, such as listeners, if
-    these were tested. Without comparisons there are no sections.
+    The first section is a table of all comparisons, if there is more than one. The second one has
+    the headline comparison over all items and over the means of a unit, such as listeners, if these
+    were tested. Without comparisons, there are no sections.
     """
     headline, sections = evaluation.headline, []
     if headline is None:
@@ -279,12 +297,13 @@ def detail_section(
 ) -> Section:
     """Return the folded section "Details" at the end of a page.
 
-    It contains sections, the items that failed, and notes about the origin of the values.
+    It contains the passed sections, a table of failures if there are any, and the section "How the
+    values were computed" with the notes, the seed and the versions of packages.
 
     Args:
-        evaluation: The evaluation of the page.
-        sections: Inner sections.
-        notes: Sentences about the origin of the values.
+        evaluation: Evaluation of the page.
+        sections: Sections at the beginning.
+        notes: Sentences about how the values were computed.
 
     >>> import pandas
     >>> from hlsim.evaluation import Condition
@@ -308,8 +327,11 @@ def detail_section(
 def score_details(evaluation: Evaluation) -> Section:
     """Return the section "Details" of a page about scores.
 
-    It has, if there are any: several comparisons, the planned one by listener, means by SNR and by
-    degree of loss, the items that failed, and how the values were computed.
+    It has all comparisons, the headline comparison by unit, means by SNR and by degree of loss, and
+    failures, as far as there are any, and the notes on how the values were computed.
+
+    Args:
+        evaluation: Evaluation of the page.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation import haspi_report

@@ -19,12 +19,13 @@ _LEVEL_TOLERANCE_DB = 1.0
 def verdict(c: ConditionComparison, subject: str = "", rival: str = "", noun: str = "item") -> str:
     """Return a sentence that says which condition is better, with scores and p values.
 
-    A higher score is called better only at equal level, because HASPI rewards gain.
+    A higher score is called better only if the output levels differ by less than 1 dB, because
+    HASPI rises with gain.
 
     Args:
-        c: The comparison.
-        subject: Other words for the condition ``after``, which begin the sentence.
-        rival: Other words for the condition ``before``.
+        c: Comparison of two conditions.
+        subject: Words that begin the sentence instead of the name of the condition ``after``.
+        rival: Words instead of the name of the condition ``before``.
         noun: Singular noun for what is counted.
 
     >>> import pandas
@@ -58,10 +59,11 @@ def verdict(c: ConditionComparison, subject: str = "", rival: str = "", noun: st
 def limits(c: ConditionComparison) -> str:
     """Return the caveats of a verdict as text.
 
-    These are the change in level, items that are not independent, and items that are left out.
+    These are the change in level, items that are not independent, items that are left out, and that
+    the score is a prediction.
 
     Args:
-        c: The comparison.
+        c: Comparison of two conditions.
 
     >>> import pandas
     >>> from hlsim.evaluation import compare
@@ -88,7 +90,7 @@ def limits(c: ConditionComparison) -> str:
 
 
 def describe_means(evaluation: Evaluation) -> str:
-    """Return a sentence with the mean score of each condition, where none could be compared.
+    """Return a sentence with the mean score of each condition, to replace a verdict.
 
     Args:
         evaluation: Evaluation without comparisons.
@@ -115,7 +117,7 @@ def describe_means(evaluation: Evaluation) -> str:
 
 
 def describe_missing_pairs(evaluation: Evaluation) -> list[str]:
-    """Return a sentence about conditions that could not be compared, or none.
+    """Return a list with a note about conditions that were not compared, or an empty list.
 
     Args:
         evaluation: Evaluation with comparisons.
@@ -139,7 +141,7 @@ def describe_missing_pairs(evaluation: Evaluation) -> list[str]:
 
 
 def format_p(p: float) -> str:
-    """Return a p value as reports state it: with five decimals, or as ``p < 0.00001``.
+    """Format a p value for a sentence, with five decimals or as ``p < 0.00001``.
 
     >>> format_p(0.0125)
     'p = 0.01250'
@@ -157,7 +159,7 @@ def count_items(count: int, noun: str = "item") -> str:
 
 
 def _describe_tests(c: ConditionComparison) -> str:
-    """State the p values, which are the same wherever the comparison appears."""
+    """Return a text with the p values of both tests, and how they are adjusted."""
     tests = {"t-test": c.p_t, "Wilcoxon": c.p_w}
     stated = [f"{name} {format_p(p)}" for name, p in tests.items() if p is not None]
     if not stated:
@@ -170,9 +172,10 @@ def _describe_tests(c: ConditionComparison) -> str:
 
 
 def _significant_tests(c: ConditionComparison) -> list[bool]:
-    """Return for each test that can decide whether its p value is below ``_ALPHA``.
+    """Return whether the p value of each test is below ``_ALPHA``.
 
-    With few items, Wilcoxon's p exceeds ``_ALPHA`` even if all pairs change alike.
+    A test that is not defined is left out. So is Wilcoxon's test if there are so few items that its
+    p value cannot be below ``_ALPHA``.
     """
     decisions = [] if c.p_t is None else [c.p_t < _ALPHA]
     lowest_p = c.family * 2.0 ** (1 - (c.overall.n - c.overall.zeros))

@@ -24,7 +24,7 @@ def write_results(page: Page, evaluation: Evaluation, out: str | Path) -> Path:
 
     Args:
         page: Page of the evaluation.
-        evaluation: The evaluation.
+        evaluation: Evaluation whose data are written.
         out: Folder of the files.
 
     Returns: The path of ``report.html``.
@@ -49,7 +49,12 @@ def write_results(page: Page, evaluation: Evaluation, out: str | Path) -> Path:
 
 
 def _add_words(evaluation: Evaluation, comparisons: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the comparisons for ``report.json`` with a text about each."""
+    """Return the dicts of comparisons for ``report.json``, each with a text, ``in_words``.
+
+    Args:
+        evaluation: Evaluation with the comparisons.
+        comparisons: Dicts of these comparisons, in the same order.
+    """
     return [
         {**data, "in_words": f"{verdict(c)} {limits(c)}"}
         for c, data in zip(evaluation.comparisons, comparisons, strict=True)
@@ -57,10 +62,13 @@ def _add_words(evaluation: Evaluation, comparisons: list[dict[str, Any]]) -> lis
 
 
 def scores_table(evaluation: Evaluation) -> DataFrame:
-    """Return the table of an evaluation for ``scores.csv``, with one column per threshold.
+    """Return the table of an evaluation for ``scores.csv``.
+
+    The column ``audiogram`` is replaced by one column per threshold, and the column ``source`` is
+    left out. For Clarity's scenes, the column ``utterance`` is called ``scene``.
 
     Args:
-        evaluation: The evaluation.
+        evaluation: Evaluation with the table.
 
     >>> import pandas
     >>> row = {"item": 0, "condition": "aid", "audiogram": [20.0] * 8, "haspi": 0.5}

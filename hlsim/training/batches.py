@@ -32,19 +32,19 @@ from hlsim.data.tones_and_clicks import draw_sounds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 
 Batch = dict[str, Tensor]
-"""Tensors by name.
+"""Tensors of a batch by name.
 
 - ``signal``: input of the network in pascals with shape (items, time)
-- ``thresholds``: ears in dB HL with shape (items, 8)
+- ``thresholds``: thresholds of the ears in dB HL with shape (items, 8)
 - ``clean``: clean speech in pascals with shape (items, time)
 - ``noise_reduction`` (hearing aids): strength of noise reduction, 0 or 1, with shape (items,)
 """
 
 MAX_DEVICES = 64
-"""Number of batches per training step, from which each training device has one of its own."""
+"""Largest number of training devices. Each step has as many batches, and a device draws its own."""
 
 _VALIDATION_SECONDS = 2.0
-"""Duration of the clips for validation."""
+"""Duration in seconds of the clips for validation."""
 
 _VALIDATION_BATCH = 4
 """Number of items in a batch for validation."""
@@ -63,8 +63,8 @@ _MAX_BABBLE_VOICES = 4
 class TrainingData:
     """Files of speech, noise and ears for training and validation. Only speech is required.
 
-    What is missing for validation is taken from training. Without ``valid_speech``, validation
-    scores are therefore those of speakers that the network knows.
+    If data for validation are missing, those for training are used. Without ``valid_speech``,
+    validation scores are therefore those of speakers that the network knows.
 
     Attributes:
         speech: Folder or files of clean speech, see ``AudioFiles``.
@@ -134,7 +134,7 @@ class TrainingData:
         )
 
     def identity(self) -> str:
-        """Compute a hash of all recordings and ears, with which a training must resume.
+        """Compute a hash of all recordings and ears, which must be the same if a training resumes.
 
         See ``hash_source`` for what is read of large corpora.
 
@@ -149,7 +149,7 @@ class TrainingData:
 
 
 def _read_ears(table: Path) -> list[tuple[float, ...]]:
-    """Read the thresholds of measured ears in dB HL."""
+    """Read the ears of a table, as eight thresholds in dB HL each."""
     return [ear.thresholds for _, ear in read_audiograms(table, simulated=True)]
 
 
@@ -192,7 +192,10 @@ class _RandomBatches(Dataset[Batch]):
         raise NotImplementedError
 
     def draw_ears(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw random and measured ears in dB HL, or repeat the one ear. Shape: -> (count, 8)."""
+        """Draw random and measured ears, or repeat the one ear.
+
+        Returns: Thresholds in dB HL, (count, 8).
+        """
         if self.ear is not None:
             return self.ear.expand(count, -1)
         ears = draw_thresholds(count, generator)
@@ -202,13 +205,20 @@ class _RandomBatches(Dataset[Batch]):
         return replace_share(ears, self.measured_ears[numbers], _MEASURED_SHARE, generator)
 
     def replace_by_sounds(self, clips: Tensor, generator: torch.Generator) -> Tensor:
-        """Replace the recipe's share of clips by tones and clicks, see ``draw_sounds``."""
+        """Replace the recipe's share of clips by tones and clicks, see ``draw_sounds``.
+
+        Shape: (items, time) -> (items, time).
+        """
         sounds = draw_sounds(len(clips), clips.shape[-1], generator)
         return replace_share(clips, sounds, self.recipe.sounds, generator)
 
 
 class _SimulatorBatches(_RandomBatches):
-    """Batches for a simulator: speech, noise, tones and clicks, like the outputs of aids."""
+    """Batches for a simulator, whose input is like the output of aids.
+
+    It is clean or noisy speech, or tones and clicks, amplified and compressed if the recipe says
+    so.
+    """
 
     recipe: SimulatorRecipe
 
@@ -251,7 +261,10 @@ class _CompensatorBatches(_RandomBatches):
 
 
 def _babble(voices: Tensor) -> Tensor:
-    """Add up to four other items at equal levels, for each item."""
+    """Return, for each item, the sum of up to four other items at equal levels.
+
+    Shape: (items, time) -> (items, time).
+    """
     count = min(len(voices), _MAX_BABBLE_VOICES + 1)
     shifted = [set_level(voices.roll(shift, 0), 65.0) for shift in range(1, count)]
     return torch.stack(shifted).sum(0)
@@ -307,10 +320,10 @@ class BatchData(L.LightningDataModule):
 def make_data(
     data: TrainingData, recipe: TrainingRecipe, ear: Audiogram | None = None
 ) -> BatchData:
-    """Make the Lightning data module with the batches for a training.
+    """Build the Lightning data module with the batches for a training.
 
-    The speech of the batches for validation is not used for training. Clips for validation are not
-    equalised, amplified or compressed.
+    Clips for validation last 2 s, and are not equalised, amplified or compressed. If the data have
+    speech for validation, none of its files may be used for training.
 
     Args:
         data: Speech, noise and ears.

@@ -28,12 +28,15 @@ class CompensatorTraining(TrainingModule):
     A ``HearingAid`` has two parts, noise reduction and amplification. The criteria ``"denoising"``
     and ``"intelligibility"`` train the noise reduction, those of ``HearingLossLoss`` the
     amplification; a part without criteria in the recipe is frozen. If the parts shared criteria,
-    those of noise reduction would change the amplification, because HASPI rewards gain, and those
-    of amplification would weaken the noise reduction, because it lowers the level.
+    those of noise reduction would change the amplification, because HASPI rises with gain, and
+    those of amplification would weaken the noise reduction, because it lowers the level.
 
     Args:
         recipe: Settings of the network and of the training.
-        simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
+        simulator: Name, folder or module, see ``load_simulator``.
+
+    Raises:
+        ValueError: The recipe, its start network or the simulator is not valid.
 
     >>> module = CompensatorTraining(CompensatorRecipe(model={"channels": 8, "blocks": 1}))
     >>> speech, ears = 0.02 * torch.randn(1, 8000), torch.full((1, 8), 40.0)
@@ -66,7 +69,7 @@ class CompensatorTraining(TrainingModule):
         self.measured_values.append(self.compute_loss(batch)[None])
 
     def compute_loss(self, batch: Batch) -> Tensor:
-        """Compute the loss of a batch, a scalar: the sum of the recipe's criteria."""
+        """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria."""
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
         loss = signal.new_zeros(())
         if self.denoising:
@@ -85,7 +88,11 @@ class CompensatorTraining(TrainingModule):
         return loss + self.loss(self.network(signal, ears, slider), reference, ears)
 
     def summarise(self, values: Tensor) -> dict[str, float]:
-        """Compute ``valid_loss``, the mean over validation batches, and ``score``, minus that."""
+        """Compute ``valid_loss``, the mean loss of validation batches, and ``score``, its negative.
+
+        Args:
+            values: Losses of the batches, (batches,).
+        """
         mean = float(values.double().mean())
         return {"score": -mean, "valid_loss": mean}
 
@@ -106,7 +113,7 @@ def train_compensator(
         recipe: Network, criteria and number of steps.
         out: Folder for the results. A training that was interrupted resumes from it.
         audiogram: Ear of a personal compensator; None trains a general one on random ears.
-        simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
+        simulator: Name, folder or module, see ``load_simulator``.
         options: ``max_minutes`` and options of Lightning's ``Trainer``, see ``train_network``.
 
     Returns:

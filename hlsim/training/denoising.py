@@ -15,7 +15,7 @@ _POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
 """Power in Pa^2 (0 dB SPL) that is added to speech and noise, so that silence is not attenuated."""
 
 _WIENER_EXPONENT = 0.6
-"""Target gain in dB divided by Wiener's gain in dB."""
+"""Ratio of the target gain in dB to Wiener's gain in dB."""
 
 _GAIN_DELAY = 1
 """Number of frames between the frame from which a gain is estimated and that to which it
@@ -23,11 +23,11 @@ applies."""
 
 
 def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
-    """Compute the error of the gains with which a hearing aid reduces noise.
+    """Compute the error of the gains with which a hearing aid reduces noise in each band.
 
-    The target is Wiener's gain sqrt(speech / (speech + noise)), computed from powers, to the power
-    of 0.6, and at least the lowest gain of the aid. The error is the mean square difference between
-    the square roots of the gains, as in RNNoise (Valin 2018, MMSP).
+    The target is Wiener's gain sqrt(speech / (speech + noise)) of the powers in a band, raised to
+    the power 0.6, and at least the lowest gain of the aid. The error is the mean square difference
+    between the square roots of the gains, as in RNNoise (Valin 2018, MMSP).
 
     Estimates have errors, which cost less if the gains are milder. Among networks that were trained
     with other exponents and largest attenuations, those with 0.6 and 12 dB had the highest HASPI in
@@ -73,7 +73,11 @@ def missing_intelligibility(aid: HearingAid, signal: Tensor, clean: Tensor, ears
         ears: Hearing thresholds in dB HL at ``FREQUENCIES``, with shape (items, 8).
 
     Returns:
-        1 - HASPI of each item, with shape (items,).
+        1 - HASPI of each item, with shape (items,); 0 without a gradient for clean speech that has
+        no score, see ``score_loss``.
+
+    Raises:
+        ValueError: The signals are shorter than 0.7 s.
 
     >>> clean, ears = 0.02 * torch.randn(1, 16000), torch.full((1, 8), 40.0)
     >>> missing_intelligibility(HearingAid(), clean, clean, ears).shape

@@ -22,9 +22,10 @@ def gradient_error(
 ) -> Tensor:
     """Compute 1 minus the cosine of the gradients of a loss through a network and its teacher.
 
-    Only the simulators differ: both gradients have the same gradient with respect to what the ear
-    perceives, that of the teacher's output. The criterion is ``coherent-bands`` for the first half
-    of the items, and ``bands`` for the others. Spikes are limited as ``HearingLossLoss`` does.
+    The gradient of the loss with respect to what the ear perceives is computed once, at the
+    teacher's output, and passed back through both simulators to their input. So only the simulators
+    differ. The criterion is ``coherent-bands`` for the first half of the items, and ``bands`` for
+    the others. Spikes are limited as ``HearingLossLoss`` does.
 
     Shape: (items, time) three times, (items, 8) -> (items,).
 
@@ -34,6 +35,9 @@ def gradient_error(
         clean: Clean speech in pascals.
         ears: Thresholds in dB HL.
         teacher: Simulator at 16 kHz.
+
+    Returns:
+        Errors, 0 for equal directions to 2 for opposite ones, with a gradient for the network.
 
     Raises:
         ValueError: The teacher is not differentiable.
@@ -67,7 +71,10 @@ def gradient_error(
 
 
 def _unit_peak(gradient: Tensor) -> Tensor:
-    """Scale the largest magnitude of each item to 1, by a factor without a gradient."""
+    """Scale the largest magnitude of each item to 1, by a factor without a gradient.
+
+    Shape: (items, time) -> (items, time).
+    """
     peak = gradient.detach().abs().amax(-1, keepdim=True)
     return gradient / torch.where(peak > 0.0, peak, 1.0)
 
@@ -75,7 +82,11 @@ def _unit_peak(gradient: Tensor) -> Tensor:
 def _limit_spikes(gradient: Tensor, signal: Tensor) -> Tensor:
     """Limit the spikes of gradients as ``HearingLossLoss`` does, by factors without a gradient.
 
-    Shape: (items, time) twice -> (items, time).
+    Args:
+        gradient: Gradients with respect to ``signal``.
+        signal: Signals, whose pauses have a lower limit.
+
+    Shape: (items, time), (items, time) -> (items, time).
     """
     values = gradient.detach()
     leaf = signal.detach().requires_grad_()

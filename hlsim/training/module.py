@@ -39,8 +39,8 @@ class TrainingModule(L.LightningModule):
         recipe: Learning rate, number of steps, and settings of the subclass.
 
     Attributes:
-        measured_values: Values of the items of a validation, (items,) per batch, or their mean,
-            (1,).
+        measured_values: Values that the validation has measured so far, one tensor per batch: one
+            value per item, (items,), or their mean, (1,).
         validation: Results of the last validation by name. The best network has the highest
             ``score``.
 
@@ -58,22 +58,22 @@ class TrainingModule(L.LightningModule):
         self.measured_values: list[Tensor] = []
 
     def compute_loss(self, batch: Batch) -> Tensor:
-        """Compute the loss of a batch, a scalar."""
+        """Compute the loss of a batch, a scalar tensor with a gradient."""
         raise NotImplementedError
 
     def summarise(self, values: Tensor) -> dict[str, float]:
         """Summarise the measured values of all validation batches.
 
         Args:
-            values: ``measured_values`` of all items.
+            values: All ``measured_values`` in one tensor.
 
         Returns:
-            Named means or quantiles, and ``score``, which is highest for the best network.
+            Dict with means or quantiles, and with ``score``, which is higher for a better network.
         """
         raise NotImplementedError
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Compute the loss of a batch, and log it.
+        """Compute and log the loss of a batch; Lightning calls this method at each step.
 
         Raises:
             ValueError: The loss is not finite.
@@ -123,8 +123,8 @@ class TrainingModule(L.LightningModule):
 def relative_learning_rate(step: int, steps: int) -> float:
     """Compute the learning rate at a step, relative to the recipe's ``learning_rate``.
 
-    The rate rises over the first 50 steps, and falls along half a period of a cosine to 1 % at the
-    end.
+    The rate rises linearly over the first 50 steps. All the time, it also falls along half a period
+    of a cosine, to 1 % at the end.
 
     Args:
         step: Number of the step, from 0.
@@ -148,6 +148,9 @@ def initial_network(
             (``model``) and the seed of random weights.
         build: Function that builds a network with the settings of the recipe.
         load: Function that loads the network of a checkpoint by its name.
+
+    Returns:
+        The network, in training mode, all of whose weights are trained.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind, or its settings differ from
@@ -175,17 +178,17 @@ def initial_network(
 
 
 def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str, str]:
-    """Describe a simulator in the record of a training, which resumes only with the same one.
+    """Describe a simulator for the record of a training, which resumes only with the same one.
 
     Args:
         role: Name of the entry, ``"simulator"`` or ``"teacher"``.
         simulator: Name, folder or module, see ``load_simulator``.
 
     Returns:
-        The name of the simulator, or its class with its settings, under ``role``. For a network,
-        and for a module of your own, a hash of its weights follows under ``role`` with ``_sha256``,
-        because a file may contain others when the training resumes. For your own code without an
-        attribute ``fingerprint``, a hash of its file follows under ``role`` with ``_code_sha256``.
+        Dict with the entry ``role``: the name of the simulator, or its class with its settings. A
+        network, or a module of your own, adds a hash of its weights as ``<role>_sha256``, because a
+        file may contain other weights when the training resumes. Your own code without an attribute
+        ``fingerprint`` adds a hash of its file as ``<role>_code_sha256``.
 
     Raises:
         ValueError: There is no such simulator.
@@ -207,8 +210,10 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
 def _hash_own(role: str, code: Any) -> dict[str, str]:
     """Return hashes of a function or module: of its weights, and of the file of its source code.
 
-    That of the weights is missing for a function. That of the file is missing for code of hlsim and
-    torch, with an attribute ``fingerprint``, or without a file.
+    There is no hash of weights for a function. There is none of the file for code of hlsim or
+    torch, for code with an attribute ``fingerprint``, and for code without a file.
+
+    Returns: The entries ``<role>_sha256`` and ``<role>_code_sha256`` of ``describe_simulator``.
     """
     hashes = {}
     if isinstance(code, nn.Module):

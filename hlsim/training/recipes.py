@@ -1,7 +1,7 @@
 """Recipes: the settings of a training, by the same names in Python, YAML and the command line.
 
-The command line shows these docstrings without waiting for torch, which this module does not
-import.
+The command line shows the docstrings of these classes as help. This module does not import torch,
+so that the help is shown at once.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class TrainingRecipe:
     Attributes:
         model: Settings of the network by name, such as ``channels``.
         start: Name or folder of a checkpoint to start from, instead of random weights. The network
-            has the settings of the checkpoint, which remains the best network until training finds
+            has the settings of the checkpoint. It is saved as the best network until training finds
             a better one.
         steps: Number of training steps. The learning rate falls over them.
         batch: Number of clips per step.
-        seconds: Duration of a clip.
+        seconds: Duration of each clip in seconds.
         learning_rate: Highest learning rate of the optimiser, AdamW.
         weights: Weight under the name of each criterion.
         levels: Lowest and highest level of the speech in dB SPL.
@@ -93,11 +93,12 @@ class SimulatorRecipe(TrainingRecipe):
         weights: Weights of ``snr``, ``log_spectrum`` and ``levels`` (of bands, where the input is
             audible), all in dB / 10; of ``gradient``, 1 minus the cosine of the gradients through
             the network and through the teacher; and of the paper's ``magnitude``, ``phase``,
-            ``complex`` and ``time``. Gradients are compared in every third step, which takes three
-            times as long.
-        unit_power: Signal by whose power all signals are divided before the criteria, ``truth`` or
-            ``input``. ``truth`` is the target, with which soft items count as much as loud ones.
-            ``input`` is the choice of MP-SENet. The paper's criteria require ``input`` for networks
+            ``complex`` and ``time``. Gradients are compared in every third step, and such a step
+            takes three times as long.
+        unit_power: Signal that is scaled to unit power, ``truth`` or ``input``. Estimate and target
+            are multiplied by the same factor before all criteria but ``levels`` and ``gradient``.
+            ``truth`` is the target, with which soft items count as much as loud ones. ``input`` is
+            the choice of MP-SENet. The paper's criteria require ``input`` for networks
             without a prior: at first, the errors of these networks for severe ears are 50 dB above
             the target, and they would learn to be silent.
         levels: Lowest and highest level of the speech in dB SPL, before amplification.
@@ -144,18 +145,19 @@ class CompensatorRecipe(TrainingRecipe):
         model: Settings of ``MappingConfig`` or ``HearingAidConfig``.
         weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
             ``hasqi``, ``denoising`` and ``intelligibility``. The first five are those of
-            ``HearingLossLoss`` for one ear; ``haspi`` and ``hasqi`` (1 - score) require clips of
-            0.7 s or more. The last two train a hearing aid's noise reduction alone, and the others
-            its amplification alone: ``denoising`` is the error of the gains of noise reduction,
-            ``intelligibility`` is 1 - HASPI at equal level.
+            ``HearingLossLoss`` for one ear. The last two train a hearing aid's noise reduction
+            alone, and the others its amplification alone: ``denoising`` is the error of the gains
+            of noise reduction, ``intelligibility`` is 1 - HASPI at equal level. ``haspi``,
+            ``hasqi`` (1 - score) and ``intelligibility`` require clips of 0.7 s or more.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
             them, a network learns that steady sounds are noise.
         equalised: Share of clips of speech, and of noise, that are equalised at random by up to 15
             dB. A few voices have few spectra, and the gains for other voices would be up to 20 dB
             wrong.
         noisy: Share of noisy clips among those of speech, if there is noise.
-        babble: Share of noisy clips whose noise is up to four other voices.
-        snr: Lowest and highest signal-to-noise ratio in dB.
+        babble: Share of noisy clips whose noise consists of up to four other voices.
+        snr: Lowest and highest signal-to-noise ratio in dB. The level of the speech is its active
+            level, without pauses.
         unreduced: Share of items for which a hearing aid's noise reduction is off.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.
@@ -195,7 +197,7 @@ class CompensatorRecipe(TrainingRecipe):
             self._require("kind", self.kind == "hearing-aid", expected)
 
     def trains_noise_reduction(self) -> bool:
-        """Return whether there is a criterion of noise reduction.
+        """Return whether a criterion of the recipe trains the noise reduction of a hearing aid.
 
         >>> CompensatorRecipe().trains_noise_reduction()
         False

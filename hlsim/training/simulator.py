@@ -27,7 +27,7 @@ from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.trainer import train_network
 
 _POWER_FLOOR = 1e-18
-"""Power in Pa^2 that is added to the power of a signal before dividing by it."""
+"""Power in Pa^2 that is added to the power of a signal before a division by this power."""
 
 _GRADIENT_INTERVAL = 3
 """Number of steps from one comparison of gradients to the next."""
@@ -61,7 +61,10 @@ class SimulatorTraining(TrainingModule):
         self._teacher = (teacher,)  # in a tuple, because it is neither trained nor saved
 
     def compute_loss(self, batch: Batch) -> Tensor:
-        """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria."""
+        """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria.
+
+        The criterion ``gradient`` takes part in every third step only.
+        """
         weights = {name: weight for name, weight in self.recipe.weights.items() if weight}
         if self.global_step % _GRADIENT_INTERVAL:
             weights.pop("gradient", None)
@@ -99,9 +102,12 @@ class SimulatorTraining(TrainingModule):
         return target, self.network(signal, ears)
 
     def summarise(self, values: Tensor) -> dict[str, float]:
-        """Compute the median and the 10th percentile of the ratios, and a score for the network.
+        """Compute the median and the 10th percentile of the items' SNRs in dB, and ``score``.
 
-        The score is the median plus half the 10th percentile in dB.
+        The score is the median plus half the 10th percentile.
+
+        Args:
+            values: Ratios of the teacher's output to the network's error in dB, (items,).
         """
         median = float(values.median())
         worst_tenth = float(values.quantile(0.1))

@@ -1,4 +1,4 @@
-"""Trainings with Lightning, which resume, save the best network, and stop after a time limit."""
+"""Training with Lightning: it can resume, saves the best network, and stops after a time limit."""
 
 from __future__ import annotations
 
@@ -37,13 +37,15 @@ _EXPECTED_WARNINGS = (
 class BestCheckpoint(L.Callback):
     """Callback that saves the network with the highest validation score in a folder.
 
-    The first candidate is the network before the first step, the others are those whose states
-    Lightning saves. The callback must come after that of the average of the weights.
+    The first candidate is the network before the first step. The others are those after each
+    validation, when Lightning saves its state. The callback must come after that of the average of
+    the weights.
 
     Args:
         folder: Folder to write, which ``load_pretrained`` or ``load_compensator`` reads.
         kind: Kind of the checkpoint, such as ``"hearing-aid"``.
-        record: Entries about the training for the checkpoint's ``config.json``.
+        record: Entries about the training for the checkpoint's ``config.json``. Results of the
+            first validation are added to it.
 
     Attributes:
         best_score: Highest validation score so far.
@@ -82,9 +84,9 @@ class BestCheckpoint(L.Callback):
 
         Args:
             module: The ``TrainingModule`` after its validation.
-            weights: State dict of the module that was validated.
-            step: Number of the step.
-            seconds: Duration of the training up to the step.
+            weights: State dict of the module as it was validated.
+            step: Number of steps taken.
+            seconds: Duration of the training so far.
         """
         score = module.validation["score"]
         if score <= self.best_score:
@@ -247,7 +249,7 @@ def train_network(
 def _check_no_network(folder: Path) -> None:
     """Raise ValueError if a folder has the network of another training, which would be replaced.
 
-    A training that ended before its first state leaves the network before its first step.
+    A network with 0 steps may be replaced: a training that ended before its first state leaves it.
     """
     if (folder / CONFIG).exists() and read_record(folder).get("about", {}).get("steps") != 0:
         raise ValueError(
