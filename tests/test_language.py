@@ -4,7 +4,7 @@ import ast
 import io
 import re
 import tokenize
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -60,14 +60,15 @@ def test_no_file_has_the_marks_of_a_conflict() -> None:
 
 def find_problems(source: str) -> Iterator[tuple[str, int, str]]:
     """Yield the rule, the line and the text of every violation in a module's source."""
-    tree = ast.parse(source)
-    docstrings = dict(_find_docstrings(tree))
+    nodes = list(ast.walk(ast.parse(source)))
+    docstrings = dict(_find_docstrings(nodes))
     for line, text in docstrings.items():
         yield from _check_docstring(line, text)
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT and (match := PER.search(token.string)):
-            yield "per", token.start[0], match.group()
-    for node in ast.walk(tree):
+    if PER.search(source):  # or no comment can contain it, and tokens take most of the time
+        for token in tokenize.generate_tokens(io.StringIO(source).readline):
+            if token.type == tokenize.COMMENT and (match := PER.search(token.string)):
+                yield "per", token.start[0], match.group()
+    for node in nodes:
         is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
         if is_text and node.lineno not in docstrings and "allowed:" in node.value:
             yield "error template", node.lineno, "allowed:"
@@ -79,9 +80,9 @@ def find_problems(source: str) -> Iterator[tuple[str, int, str]]:
             yield "line length", number, f"{len(text)} columns"
 
 
-def _find_docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
+def _find_docstrings(nodes: Iterable[ast.AST]) -> Iterator[tuple[int, str]]:
     """Yield the line and the text of every string that is a statement of its own."""
-    for node in ast.walk(tree):
+    for node in nodes:
         value = node.value if isinstance(node, ast.Expr) else None
         if isinstance(value, ast.Constant) and isinstance(value.value, str):
             yield node.lineno, value.value

@@ -55,13 +55,16 @@ def imported_modules(path: Path) -> Iterator[str]:
         yield from (name for name in names if name in MODULES)
 
 
-IMPORTS = {module: set(imported_modules(path)) - {module} for module, path in MODULES.items()}
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """Modules of the project that each module imports."""
+    return {module: set(imported_modules(path)) - {module} for module, path in MODULES.items()}
 
 
-def test_imports_between_rooms_point_downwards() -> None:
+def test_imports_between_rooms_point_downwards(imports: dict[str, set[str]]) -> None:
     upward = {
         (module, imported)
-        for module, names in IMPORTS.items()
+        for module, names in imports.items()
         for imported in names
         if room_of(imported) != room_of(module)
         and FLOOR_OF[room_of(imported)] <= FLOOR_OF[room_of(module)]
@@ -69,12 +72,12 @@ def test_imports_between_rooms_point_downwards() -> None:
     assert upward == set()
 
 
-def test_rooms_and_files_form_no_circle() -> None:
+def test_rooms_and_files_form_no_circle(imports: dict[str, set[str]]) -> None:
     rooms: dict[str, set[str]] = {}
-    for module, names in IMPORTS.items():
+    for module, names in imports.items():
         rooms.setdefault(room_of(module), set()).update(map(room_of, names))
     TopologicalSorter({room: below - {room} for room, below in rooms.items()}).prepare()
-    TopologicalSorter(IMPORTS).prepare()  # raises CycleError
+    TopologicalSorter(imports).prepare()  # raises CycleError
 
 
 @pytest.mark.parametrize("room", sorted({path.parent for path in MODULES.values()}))
