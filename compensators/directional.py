@@ -2,7 +2,8 @@
 
 Inputs have the shape (..., microphones, ears, time): at each side of the head, a front and a rear
 microphone, left side first. Outputs have the shape (..., ears, time), which any aid of two ears
-takes. For sounds from the front, the output is the signal of the front microphone.
+takes. Sounds from the front come out as the front microphone receives them; sounds from other
+directions are attenuated.
 """
 
 from __future__ import annotations
@@ -25,15 +26,16 @@ from hlsim.dsp.fft import fft_length
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
 
 LOOK_AHEAD = 0.001
-"""Look-ahead of the filters in s."""
+"""Look-ahead of the filters in seconds."""
 
 FILTER_SECONDS = 0.008
-"""Length of the filters in s."""
+"""Duration of the filters in seconds, after their look-ahead."""
 
 PATTERNS = {"dipole": 0.0, "hypercardioid": 1.0 / 3.0, "supercardioid": 0.577, "cardioid": 1.0}
-"""Delay of the rear microphone for each directional pattern, relative to that of the spacing.
+"""Delay of the rear microphone for each directional pattern, by name.
 
-The pattern has its null where the cosine of the angle to the front is minus this number.
+It is relative to the time in which sound passes from one microphone to the other. The pattern has
+its null where the cosine of the angle to the front is minus this number.
 """
 
 _NOISE_DIRECTIONS = 200
@@ -52,9 +54,9 @@ class FilterAndSum(nn.Module):
     """Fixed filters, one per microphone and ear, whose outputs are added up.
 
     Args:
-        taps: Impulse responses from each microphone to each ear of the output, (ears,
-            microphones, ears of the microphones, length).
-        look_ahead: Number of samples of the impulse responses that come before time 0.
+        taps: Impulse responses from each microphone to each ear of the output, (ears of the
+            output, microphones, ears of the microphones, length).
+        look_ahead: Number of samples of the impulse responses before time 0.
         sample_rate: Sample rate in Hz.
 
     Attributes:
@@ -103,7 +105,7 @@ class FilterAndSum(nn.Module):
         return self.process(padded, self.initial_state(waveform))[0][..., self.latency :]
 
     def check_microphones(self, waveform: Tensor) -> None:
-        """Raise ValueError unless a waveform has the right numbers of microphones and ears."""
+        """Raise ValueError unless a waveform has as many microphones and ears as the filters."""
         check_waveform(waveform)
         expected = tuple(self.taps.shape[1:3])
         if waveform.shape[-3:-1] != expected:
@@ -114,14 +116,21 @@ class FilterAndSum(nn.Module):
             )
 
     def initial_state(self, waveform: Tensor) -> State:
-        """Return the state before the first sample, for signals like ``waveform``.
+        """Return the state at the beginning of a signal, before which there is silence.
 
-        Returns: The earlier samples that the filters need, by the name "past".
+        Args:
+            waveform: Signals with the shape, type and device of those to process.
+
+        Returns: Zeros in place of the earlier samples that the filters need, under "past".
         """
         return {"past": waveform.new_zeros(*waveform.shape[:-1], self.taps.shape[-1] - 1)}
 
     def process(self, waveform: Tensor, state: State) -> tuple[Tensor, State]:
         """Return the output, delayed by ``latency`` samples, and the state after the last sample.
+
+        Args:
+            waveform: Signals of the microphones.
+            state: State from ``initial_state``, or from the call for the preceding samples.
 
         Shape: (..., microphones, ears, time) -> (..., ears, time).
         """
@@ -131,7 +140,11 @@ class FilterAndSum(nn.Module):
 
     @staticmethod
     def filter(samples: Tensor, taps: Tensor) -> Tensor:
-        """Filter the microphones, and add them up, from the first sample with a complete past.
+        """Filter the signals of the microphones, and add them up for each ear.
+
+        Args:
+            samples: Signals of the microphones, after the earlier samples that the filters need.
+            taps: Impulse responses.
 
         Shape: (..., microphones, ears, length - 1 + time), (ears, microphones, ears, length)
             -> (..., ears, time).
@@ -155,7 +168,7 @@ class FilterAndSum(nn.Module):
 class MicrophoneStream:
     """A front end for signals that arrive in chunks: a function from a chunk to the next output.
 
-    The output is that of the whole signal, delayed by ``front_end.latency`` samples, without
+    The output is that for the whole signal, delayed by ``front_end.latency`` samples, without
     gradients.
 
     Args:
@@ -186,10 +199,10 @@ class MicrophoneStream:
 class DifferentialMicrophone(FilterAndSum):
     """A fixed directional microphone at each side: front minus delayed rear microphone.
 
-    The difference falls by 6 dB per octave towards low frequencies, for which a filter compensates
-    down to ``lowest``. Below, the output falls, so that the noise of microphones is not amplified
-    further. Source: Elko 2004, in Huang and Benesty (editors), Audio Signal Processing for
-    Next-Generation Multimedia Communication Systems, chapter 2.
+    The difference falls by 6 dB per octave towards low frequencies, which a filter compensates down
+    to ``lowest``. Below this frequency, the output falls, so that the noise of the microphones is
+    not amplified further. Source: Elko 2004, in Huang and Benesty (editors), Audio Signal
+    Processing for Next-Generation Multimedia Communication Systems, chapter 2.
 
     Args:
         pattern: "cardioid", "supercardioid", "hypercardioid" or "dipole".
@@ -227,14 +240,14 @@ class DifferentialMicrophone(FilterAndSum):
 class AdaptiveDifferentialMicrophone(FilterAndSum):
     """An adaptive directional microphone at each side, whose null follows the loudest noise behind.
 
-    Of a cardioid to the front, a share of a cardioid to the rear is subtracted, from 0 to 1, which
-    moves the null from 180 to 90 degrees. The share minimises the power of the output. Source: Elko
+    A share, 0 to 1, of a cardioid to the rear is subtracted from a cardioid to the front. It moves
+    the null from 180 to 90 degrees, and minimises the power of the output. Source: Elko
     and Nguyen Pong 1995, IEEE ASSP Workshop on Applications of Signal Processing to Audio and
     Acoustics; here, the average powers of the recent past give the share, instead of an LMS
     algorithm.
 
     Args:
-        seconds: Time constant of the averages in s.
+        seconds: Time constant of the averages in seconds.
         spacing: Distance between the two microphones of a side in m.
         lowest: Frequency in Hz at which the output is 3 dB softer.
         sample_rate: Sample rate in Hz, 16000 to 48000.
@@ -285,14 +298,14 @@ class BinauralMVDR(FilterAndSum):
     """A fixed beamformer that combines the microphones of both sides to the front.
 
     Of all filters that pass sound from the front as the front microphone of each ear receives it,
-    these let least of diffuse noise through (minimum variance, distortionless response). The model
-    of the head is a rigid sphere, with noise of equal power from all directions. Level and
-    time differences between the ears are kept for the front only: remaining noise gets those of the
-    front.
+    these pass the least diffuse noise (minimum variance distortionless response). The head is
+    modelled as a rigid sphere, and the noise as sounds of equal power from all directions. Only
+    sounds from the front keep their differences of level and time between the ears: remaining noise
+    gets those of the front.
 
     Args:
-        loading: Power of the noise of each microphone relative to the diffuse noise, which limits
-            how much the former is amplified.
+        loading: Power of each microphone's own noise, relative to the diffuse noise, for which the
+            filters are designed. The larger it is, the less they amplify this noise.
         spacing: Distance between the two microphones of a side in m.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
@@ -343,18 +356,22 @@ class DirectionalAid(nn.Module):
             sliders: Further arguments of the aid, such as ``noise_reduction=0.0``.
 
         Shape: (..., microphones, ears, time) -> (..., ears, time).
+
+        Raises:
+            ValueError: The waveform has another number of microphones or ears, or the aid rejects
+                an ear or a slider.
         """
         output: Tensor = self.aid(self.front_end(waveform), audiogram, **sliders)
         return output
 
 
 def look_ahead_samples(sample_rate: int) -> int:
-    """Return the look-ahead of the filters in samples, at most 1 ms."""
+    """Return the look-ahead of the filters in whole samples, at most 1 ms."""
     return int(LOOK_AHEAD * sample_rate)
 
 
 def filter_length(sample_rate: int) -> int:
-    """Return the length of the filters in samples, with the look-ahead."""
+    """Return the length of the filters in samples, including the look-ahead."""
     return look_ahead_samples(sample_rate) + int(FILTER_SECONDS * sample_rate)
 
 
@@ -391,7 +408,13 @@ def differential_taps(
 def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.float64]:
     """Design the filters of ``BinauralMVDR`` by least squares over their coefficients (Frost 1972).
 
-    Returns: (ears, microphones, ears, length).
+    Args:
+        loading: Power of each microphone's own noise, relative to the diffuse noise.
+        spacing: Distance between the microphones of a side in m.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Impulse responses, (ears of the output, microphones, ears of the microphones, length).
     """
     frequencies = design_frequencies(sample_rate)
     noise = head_responses(evenly_spread_directions(_NOISE_DIRECTIONS), frequencies, spacing)

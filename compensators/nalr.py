@@ -48,9 +48,13 @@ class NALR(Aid):
     """Frequencies in Hz between which the gains of the filter are straight lines."""
 
     def prescribe(self, thresholds: Tensor, points: tuple[float, ...]) -> Tensor:
-        """Return the prescribed gains in dB at ``FREQUENCIES``, or at the points of ``grid``.
+        """Compute the prescribed gains in dB.
 
-        Shape: (..., 8) in dB HL -> (..., points).
+        Args:
+            thresholds: Thresholds in dB HL at ``FREQUENCIES``.
+            points: Frequencies in Hz of the gains: ``FREQUENCIES`` or ``grid``.
+
+        Shape: (..., 8) -> (..., number of points).
         """
         return nalr_gains_db(thresholds)
 
@@ -70,7 +74,7 @@ class NALR(Aid):
             return output.to(waveform.dtype)
 
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
-        """Compute the insertion gains: NAL-R's gains themselves, which need no measurement.
+        """Compute the insertion gains, which are the prescribed gains and need no measurement.
 
         Args:
             audiogram: One or more ears, by default those of the constructor.

@@ -29,7 +29,7 @@ from hlsim.checks import check_choice, check_number
 from hlsim.dsp.interpolation import interpolate
 
 KNEE_DB = 20.0
-"""Level of a band in dB below that of average speech, below which softer sounds get no more gain.
+"""Range in dB below the level of average speech in a band, below which the gain stays the same.
 
 With CAMFIT it is ``SPEECH_RANGE_DB``.
 """
@@ -42,10 +42,11 @@ class WDRC(Wearable):
     """A hearing aid that amplifies loud sounds less than soft ones, without trained parameters.
 
     Each band of average speech at 65 dB SPL gets the gain that a prescription gives it, by default
-    NAL-R. The gain is smaller if the band is louder, and larger if it is softer, by up to 20 dB:
-    the output changes by 1 dB if the input changes by as many dB as the compression ratio. The
-    ratio is 1 up to a loss of 10 dB HL, rises by 1 per 40 dB of loss, and is 3 at most. CAMFIT
-    prescribes the ratio, too, see ``CAMFIT``. Gains are 0 dB or more. The delay is 4 ms.
+    NAL-R. The gain is smaller if the band is louder, and larger if it is softer, down to 20 dB
+    below average speech: the output changes by 1 dB if the input changes by as many dB as the
+    compression ratio. The ratio is 1 up to a loss of 10 dB HL, rises by 1 per 40 dB of loss, and is
+    3 at most. With CAMFIT, ratio and range are those of ``CAMFIT``. Gains are 0 dB or more. The
+    delay is 4 ms.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
@@ -94,6 +95,8 @@ class WDRC(Wearable):
 
     def fit(self, thresholds: Tensor) -> Tensor:
         """Compute the gain of each band for average speech in dB, followed by the slope of each.
+
+        The slope is the change of the gain in dB per dB of the band's level, 0 or less.
 
         Shape: (items, 8) in dB HL -> (items, 2 * bands).
         """

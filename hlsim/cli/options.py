@@ -306,10 +306,10 @@ def loudness(text: str) -> float | dict[float, float]:
     """Convert the text of ``--loudness`` to a number, or to numbers by level.
 
     Args:
-        text: A number, or levels in dB SPL with numbers.
+        text: A number in dB, or levels in dB SPL with numbers in dB.
 
     Raises:
-        argparse.ArgumentTypeError: It is neither.
+        argparse.ArgumentTypeError: The text is neither.
 
     >>> loudness("-5"), loudness("50:0,80:-9")
     (-5.0, {50.0: 0.0, 80.0: -9.0})

@@ -88,17 +88,17 @@ class PrescriptionForEar(nn.Module):
         self.usual, self.profound = NALR(sample_rate=NEURO_RATE), NALRP(sample_rate=NEURO_RATE)
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Return the waveform amplified by the prescription for the ear."""
+        """Return the waveform amplified by the prescription for the ear, (time,) -> (time,)."""
         at_2_khz = audiogram.thresholds[FREQUENCIES.index(2000.0)]
         aid = self.profound if at_2_khz > PROFOUND_FROM else self.usual
         return aid(waveform, audiogram)
 
 
 def load_rival(rival: Rival) -> tuple[str, nn.Module]:
-    """Return the name in tables and the aid of a rival.
+    """Return the name in tables and the aid of a rival, with which compensators are compared.
 
     Args:
-        rival: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or ``"for-ear"`` for the one that
+        rival: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or ``"for-ear"`` for the prescription that
             ``PrescriptionForEar`` chooses for each ear.
 
     Raises:

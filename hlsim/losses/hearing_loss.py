@@ -138,7 +138,7 @@ class HearingLossLoss(nn.Module):
             module of your own gets the attribute ``checkpoint = True``; what it then stores is up
             to its code.
         loudness: Target of the perceived loudness, in dB relative to a normal ear: one number, or a
-            dictionary of numbers by the level of the clean speech in dB SPL, such as
+            dict of numbers by the level of the clean speech in dB SPL, such as
             ``{50: 0, 65: -5, 80: -9}``, which is interpolated. The reference gets this gain. Each
             of two ears has this target; both together are louder than one, so that two ears need a
             lower number. Most people prefer less than normal loudness, see the guide about levels.
@@ -395,9 +395,10 @@ class HearingLossLoss(nn.Module):
         batch: torch.Size,
         lengths: Tensor | None,
     ) -> Tensor:
-        """Compute the reference of a criterion at the chosen loudness, (*batch, time).
+        """Compute the reference of a criterion, with the gain of ``loudness``, (*batch, time).
 
-        Arguments are those of ``FrozenSimulator.compute_reference``.
+        Clean speech as it is (None) gets no gain. Arguments are those of
+        ``FrozenSimulator.compute_reference``.
         """
         signal = self._frozen.compute_reference(reference, clean, ears, batch, lengths)
         if reference is None or not self.loudness:

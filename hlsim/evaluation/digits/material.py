@@ -45,7 +45,8 @@ class Triplets(NamedTuple):
     Attributes:
         speech: Digits without noise, each with RMS 1, (triplets, time), or at several microphones,
             (triplets, ..., time).
-        noise: Masking noise with RMS 1 and the long-term spectrum of the digits, likewise.
+        noise: Masking noise with RMS 1 and the long-term spectrum of the digits, in the shape of
+            ``speech``.
         internal: Internal noise of a normal ear in pascals, (triplets, time).
         digits: Spoken digits, 0 to 9, (triplets, 3).
 

@@ -218,7 +218,8 @@ def _portions(count: int, size: int) -> list[slice]:
 def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) -> Tensor:
     """Compute the outputs of an aid for a portion of the signals, and validate them.
 
-    Shape: (triplets, time), (8,) -> (triplets of the portion, time).
+    Shape: (triplets, time), or (triplets, ..., time) for several microphones, and (8,) in dB HL
+        -> (triplets of the portion, time).
 
     Raises:
         ValueError: The outputs have another shape, or samples that are not finite.
