@@ -22,6 +22,9 @@ _KNOWN_WORDS = {
 }
 """Words that the name of a column of thresholds may contain besides the frequency."""
 
+_UCL_WORDS = {"ucl", "ldl"}
+"""Words of columns of uncomfortable levels, which are also called loudness discomfort levels."""
+
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}
 """Words in the names of columns with other levels than measured thresholds of air conduction."""
 
@@ -46,6 +49,7 @@ class ThresholdColumn(NamedTuple):
         ear: Ear that the column's name mentions, or None.
         hz: Frequency in Hz.
         is_remark: Whether the column contains remarks on another column of this frequency.
+        is_ucl: Whether the column contains uncomfortable levels instead of thresholds.
 
     >>> ThresholdColumn("left", 500.0).is_remark
     False
@@ -54,10 +58,13 @@ class ThresholdColumn(NamedTuple):
     ear: EarName | None
     hz: float
     is_remark: bool = False
+    is_ucl: bool = False
 
 
 def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     """Find the columns of thresholds among the columns of a table, and the remarks on them.
+
+    Columns of uncomfortable levels, such as ``ucl_500`` and ``ucl_left_500``, are found as well.
 
     A column of thresholds is called ``hl_250``, ``250``, ``250 Hz``, ``1,000 Hz`` or ``1k``, in any
     case, perhaps with an ear, as in ``L250``, ``right_250`` or ``250 Hz (R)``. Columns such as
@@ -78,7 +85,7 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
             the same frequency and ear.
 
     >>> threshold_columns(["name", "R 1k"])
-    {'R 1k': ThresholdColumn(ear='right', hz=1000.0, is_remark=False)}
+    {'R 1k': ThresholdColumn(ear='right', hz=1000.0, is_remark=False, is_ucl=False)}
     """
     meanings = {}
     other_columns = []
@@ -99,9 +106,9 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
                 "them"
             )
         names[meaning] = column
-    measured_hz = {meaning.hz for meaning in names}
+    measured_hz = {meaning.hz for meaning in names if not meaning.is_ucl}
     for column, meaning in meanings.items():
-        if meaning.hz not in measured_hz:
+        if meaning.is_remark and meaning.hz not in measured_hz:
             raise ValueError(
                 f"column {column!r}: expected a name such as hl_500, 500 Hz, 500 or R 500 for "
                 "thresholds; rename the column"
@@ -131,6 +138,8 @@ def _read_name(column: str, name: str) -> ThresholdColumn | None:
     if match is None:
         return None
     before, after = (re.findall(r"[a-z]+|\d+", match[part]) for part in ("before", "after"))
+    is_ucl = not _UCL_WORDS.isdisjoint(before)
+    before = [word for word in before if word not in _UCL_WORDS]
     words = {*before, *after}
     has_hz = bool(words & {"hz", "khz"})
     is_explicit = has_hz or before[:1] == ["hl"]
@@ -155,7 +164,7 @@ def _read_name(column: str, name: str) -> ThresholdColumn | None:
             f"column {column!r}: expected a frequency from {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz, "
             "such as 500, 1k or 1414 Hz; multiply kHz by 1000, or rename a column of other values"
         )
-    return ThresholdColumn(ear, hz)
+    return ThresholdColumn(ear, hz, is_ucl=is_ucl)
 
 
 def _read_hz(number: str, kilo: str) -> float:

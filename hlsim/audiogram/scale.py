@@ -27,6 +27,13 @@ LOWEST_HZ, HIGHEST_HZ = 100.0, 20000.0
 LOWEST_LEVEL, HIGHEST_LEVEL = -10.0, 120.0
 """Range of the thresholds of an audiogram in dB HL."""
 
+LOWEST_UCL, HIGHEST_UCL = 20.0, 140.0
+"""Range of the uncomfortable levels of an audiogram in dB HL."""
+
+UCL_NOT_REACHED = 115.0
+"""Uncomfortable level in dB HL from which on it was not reached: the real one is at least as high.
+"""
+
 HIGHEST_SIMULATED = 100.0
 """Highest threshold in dB HL that a simulator accepts. MSBG divides by 0 at 105 dB HL."""
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.audiogram.columns import threshold_columns
+from hlsim.audiogram.discomfort import Points, UclLike, read_points, uncomfortable_levels_at
 from hlsim.audiogram.plot import EAR_STYLES, frequency_axis
 from hlsim.audiogram.scale import (
     EARS,
     FREQUENCIES,
     HIGHEST_HZ,
     HIGHEST_LEVEL,
+    HIGHEST_UCL,
     LOWEST_HZ,
     LOWEST_LEVEL,
+    LOWEST_UCL,
     SEVERITIES,
     SEVERITY_LIMITS,
     WHO_GRADES,
@@ -51,6 +54,9 @@ class Audiogram:
             the frequencies is also accepted, see ``as_audiogram``.
         frequencies: Ascending frequencies from 100 to 20000 Hz; by default 250, 500, 1000, 2000,
             3000, 4000, 6000 and 8000, the ``FREQUENCIES``.
+        ucl: Measured uncomfortable levels of pure tones in dB HL, 20 to 140, by frequency in Hz. A
+            level of 115 or more means that none was reached. The attribute contains pairs of a
+            frequency and a level. See ``uncomfortable_levels``.
 
     Raises:
         ValueError: The numbers of levels and frequencies differ, no level was measured, one is out
@@ -65,15 +71,24 @@ class Audiogram:
 
     levels: tuple[float, ...]
     frequencies: tuple[float, ...] = FREQUENCIES
+    ucl: Points = field(default=(), kw_only=True)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self, levels: Any, frequencies: Any = FREQUENCIES, *, ucl: UclLike | None = ()
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         names_frequencies = isinstance(self.levels, Mapping) or hasattr(self.levels, "to_dict")
+        object.__setattr__(self, "ucl", read_points(self.ucl))
         ear = None
         if names_frequencies and self.frequencies is FREQUENCIES:
             ear = find_audiogram(self.levels)
         if ear is not None:
             object.__setattr__(self, "levels", ear.levels)
             object.__setattr__(self, "frequencies", ear.frequencies)
+            object.__setattr__(self, "ucl", self.ucl or ear.ucl)
             return
         levels, frequencies = _as_array(self.levels), _as_array(self.frequencies)
         if len(levels) != len(frequencies):
@@ -132,12 +147,13 @@ class Audiogram:
         return cls(STANDARD[key])
 
     def __repr__(self) -> str:
+        text = _describe_points(zip(self.frequencies, self.levels, strict=True))
+        if self.ucl:
+            return f"Audiogram({text}, ucl={_describe_points(self.ucl)})"
         for name, levels in STANDARD.items():
             if self.frequencies == FREQUENCIES and self.levels == levels:
                 return f"Audiogram({name!r})"
-        points = zip(self.frequencies, self.levels, strict=True)
-        text = ", ".join(f"{frequency:g}: {level:g}" for frequency, level in points)
-        return f"Audiogram({{{text}}})"
+        return f"Audiogram({text})"
 
     @property
     def thresholds(self) -> tuple[float, ...]:
@@ -148,8 +164,36 @@ class Audiogram:
         """
         if self.frequencies == FREQUENCIES:
             return self.levels
-        values = np.interp(np.log(FREQUENCIES), np.log(self.frequencies), self.levels)
-        return tuple(values.tolist())
+        return tuple(self._interpolate(FREQUENCIES).tolist())
+
+    def uncomfortable_levels(self, frequencies: Sequence[float] = FREQUENCIES) -> tuple[float, ...]:
+        """Return the levels from which on pure tones are uncomfortably loud, in dB HL.
+
+        They are those that were measured, ``ucl``, or else predicted from the thresholds (see
+        ``hlsim.audiogram.discomfort``, which states the error of the prediction: 8.7 dB). Between
+        measured frequencies, their difference from the prediction is interpolated over log
+        frequency; beyond them it is constant.
+
+        Args:
+            frequencies: Frequencies of the result in Hz.
+
+        Example:
+            >>> from hlsim import Audiogram
+            >>> Audiogram({500: 20, 4000: 60}).uncomfortable_levels([500, 4000])
+            (93.5, 103.9)
+            >>> Audiogram({500: 20, 4000: 60}, ucl={4000: 91.8}).uncomfortable_levels([4000, 8000])
+            (91.8, 91.8)
+        """
+        measured_hz = [hz for hz, _ in self.ucl]
+        levels = uncomfortable_levels_at(
+            self.ucl, self._interpolate(measured_hz), frequencies, self._interpolate(frequencies)
+        )
+        return tuple(round(level, 6) for level in levels)
+
+    def _interpolate(self, frequencies: Sequence[float]) -> NDArray[np.float64]:
+        """Interpolate the thresholds linearly over log frequency, constant beyond the ends."""
+        values = np.interp(np.log(frequencies), np.log(self.frequencies), self.levels)
+        return np.asarray(values)
 
     @property
     def severity(self) -> str:
@@ -210,14 +254,22 @@ class Audiogram:
         """
         return self
 
-    def to_dict(self) -> dict[str, list[float]]:
-        """Return a dict of ``levels`` and ``frequencies``, which can be written as JSON."""
-        return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
+    def to_dict(self) -> dict[str, Any]:
+        """Return a dict of ``levels`` and ``frequencies``, which can be written as JSON.
+
+        It also has the pairs of ``ucl`` if uncomfortable levels were measured.
+        """
+        ear: dict[str, Any] = {"levels": list(self.levels), "frequencies": list(self.frequencies)}
+        return ear | {"ucl": [list(point) for point in self.ucl]} if self.ucl else ear
 
     def to_row(self) -> dict[str, str]:
-        """Return the thresholds as texts by column of a CSV file: ``hl_250``, ``hl_500``, ..."""
+        """Return the thresholds as texts by column of a CSV file: ``hl_250``, ``hl_500``, ...
+
+        Measured uncomfortable levels have the columns ``ucl_500``, ...
+        """
         points = zip(self.frequencies, self.levels, strict=True)
-        return {f"hl_{_shortest(hz)}": _shortest(level) for hz, level in points}
+        columns = {f"hl_{_shortest(hz)}": _shortest(level) for hz, level in points}
+        return columns | {f"ucl_{_shortest(hz)}": _shortest(level) for hz, level in self.ucl}
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Audiogram:
@@ -397,24 +449,30 @@ def ears_in_row(
     {'left': Audiogram({500: 20}), 'right': Audiogram({500: 30})}
     """
     points: dict[EarName | None, dict[float, float]] = {}
+    ucl: dict[EarName | None, dict[float, float]] = {}
     for column, meaning in threshold_columns(row).items():
         text = str(row[column]).strip()
         if meaning.is_remark:
             _check_remark(text, column)
         elif text.lower() not in _UNMEASURED:
-            level = _parse_level(text, column, highest)
-            points.setdefault(meaning.ear, {})[meaning.hz] = level
+            limits = (LOWEST_UCL, HIGHEST_UCL) if meaning.is_ucl else (LOWEST_LEVEL, highest)
+            ears = ucl if meaning.is_ucl else points
+            ears.setdefault(meaning.ear, {})[meaning.hz] = _parse_level(text, column, *limits)
     if not points:
         raise ValueError(
             "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got the "
             f"columns {', '.join(row)}; add columns or thresholds"
         )
-    if None in points and len(points) > 1:
+    if None in points and len(points | ucl) > 1:
         raise ValueError(
             "expected all columns of thresholds to name the ear, such as L500 and R500, or none of "
             f"them, got {', '.join(threshold_columns(row))}; rename the columns"
         )
-    return {ear: _from_mapping(points[ear]) for ear in (None, *EARS) if ear in points}
+    return {
+        ear: replace(_from_mapping(points[ear]), ucl=read_points(ucl.get(ear)))
+        for ear in (None, *EARS)
+        if ear in points
+    }
 
 
 def check_range(
@@ -455,24 +513,25 @@ def _check_remark(text: str, column: str) -> None:
     )
 
 
-def _parse_level(text: str, column: str, highest: float) -> float:
+def _parse_level(text: str, column: str, lowest: float, highest: float) -> float:
     """Convert the text of a threshold in dB HL, which may have a decimal comma, into a number.
 
     Args:
         text: Text to convert.
         column: Name of the column, for the message.
+        lowest: Lowest level allowed, in dB HL.
         highest: Highest level allowed, in dB HL.
 
     Raises:
-        ValueError: The text is not a number from -10 to ``highest``.
+        ValueError: The text is not a number from ``lowest`` to ``highest``.
     """
     try:
         level = float(text.replace(",", "."))
     except ValueError:
         level = math.nan
-    if not LOWEST_LEVEL <= level <= highest:
+    if not lowest <= level <= highest:
         raise ValueError(
-            f"column {column} is {text!r}; expected a level from {LOWEST_LEVEL:g} to {highest:g} "
+            f"column {column} is {text!r}; expected a level from {lowest:g} to {highest:g} "
             "dB HL. For no response write the highest level that was presented; for a frequency "
             "that was not measured leave the value empty, and it will be interpolated"
         )
@@ -492,6 +551,11 @@ def _as_array(values: Any) -> NDArray[np.float64]:
     if numbers.ndim != 1:
         raise ValueError(f"expected a list of numbers for an audiogram, got {values!r}")
     return numbers
+
+
+def _describe_points(points: Iterable[tuple[float, float]]) -> str:
+    """Return the text of a dict of frequencies to levels."""
+    return f"{{{', '.join(f'{hz:g}: {level:g}' for hz, level in points)}}}"
 
 
 def _shortest(value: float) -> str:
