@@ -3,8 +3,8 @@
     python docs/figures/uncomfortable_levels.py people/thresholds_in_noise.csv
 
 The table has one row per person, see ``examples/people_recruitment.py``. Every second person
-belongs to the fit. A level of 115 dB HL or more counts as not reached in the fit, and has no error in the
-test.
+belongs to the fit. A level of 115 dB HL or more counts as not reached in the fit, and has no error
+in the test.
 """
 
 import sys
