@@ -26,6 +26,7 @@ from hlsim.evaluation.digits.material import (
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
 from hlsim.simulators import Attenuation, load_simulator
+from tests.helpers import load_figure
 
 QUICK: dict[str, Any] = {"simulator": "attenuation", "triplets": 30}
 """Settings of a test of a second."""
@@ -228,3 +229,17 @@ def test_command_prints_a_line_per_ear(capsys: pytest.CaptureFixture[str], tmp_p
     assert [line[:5] for line in capsys.readouterr().out.splitlines()] == ["left,", "right"]
     assert main(["srt", "--audiogram", "N2", "--noise-reduction", "1", *quick]) == 2
     assert "no effect without an aid" in capsys.readouterr().err
+
+
+@torch.no_grad()
+def test_speech_and_noise_pass_the_gains_that_the_aid_has_for_their_sum() -> None:
+    figure = load_figure("digits_noise_reduction.py")
+    aid = hlsim.load_compensator("hearing-aid")
+    triplets = draw(1)
+    mixture = present(triplets, torch.zeros(1), 65.0)[:, :6400]
+    speech = 0.5 * triplets.speech[:, :6400]
+    attenuation = aid.attenuation(mixture)
+    parts = [figure.attenuate(part, attenuation) for part in (speech, mixture - speech)]
+    output = aid(mixture, "NH", noise_reduction=1.0, amplification=0.0)
+    assert float(attenuation.min()) < -1.0
+    torch.testing.assert_close(sum(parts)[:, 64:], output[:, :-64], rtol=1e-4, atol=1e-7)
