@@ -85,7 +85,7 @@ def filter_centres(bands: int) -> tuple[float, ...]:
 
 
 def _spaced_frequencies(count: int, erbs: float) -> list[float]:
-    """Return ``count`` frequencies in Hz from 0 Hz upwards, ``erbs`` ERBs or 125 Hz apart."""
+    """Return ``count`` frequencies from 0 Hz upwards, ``erbs`` ERBs but at least 125 Hz apart."""
     frequencies = [0.0]
     for _ in range(count - 1):
         width = erbs * float(erb(np.array(frequencies[-1])))
@@ -249,7 +249,10 @@ def speech_density(points: int) -> NDArray[np.float64]:
 
 @constant
 def _hop_matrix(bands: int) -> NDArray[np.float64]:
-    """Return the matrix that filters a hop, with the 128 samples before it, into all bands.
+    """Return the matrix that filters samples into bands.
+
+    The product of 192 samples, a hop with the 128 samples before it, and this matrix is the 64
+    samples of the first band, then those of the second one, and so on.
 
     Returns: (2 * DELAY + HOP, bands * HOP).
     """
@@ -262,7 +265,7 @@ def _hop_matrix(bands: int) -> NDArray[np.float64]:
 
 @constant
 def _ramp() -> NDArray[np.float64]:
-    """Return the weights of a hop's first and last gain at each sample, (2, HOP)."""
+    """Return the weights of the gains at the start and at the end of a hop, by sample, (2, HOP)."""
     last = np.arange(1, HOP + 1) / HOP
     return np.stack([1.0 - last, last])
 

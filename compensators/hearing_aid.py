@@ -211,6 +211,8 @@ class HearingAid(Wearable, HubModel):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of restoring gain and correction in dB, and the new state.
 
+        The sum is limited, and fades for quiet sounds.
+
         Args:
             levels: Levels in dB SPL of the bands and of the whole frame.
             fitted: Hearing loss in dB HL in each band, then NAL-R's gain in dB in each band.

@@ -113,9 +113,9 @@ def _powers(frames: int, past: float) -> NDArray[np.float64]:
 
 @constant
 def _weights(frames: int, past: float) -> NDArray[np.float64]:
-    """Return the matrix from the frames' values to their averages, without the past before them.
+    """Return the matrix that turns values of frames into their exponential averages.
 
-    Returns: Lower triangular, (frames, frames).
+    The averages start from 0. Returns: Lower triangular, (frames, frames).
     """
     distance = np.arange(frames)[:, None] - np.arange(frames)
     return np.where(distance >= 0, (1.0 - past) * past ** np.maximum(distance, 0), 0.0)

@@ -199,6 +199,6 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
-    """Return those of ``noise_reduction`` and ``amplification`` that a user has set, by name."""
+    """Return the values of the sliders of a hearing aid that a user has set, by name."""
     values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}
     return {name: value for name, value in values.items() if value is not None}

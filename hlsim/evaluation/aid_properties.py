@@ -321,7 +321,7 @@ def measure_reception_thresholds(
 
 
 def _measure_reception_threshold(aid: Aid, ear: Audiogram, test: DigitTest) -> dict[str, Estimate]:
-    """Measure the reception threshold of one ear with an aid, as the value of ``threshold_db``."""
+    """Return the speech reception threshold of one ear with an aid, as ``threshold_db``."""
     thresholds = torch.tensor(ear.thresholds)
     return {
         "threshold_db": test.measure(thresholds, lambda inputs, _: _aid_outputs(aid, inputs, ear))
@@ -348,7 +348,7 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
 
 
 def _band_powers(signal: Tensor) -> Tensor:
-    """Return the mean power in each of 24 bands, relative to 20 micropascals squared.
+    """Return the mean power in each of 24 bands, where 1.0 is 0 dB SPL.
 
     Shape: (utterances, time) -> (24,).
     """

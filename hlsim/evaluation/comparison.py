@@ -72,7 +72,7 @@ class ConditionComparison:
         return column_title(self.measure)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes for ``report.json``."""
+        """Return the attributes as a dict for ``report.json``; an unknown level change is None."""
         level_change = None if math.isnan(self.level_change) else self.level_change
         return asdict(self) | {"level_change": level_change}
 

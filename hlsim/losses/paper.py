@@ -118,8 +118,8 @@ def _magnitude(spectrum: Tensor) -> Tensor:
 class _FadedPhaseDifference(torch.autograd.Function):
     """Phase of the target minus that of the estimate, as the angle of one complex product.
 
-    The gradient of the angle of z is i z / |z|^2. Here it is multiplied by |z|^2 / (|z|^2 + faint),
-    and by the same factor of the other spectrum.
+    The gradient of the angle of z is i z / |z|^2. Here it is faded out near silence: multiplied by
+    |z|^2 / (|z|^2 + ``FAINT_POWER``), and by the same factor of the other spectrum.
     """
 
     @staticmethod

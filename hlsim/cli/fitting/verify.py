@@ -75,7 +75,7 @@ def _verify(options: argparse.Namespace) -> None:
 
 
 def _print_result(result: Verification) -> None:
-    """Print a table with one row per third octave, see ``Verification.rows``, and both SIIs."""
+    """Print one row per third octave, see ``Verification.rows``, and audible shares of speech."""
     rows = result.rows()
     # Short labels, such as "in 30" for input_30, keep the table within the width of a terminal.
     labels = [name.replace("put_", " ").replace("_", " ") for name in rows[0]]

@@ -160,7 +160,7 @@ def _interpolate(points: Array) -> Array:
 
 
 def _write_csv(fitting: _Fitting) -> str:
-    """Return a CSV table with a row per frequency, and a column per level of speech in dB SPL."""
+    """Return a CSV table of gains in dB, with one row per frequency and one column per level."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frequency_hz", *(f"gain_db_at_{level:g}" for level in LEVELS)])
@@ -177,7 +177,10 @@ def _write_equalizer_apo(fitting: _Fitting) -> str:
 
 
 def _write_camilladsp(fitting: _Fitting) -> str:
-    """Return the configuration of CamillaDSP 3: a minimum-phase filter, from stdin to stdout."""
+    """Return the configuration of CamillaDSP 3: a filter with the gains, from stdin to stdout.
+
+    The filter has minimum phase, for the shortest delay.
+    """
     points = _equaliser_points(fitting.gains(fitting.level))
     hertz = np.array([0, *_HERTZ, *[fitting.sample_rate / 2][: fitting.sample_rate > RATE]])
     response = 10.0 ** (np.interp(hertz, _HERTZ, _interpolate(points)) / 20.0)

@@ -322,7 +322,7 @@ def section_powers(signal: Tensor, sample_rate: int) -> Array:
 
 
 def _bandwidth_db() -> Array:
-    """Return 10 log10 of each third octave's width in Hz, (18,): its level above that per Hz."""
+    """Return by how many dB the level of a third octave exceeds its level per Hz, (18,)."""
     width = 2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0)
     return 10.0 * np.log10(width * np.array(SII_BANDS))
 

@@ -120,7 +120,8 @@ def value_hash(value: Any) -> str:
 
     Args:
         value: Text, number, list or dict, whose order does not matter, nested as you like, with
-            tensors, arrays, dataclasses, functions with a name, and modules with a fingerprint.
+            tensors, arrays, dataclasses, functions (of which only the name counts), and modules
+            with a fingerprint.
 
     Raises:
         TypeError: The value contains something else, such as a lambda.
@@ -168,7 +169,7 @@ def _describe(value: Any) -> Any:
     """Convert an object that JSON cannot represent to values that it can, for ``value_hash``.
 
     Raises:
-        TypeError: The object has no description that would change with its contents.
+        TypeError: The object cannot be described, as a lambda.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
