@@ -434,7 +434,10 @@ class Stream:
         waveform = as_samples(chunk)
         check_waveform(waveform, "chunk", full_scale_spl=self._aid.full_scale_spl)
         if not bool(waveform.isfinite().all()):
-            raise ValueError("expected finite samples in a chunk, got NaN or infinity")
+            raise ValueError(
+                "expected finite samples in a chunk, got NaN or infinity; the chunk was not "
+                "processed, replace its samples, for example by torch.nan_to_num"
+            )
         with torch.no_grad(), torch.autocast(waveform.device.type, enabled=False):
             self._prepare(waveform)
             gain = gain_to_pascals(self._aid.full_scale_spl)
@@ -475,7 +478,7 @@ class Stream:
         elif chunk.shape[:-1] != self._shape:
             raise ValueError(
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
-                f"got {tuple(chunk.shape)}"
+                f"got {tuple(chunk.shape)}; call flush before a signal of another shape"
             )
         self._sliders = self._aid.stack_sliders(self.sliders, self._batch, self._fitted)
         if is_first:

@@ -424,5 +424,7 @@ def _band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> fl
     reference_levels = band_levels(reference, sample_rate)
     audible = audibility_weights(reference_levels, audibility_threshold(reference_levels)) > 0.0
     if not bool(audible.any()):
-        raise ValueError("a normal ear finds nothing of the clean speech audible")
+        raise ValueError(
+            "expected clean speech that is audible for a normal ear, got none; raise its level"
+        )
     return float((levels - reference_levels).abs()[audible].double().quantile(0.5))

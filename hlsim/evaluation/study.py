@@ -509,10 +509,13 @@ def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
     """
     if output.shape[:-1] != signal.shape[:-1]:
         raise ValueError(
-            f"expected an output of shape {tuple(signal.shape)}, got {tuple(output.shape)}"
+            f"expected an output of shape {tuple(signal.shape)}, got {tuple(output.shape)}; return "
+            "a signal of the input's shape"
         )
     if not output.isfinite().all():
-        raise ValueError("expected finite samples in the output, got NaN or infinite ones")
+        raise ValueError(
+            "expected finite samples in the output, got NaN or infinite ones; correct the aid"
+        )
     lengths = signal.shape[-1], output.shape[-1]
     return output[..., : common_length(lengths, sample_rate, ("the input", "the output"))]
 
