@@ -68,6 +68,8 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from hlsim.report.simulators_page import simulators_page
 
     compensator = load_compensator(options.compensator) if options.compensator else None
+    if options.compensator:
+        warn_of_other_ears({options.compensator: options.compensator}, None)
     _run_study(
         options,
         evaluate_simulators,
@@ -238,11 +240,16 @@ def _clarity(options: argparse.Namespace) -> None:
     from hlsim.evaluation.clarity import evaluate_scenes
     from hlsim.report.recordings_page import scenes_page
 
+    aids = _read_labels(options.names)
+    checkpoints = {
+        label: name for label, name in aids.items() if ":" not in name or Path(name).exists()
+    }
     _run_study(
         options,
         evaluate_scenes,
         scenes_page,
-        aids=_read_labels(options.names),
+        notes=warn_of_other_ears(checkpoints, None),
+        aids=aids,
         outputs=_by_name(options.outputs, "--outputs"),
         out=options.out,
     )
@@ -371,6 +378,8 @@ def _run_study(
         evaluation = replace(evaluation, notes=[*notes, *evaluation.notes])
         page = make_page(evaluation)
         path = write_results(page, evaluation, options.out)
+    for note in evaluation.notes[len(notes) :]:  # Those of the caller have been printed.
+        print(f"hlsim: {note}", file=sys.stderr)
     tables = [table for section in page.sections for table in section.tables]
     print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path.as_uri()}")
     failed = len(evaluation.failures)

@@ -309,7 +309,7 @@ def loudness(text: str) -> float | dict[float, float]:
         text: A number in dB, or levels in dB SPL with numbers in dB.
 
     Raises:
-        argparse.ArgumentTypeError: The text is neither.
+        argparse.ArgumentTypeError: The text is neither, or a level occurs twice.
 
     >>> loudness("-5"), loudness("50:0,80:-9")
     (-5.0, {50.0: 0.0, 80.0: -9.0})
@@ -318,11 +318,16 @@ def loudness(text: str) -> float | dict[float, float]:
         if ":" not in text:
             return float(text)
         points = [point.split(":") for point in text.split(",")]
-        return {float(level): float(value) for level, value in points}
+        numbers = {float(level): float(value) for level, value in points}
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"got {text!r}, expected a number of dB, or numbers by level such as 50:0,65:-5,80:-9"
         ) from None
+    if len(numbers) < len(points):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected one number for each level; leave all but one out"
+        )
+    return numbers
 
 
 def _limited(

@@ -5,12 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from hlsim.cli.inputs import (
-    build_compensator,
-    parse_ears,
-    read_sliders,
-    warn_of_other_ears,
-)
+from hlsim.cli.inputs import build_compensator, parse_ears, read_sliders
 from hlsim.cli.options import Parser, count, seed, sound_level
 from hlsim.progress import ProgressLine
 
@@ -49,8 +44,6 @@ def _srt(options: argparse.Namespace) -> None:
             ears.update(ear.ears().items())
     aid = None
     if options.compensator:
-        for ear in ears.values():
-            warn_of_other_ears({options.compensator: options.compensator}, ear)
         aid = build_compensator(options, NEURO_RATE)
     sliders: dict[str, Any] = {**read_sliders(options)}
     with ProgressLine("tests") as progress:

@@ -370,7 +370,8 @@ def read_recordings(
             raise ValueError(
                 f"{rows[0][0]}: there is no column {column}, only {', '.join(columns)}; add it"
             )
-    warn_of_unused({*columns} - {*_COLUMNS, *threshold_columns(columns)}, "the manifest", _COLUMNS)
+    known = [column for column in _COLUMNS if column != "spl"]
+    warn_of_unused({*columns} - {*known, *threshold_columns(columns)}, "the manifest", known)
     listeners: dict[str, Listener] = {}
     if audiograms is not None:
         listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})

@@ -14,7 +14,7 @@ from hlsim.audiogram.scale import EARS
 from hlsim.audiogram.value import EarLike
 from hlsim.evaluation.comparison import PlannedComparison, compare
 from hlsim.evaluation.conditions import AFTER, BEFORE
-from hlsim.evaluation.measures import ALIGNMENT, LEVELS, find_lag, find_measures
+from hlsim.evaluation.measures import ALIGNMENT, CORRELATION_FLOOR, LEVELS, find_lag, find_measures
 from hlsim.evaluation.recorded_items import (
     RecordedItem,
     join_name,
@@ -235,7 +235,7 @@ def score_recordings(
     columns = [*find_measures(measures, precision), LEVELS, ALIGNMENT]
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
     table, scores, names = evaluation.table, evaluation.scores, evaluation.names
-    notes = _describe_lags(table)
+    notes = [*_describe_unrelated(table), *_describe_lags(table)]
     if better_ear:
         table = _better_ears(table, utterances, scores)
         replace(evaluation, table=table).check_scores()
@@ -345,6 +345,22 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
     for fact in last.columns.intersection(_EAR_FACTS):
         better[fact] = better["item"].map(last[fact])
     return better
+
+
+def _describe_unrelated(table: DataFrame) -> list[str]:
+    """Return a sentence about outputs that are not similar to their clean speech, or none."""
+    values = table.reindex(columns=["level", "lag_ms"])
+    unrelated = table[values["level"].notna() & values["lag_ms"].isna()]
+    if unrelated.empty:
+        return []
+    counts = unrelated["condition"].value_counts(sort=False)
+    return [
+        f"{len(unrelated)} of {len(table)} outputs are not similar to their clean speech "
+        f"(correlation of at most {CORRELATION_FLOOR} at every lag): "
+        f"{', '.join(f'{count} under {name}' for name, count in counts.items())}. Check that "
+        "these files have the same sentence as their clean file. Noise that is much louder than "
+        "the speech, and a resynthesised waveform, have the same effect."
+    ]
 
 
 def _describe_lags(table: DataFrame) -> list[str]:

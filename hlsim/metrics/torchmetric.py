@@ -379,7 +379,12 @@ def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
     levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL)
     one_for_all = (2, len(FREQUENCIES)) if sides == 2 else (len(FREQUENCIES),)
     fits = levels.shape in (one_for_all, (items, *one_for_all))
-    if not fits or (sides == 1 and has_listeners(audiogram)):
+    if sides == 1 and has_listeners(audiogram):
+        raise ValueError(
+            "expected signals of shape (batch, 2, time) for a Listener, got one channel per item; "
+            "stack left and right: torch.stack([left, right], 1)"
+        )
+    if not fits:
         raise ValueError(
             f"expected an audiogram of shape {one_for_all} or {(items, *one_for_all)}, "
             f"got {tuple(levels.shape)}"

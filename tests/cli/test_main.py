@@ -110,6 +110,7 @@ compensate {speech} {out} --audiogram N3 --compensator wdrc --linked | expected 
 listen {speech} --listener {ears}:a --out {out} | in.flac: expected two channels
 simulate {speech} {out} --audiogram 10,20 | such as 500:20,4000:50 on the command line
 simulate {speech} {out} --audiogram 500:30,500:60 | one level for each frequency
+evaluate-compensator nalr --speech {speech} --out {out} --loudness 50:0,50.0:-9 | one number for each level
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
@@ -257,6 +258,33 @@ def test_a_compensator_for_another_ear_warns_once(
     options = ("--audiogram", ear, "--compensator", tmp_path / "mine")
     assert run("compensate", utterance, tmp_path / "out.wav", *options) == 0
     assert capsys.readouterr().err.count("was trained for one ear") == warnings
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "verify {speech} {speech} --audiogram N3 --target {aid}",
+        "listen {speech} --audiogram N3 --compensator {aid} --seconds 1 --out {out}/page.html",
+        "export-gains --audiogram N3 --to csv --compensator {aid}",
+        "evaluate-simulator msbg --speech {folder} --audiograms standard --out {out} --items 1 "
+        "--seconds 1 --jobs 1 --inputs compensated --compensator {aid}",
+        "clarity {folder} {aid} --listeners {speech} --out {out}",
+    ],
+)
+def test_every_command_warns_of_a_compensator_for_another_ear(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    model = MappingCompensator(config=MappingConfig(channels=8, blocks=1))
+    about = {"audiogram": Audiogram.standard("N4").to_dict()}
+    aid = tmp_path / "mine"
+    save_checkpoint(aid, "mapping-compensator", model, model.config.to_dict(), about)
+    (tmp_path / "speech").mkdir()
+    (tmp_path / "speech" / utterance.name).write_bytes(utterance.read_bytes())
+    places = {"speech": utterance, "folder": tmp_path / "speech", "out": tmp_path, "aid": aid}
+    # The folder for ``clarity`` has no scenes, which it reports after the warning.
+    expected_status = 2 if command.startswith("clarity") else 0
+    assert run(*command.format(**places).split()) == expected_status
+    assert capsys.readouterr().err.count("was trained for one ear") == 1
 
 
 def test_folders_keep_their_tree_and_bad_files_are_reported(

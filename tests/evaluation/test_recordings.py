@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import soundfile
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
+from hlsim.cli.main import main
 from hlsim.evaluation import haspi_report
 from hlsim.evaluation.recorded_items import RecordedItem, read_recordings
 from hlsim.files import sha256
@@ -484,6 +486,29 @@ def test_outputs_that_are_late_are_named(tmp_path: Path) -> None:
     (note,) = report.notes
     assert "2 of 2 outputs" in note
     assert "1 under after (median +32.0 ms)" in note
+
+
+def test_outputs_of_other_sentences_are_named(
+    corpus: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noise = np.random.default_rng(0).standard_normal(16000)
+    speech = {"own": example_speech()[:16000], "other": 0.02 * torch.from_numpy(noise).float()}
+    for folder, sounds in {
+        "clean": ("own", "own"),
+        "right": ("own", "own"),
+        "mixed up": ("own", "other"),
+    }.items():
+        for number, sound in enumerate(sounds):
+            write_audio(corpus / "study" / folder / f"{number}.wav", speech[sound], 16000)
+    command = ["haspi-report", "--clean", f"{corpus}/study/clean", "--audiogram", "N4"]
+    command += ["--condition", f"right={corpus}/study/right", "--jobs", "1"]
+    command += ["--condition", f"mixed up={corpus}/study/mixed up", "--measures", "stoi"]
+    assert main([*command, "--out", f"{corpus}/study/report"]) == 0
+    note = "1 of 4 outputs are not similar to their clean speech"
+    assert (
+        f"hlsim: {note}" in (printed := capsys.readouterr().err) and "1 under mixed up" in printed
+    )
+    assert note in (corpus / "study" / "report" / "report.md").read_text()
 
 
 def test_folders_of_many_systems_are_scored_for_all_ears_of_a_table(corpus: Path) -> None:

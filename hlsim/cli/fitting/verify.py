@@ -8,7 +8,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_extras, parse_ear, use_one_thread
+from hlsim.cli.inputs import check_extras, parse_ear, use_one_thread, warn_of_other_ears
 from hlsim.cli.options import SIMULATED_EARS, Parser, input_path
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ def _verify(options: argparse.Namespace) -> None:
     from hlsim.evaluation.fitting.verification import verify as verify_aid
     from hlsim.files import write_atomically
 
+    ear = parse_ear(options)
+    warn_of_other_ears({options.target: options.target}, ear)
     (input_, rate), (output, output_rate) = map(read_audio, (options.input, options.output))
     if rate != output_rate:
         raise ValueError(
@@ -56,7 +58,7 @@ def _verify(options: argparse.Namespace) -> None:
     result = verify_aid(
         input_.squeeze(0),
         output.squeeze(0),
-        parse_ear(options),
+        ear,
         rate,
         full_scale_spl=full_scale_spl,
         prescription=options.target,
