@@ -7,6 +7,7 @@ import inspect
 import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, fields
 from functools import partial
 from pathlib import Path
@@ -91,12 +92,18 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
         settings: Arguments such as ``--recipe.babble=0.3``.
 
     Raises:
-        ValueError: The file cannot be read, or a setting is unknown or invalid.
+        ValueError: The file cannot be read, or a setting is unknown, invalid or given twice.
+        OSError: There is no such file.
     """
     arguments = [*settings] if file is None else [f"--recipe={file}", *settings]
     if not arguments:
         return recipe()  # type: ignore[call-arg]
     jsonargparse: Any = require("jsonargparse", "train")
+    texts = [setting.partition("=")[2] for setting in settings]
+    if file is not None:
+        texts.append(file.read_text(encoding="utf-8", errors="replace"))
+    for text in texts:
+        _reject_repeated_keys(text)
     parser = jsonargparse.ArgumentParser(exit_on_error=False)
     parser.add_class_arguments(recipe, "recipe")
     try:
@@ -107,3 +114,22 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
         ) from error
     result: Recipe = parser.instantiate(parsed).recipe
     return result
+
+
+def _reject_repeated_keys(text: str) -> None:
+    """Raise ValueError if a mapping in a YAML text has a key twice, of which the last would count.
+
+    A text that is not valid YAML passes, because jsonargparse rejects it.
+    """
+    yaml: Any = require("yaml", "train")
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+            for key in keys:
+                if keys.count(key) > 1:
+                    raise ValueError(f"recipe: {key!r} occurs twice; remove one of the two")
+            return super().construct_mapping(node, deep)
+
+    with suppress(yaml.YAMLError):
+        yaml.load(text, Loader=Loader)

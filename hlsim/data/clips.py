@@ -34,6 +34,13 @@ _MAX_HASHED_BYTES = 2**30
 _HASHED_PIECES = 4
 _SMALLEST_PIECE = 4096  # bytes
 
+_LOWEST_CORRELATION = -0.4
+"""Correlation of noise and clean speech below which the noise contains inverted clean speech.
+
+Noise and speech of a true pair have about 0. If the noisy file has another sentence, another level
+or a delay, their difference is mostly the clean speech with the opposite sign.
+"""
+
 _SILENT_POWER = 1e-7
 """Mean square up to which a clip counts as silent, if the peak of its recording is 1.0."""
 
@@ -171,7 +178,7 @@ class Clips:
         file, clean_file = self.files[index], self._clean_files[index]
         waveform, rate = read_audio(clean_file or file)
         if clean_file is not None:
-            waveform = read_noisy(file, waveform, rate) - waveform
+            waveform = _read_noise(file, waveform, rate)
         return resample(waveform[:1], rate, self.sample_rate).squeeze(0)
 
 
@@ -201,6 +208,24 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
             f"the clean version, got {rate} Hz and {tuple(noisy.shape)}; replace one of them"
         )
     return noisy
+
+
+def _read_noise(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
+    """Return noisy minus clean speech, with the arguments of ``read_noisy``.
+
+    Raises:
+        ValueError: The noisy speech cannot be read, or does not contain the clean speech.
+    """
+    noise = read_noisy(path, clean, clean_rate) - clean
+    scale = float(noise.norm() * clean.norm())
+    correlation = float((noise * clean).sum()) / scale if scale else 0.0
+    if correlation < _LOWEST_CORRELATION:
+        raise ValueError(
+            f"{path}: expected the clean speech plus noise, but their difference is not noise "
+            f"(correlation with the clean speech {correlation:.2f}); pair files of the same "
+            "sentence, at the same level and without a delay"
+        )
+    return noise
 
 
 def hash_source(source: AudioFiles) -> str:

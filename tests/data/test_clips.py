@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import soundfile
 import torch
@@ -86,6 +87,24 @@ def test_noise_of_pairs_is_noisy_minus_clean(tmp_path: Path) -> None:
     pairs = [(tmp_path / f"{a}.wav", tmp_path / f"{b} noisy.wav") for a, b in ("aa", "bb", "cb")]
     clips = Clips(pairs, sample_rate=16000, seconds=0.25, repeat=True)
     with pytest.warns(UserWarning, match=r"b noisy.wav"):
+        drawn = clips.draw(20, torch.Generator().manual_seed(0))
+    for clip in drawn:
+        torch.testing.assert_close(clip, noise / noise.abs().max(), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("change", ["another sentence", "softer", "late"])
+def test_a_noisy_file_that_does_not_contain_its_clean_version_is_left_out(
+    tmp_path: Path, change: str
+) -> None:
+    generator = np.random.default_rng(0)
+    clean, other, noise = torch.from_numpy(generator.standard_normal((3, 4000))).float() / 4
+    contents = {"another sentence": other, "softer": 0.3 * clean, "late": clean.roll(40)}
+    write_audio(tmp_path / "a.wav", clean, 16000)
+    write_audio(tmp_path / "a noisy.wav", clean + noise, 16000)  # at 0 dB
+    write_audio(tmp_path / "b noisy.wav", contents[change] + 0.1 * noise, 16000)
+    pairs = [(tmp_path / "a.wav", tmp_path / f"{name} noisy.wav") for name in "ab"]
+    clips = Clips(pairs, sample_rate=16000, seconds=0.25)
+    with pytest.warns(UserWarning, match=r"b noisy.wav: expected the clean speech plus noise"):
         drawn = clips.draw(20, torch.Generator().manual_seed(0))
     for clip in drawn:
         torch.testing.assert_close(clip, noise / noise.abs().max(), atol=1e-3, rtol=0)

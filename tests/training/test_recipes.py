@@ -94,3 +94,12 @@ def test_invalid_files_and_arguments_are_rejected(tmp_path: Path, text: str) -> 
         make_recipe(CompensatorRecipe, tmp_path / "recipe.yaml", [])
     with pytest.raises(ValueError):
         make_recipe(CompensatorRecipe, None, [f"--recipe.{text.replace(': ', '=') or '='}"])
+
+
+def test_a_setting_that_is_given_twice_is_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "recipe.yaml"
+    file.write_text("batch: 4\nsteps: 10\nbatch: 8\n")
+    with pytest.raises(ValueError, match="'batch' occurs twice"):
+        make_recipe(CompensatorRecipe, file, [])
+    with pytest.raises(ValueError, match="50 occurs twice"):
+        make_recipe(CompensatorRecipe, None, ["--recipe.loudness={50: 0, 50.0: -9}"])
