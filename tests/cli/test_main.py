@@ -110,7 +110,7 @@ compensate {speech} {out} --audiogram N3 --compensator wdrc --linked | expected 
 listen {speech} --listener {ears}:a --out {out} | in.flac: expected two channels
 simulate {speech} {out} --audiogram 10,20 | such as 500:20,4000:50 on the command line
 simulate {speech} {out} --audiogram 500:30,500:60 | one level for each frequency
-evaluate-compensator nalr --speech {speech} --out {out} --loudness 50:0,50.0:-9 | one number for each level
+evaluate-compensator nalr --speech {speech} --out {out} --loudness 50:0,50:1 | one number for
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
