@@ -320,7 +320,7 @@ class HearingLossLoss(nn.Module):
         if output.shape != clean.shape:
             raise ValueError(
                 "expected output and clean with the same shape, "
-                f"got {tuple(output.shape)} and {tuple(clean.shape)}; cut, pad or expand one of them"
+                f"got {tuple(output.shape)} and {tuple(clean.shape)}; cut or expand one of them"
             )
         if clean.requires_grad and not output.requires_grad and not self._has_warned_of_order:
             self._has_warned_of_order = True
