@@ -3,6 +3,7 @@
     python docs/figures/benchmark.py
     python docs/figures/benchmark.py --what simulators --simulators neuro-msbg runs/mine/checkpoint
     OMP_NUM_THREADS=1 python docs/figures/benchmark.py --what loss step --seconds 2 --batch 8
+    OMP_NUM_THREADS=1 python docs/figures/benchmark.py --processor-time  # on a busy machine
 
 Every round times all rows of a table in turn, so that a ratio compares calls within seconds of each
 other. The first round is not counted. Tables show the median (minimum to maximum) of the other
@@ -162,25 +163,27 @@ TABLES = {
 }
 
 
-def time_call(row: Row, backward: bool, device: str) -> float:
+def time_call(row: Row, backward: bool, device: str, clock: Callable[[], float]) -> float:
     """Measure the milliseconds of a call, forward alone or with the backward pass."""
-    start = time.perf_counter()
+    start = clock()
     with torch.inference_mode(not backward):
         value = row.call()
         if backward:
             value.square().sum().backward()
     if device.startswith("cuda"):
         torch.cuda.synchronize(device)
-    return 1000.0 * (time.perf_counter() - start)
+    return 1000.0 * (clock() - start)
 
 
-def print_table(title: str, rows: list[Row], repeats: int, device: str) -> None:
+def print_table(
+    title: str, rows: list[Row], repeats: int, device: str, clock: Callable[[], float]
+) -> None:
     """Time the rows in turns and print a Markdown table."""
     times: dict[tuple[str, bool], list[float]] = {}
     for repeat in range(repeats + 1):
         for row in rows:
             for backward in (False, True) if row.backward else (False,):
-                elapsed = time_call(row, backward, device)
+                elapsed = time_call(row, backward, device, clock)
                 if repeat > 0:
                     times.setdefault((row.name, backward), []).append(elapsed)
     print(f"\n| {title} | forward (ms) | forward + backward (ms) | pyclarity's time / forward |")
@@ -218,7 +221,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, default=1, help="signals per batch")
     parser.add_argument("--repeats", type=int, default=7, help="counted rounds")
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:1")
+    parser.add_argument(
+        "--processor-time",
+        action="store_true",
+        help="time all threads of this process, instead of the time that passes",
+    )
     options = parser.parse_args(arguments)
+    clock = time.process_time if options.processor_time else time.perf_counter
     size = f"{options.batch} x {options.seconds:g} s"
     print(
         f"{size} on {options.device}, {torch.get_num_threads()} threads, torch "
@@ -226,7 +235,7 @@ def main(arguments: list[str] | None = None) -> None:
         f"{options.repeats} rounds"
     )
     for name in options.what:
-        print_table(name, TABLES[name](options), options.repeats, options.device)
+        print_table(name, TABLES[name](options), options.repeats, options.device, clock)
 
 
 if __name__ == "__main__":
