@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import NamedTuple
 
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_HZ, LOWEST_HZ, EarName
@@ -123,6 +124,7 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     return meanings
 
 
+@lru_cache(maxsize=1024)  # every row of a table has the same names
 def _read_name(column: str, name: str) -> ThresholdColumn | None:
     """Return the meaning of a column of thresholds or of remarks, or None for any other column.
 

@@ -19,7 +19,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,7 +107,7 @@ class RecordedItem:
         snr = None if math.isnan(self.snr) else self.snr
         return self.listener, self.utterance, snr
 
-    @property
+    @cached_property
     def facts(self) -> dict[str, Any]:
         """Columns of the table that describe the recording, except its name."""
         return {
@@ -152,7 +152,7 @@ class RecordedItem:
             sample_rate=rate,
             full_scale_spl=full_scale,
             seed=(self.seed + int(_file_hash(self.clean)[:8], 16)) % 2**32,
-            facts=self.facts,
+            facts=dict(self.facts),
             recorded=partial(self._read_output, rate),
         )
 

@@ -12,6 +12,9 @@ import scipy
 RESAMPLES = 9999
 """Number of bootstrap resamples."""
 
+_DRAWS_AT_ONCE = 2**17
+"""Number of values that are drawn at once, which fit into caches."""
+
 MIN_ITEMS_FOR_INTERVAL = 6
 """Smallest number of items with an interval. With fewer, Wilcoxon's p cannot fall below 0.05."""
 
@@ -167,10 +170,13 @@ def bootstrap_interval(values: Iterable[float]) -> tuple[float, float]:
     n = len(data)
     if n < MIN_ITEMS_FOR_INTERVAL:
         raise ValueError(f"expected {MIN_ITEMS_FOR_INTERVAL} values or more, got {n}; add items")
-    indices = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
+    generator = np.random.default_rng(0)
+    means = np.empty(RESAMPLES)
+    for part in np.array_split(means, -(-RESAMPLES * n // _DRAWS_AT_ONCE)):
+        part[:] = data[generator.integers(0, n, (len(part), n))].mean(-1)
     expanded = scipy.special.stdtrit(n - 1, 0.975) * math.sqrt(n / (n - 1))
     tail = 100.0 * scipy.special.ndtr(-expanded)
-    low, high = np.percentile(data[indices].mean(-1), [tail, 100.0 - tail])
+    low, high = np.percentile(means, [tail, 100.0 - tail])
     return float(low), float(high)
 
 

@@ -38,6 +38,7 @@ from hlsim.metrics.ear import alignment, envelope_modulation as envelopes, model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
+from hlsim.metrics.ear.motion_noise import draw_motion_noise
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import Audio, Samples, as_type_of, constant, not_compiled
@@ -289,7 +290,7 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
     random = np.random.RandomState()
     for item, (samples, frames) in enumerate(zip(extent.ends, audible.ends, strict=True)):
-        random.set_state(_state_after_motion_noise(seed, samples))
+        random.set_state(_state_after_motion_noise(seed, samples, like.dtype))
         for signal in (0, 1):
             levels = torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like.dtype)
             noise[signal, item, :, :frames] = envelopes.NOISE_DB * envelopes.cepstrum(levels.mT)
@@ -297,21 +298,20 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
 
 
 @lru_cache(maxsize=256)
-def _state_after_motion_noise(seed: int, samples: int) -> Any:
+def _state_after_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> Any:
     """Return the state of NumPy's generator after the noise that pyclarity draws for the motion.
 
     Before the noise on the levels, pyclarity draws noise for the motion of the basilar membrane of
-    both signals, which only HASQI uses. These are most of the random numbers. The state is stored,
-    because a study needs the same one for all conditions and ears.
+    both signals, which only HASQI and HAAQI use. These are most of the random numbers. The state is
+    stored, because a study needs the same one for all conditions and ears, and it takes less memory
+    than the noise.
 
     Args:
         seed: Seed of the generator.
         samples: Number of samples at 24 kHz per channel.
+        dtype: Precision in which HASQI uses the noise.
     """
-    random = np.random.RandomState(seed)
-    for _ in range(2 * CHANNELS):
-        random.standard_normal(samples)
-    return random.get_state()
+    return draw_motion_noise(seed, samples, dtype).state
 
 
 # -- networks --------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from hlsim.metrics.ear import alignment, fine_structure, model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
+from hlsim.metrics.ear.motion_noise import draw_motion_noise
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise
 from hlsim.metrics.reference import PreparedBatch, Reference
@@ -192,6 +193,9 @@ class QualityReference(Reference):
         delays = longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
         inner = cells[..., channels].inner
         levels, motion = self._adapt(cochlea.power, cochlea.motion, inner, delays, extent)
+        segments = None
+        if self._keeps_features:
+            segments = self._segment_spectra(motion, delays, channels, None, extent)
         return _Channels(
             channels=channels,
             envelope=alignment.lag_spectrum(cochlea.power.sqrt(), extent),
@@ -199,7 +203,7 @@ class QualityReference(Reference):
             delays=delays,
             smooth_levels=levels,
             adapted_motion=motion,
-            segments=self._segment_spectra(motion, delays, channels, None, extent),
+            segments=segments,
             level=cochlea.level,
         )
 
@@ -269,7 +273,7 @@ class QualityReference(Reference):
         clean_noise, noise = noises
         segments = self._segment_spectra(motion, clean.delays, channels, noise, extent)
         clean_segments = clean.segments
-        if clean_noise is not None:
+        if clean_segments is None or clean_noise is not None:
             clean_segments = self._segment_spectra(
                 clean.adapted_motion, clean.delays, channels, clean_noise, extent
             )
@@ -327,7 +331,8 @@ class _Channels:
             segments).
         adapted_motion: Motion whose envelope is the level at the auditory nerve. Shape: (items,
             channels, padded).
-        segments: Spectra and mean squares of segments of that motion by ``segment_spectra``.
+        segments: Spectra and mean squares of segments of that motion by ``segment_spectra``;
+            None if they serve a single score, which computes them with its noise.
         level: Long-term level in dB over threshold. Shape: (items, channels).
     """
 
@@ -337,7 +342,7 @@ class _Channels:
     delays: Tensor
     smooth_levels: Tensor
     adapted_motion: Tensor
-    segments: tuple[Tensor, Tensor]
+    segments: tuple[Tensor, Tensor] | None
     level: Tensor
 
 
@@ -389,8 +394,7 @@ def _threshold_noise(
     if noise == "seeded":
         drawn = torch.zeros(2, len(extent.ends), CHANNELS, longest, dtype=like.dtype)
         for item, end in enumerate(extent.ends):
-            random = np.random.RandomState(seed)
-            drawn[:, item, :, :end] = torch.from_numpy(random.standard_normal((2, CHANNELS, end)))
+            drawn[:, item, :, :end] = draw_motion_noise(seed, end, like.dtype).signals
         clean_noise, output_noise = drawn.to(like.device)
         return clean_noise, output_noise
     if noise == "expected":

@@ -95,6 +95,7 @@ class Reference(ABC):
     ) -> None:
         check_number("equalisation", equalisation, 1, 2, whole=True)
         self._is_amplified = equalisation == 2
+        self._keeps_features = keep
         rate = check_rate(sample_rate)
         self._rate = 1000 * round(rate / 1000) if whole_khz else rate
         self._full_scale_spl = check_full_scale(full_scale_spl)

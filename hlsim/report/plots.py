@@ -38,6 +38,9 @@ _LINE_STYLES = ("-", "--", ":", "-.")
 _LINEAR_DB = 0.5
 """Largest difference in dB between gains at several levels that are drawn as one curve."""
 
+_MOST_DRAWN_POINTS = 2000
+"""Number of points above which they become an image in the drawing."""
+
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH_INCHES = 4.2
 _LEGEND_INCHES = 0.2  # for each row of a legend
@@ -330,7 +333,9 @@ def scores_pictures(evaluation: Evaluation) -> list[Picture]:
 
     def draw(axes: Any) -> None:
         axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
-        style = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0]}
+        # Thousands of points as drawings would make the page large and slow.
+        is_raster = len(before) > _MOST_DRAWN_POINTS
+        style = {"alpha": 0.6, "linewidths": 0, "color": _COLOURS[0], "rasterized": is_raster}
         axes.scatter(before, after, s=16, **style)
         axes.set(xlabel=f"{c.title}, {c.before}", ylabel=f"{c.title}, {c.after}")
         axes.set(xlim=axis_range, ylim=axis_range)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import tracemalloc
 from itertools import combinations
 
 import numpy as np
@@ -135,3 +136,12 @@ def test_equal_differences_share_a_rank_in_either_precision() -> None:
     single = [np.array(scores, dtype=np.float32).tolist() for scores in (before, after)]
     assert paired_comparison(*single).w == paired_comparison(before, after).w == 1.5
     assert paired_comparison(*single).p_w == paired_comparison(before, after).p_w == 0.375
+
+
+def test_intervals_of_many_values_need_little_memory() -> None:
+    values = np.arange(3000.0)
+    tracemalloc.start()
+    bootstrap_interval(values)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10e6  # All draws at once take 500 MB.

@@ -429,3 +429,18 @@ def test_bad_arguments_raise_value_error(name: str) -> None:
         clean = change.get("clean", pair()[0][0])
         with pytest.raises(ValueError):
             SCORES[name](**{"output": clean, "clean": clean, "audiogram": N3, **change})
+
+
+def test_scores_of_an_item_draw_the_noise_of_the_ear_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = []
+    generator = np.random.RandomState
+
+    def count(seed: int | None = None) -> np.random.RandomState:
+        seeds.append(seed)
+        return generator(seed)
+
+    monkeypatch.setattr(np.random, "RandomState", count)
+    clean, output = (signals[0] for signals in pair())
+    for score, ear in ((haspi, N3), (hasqi, N3), (hasqi, N4)):
+        score(output, clean, ear, noise="seeded", seed=4711)
+    assert seeds.count(4711) == 1

@@ -1,17 +1,21 @@
 """Plots: legible in light and dark, labels as they are, and no picture of a single group."""
 
+import numpy as np
 import pytest
 
-from hlsim.evaluation import Condition
+from hlsim.evaluation import MEASURES, Condition, compare
+from hlsim.evaluation.result import Evaluation
 from hlsim.report.plots import (
     INK,
     UNAIDED_COLOUR,
     condition_colours,
     curves_picture,
     gain_picture,
+    scores_pictures,
 )
 
 pytest.importorskip("matplotlib")
+pandas = pytest.importorskip("pandas")
 
 
 def test_ink_follows_the_colour_scheme_of_the_page_and_plots_are_reproducible() -> None:
@@ -54,3 +58,16 @@ def test_settings_of_the_user_neither_change_a_picture_nor_are_changed() -> None
     with matplotlib.rc_context({"text.usetex": True, "axes.linewidth": 5.0}):
         assert curves_picture(curves, "A title", "level (dB)").data == expected
         assert matplotlib.rcParams["text.usetex"]
+
+
+def test_thousands_of_points_are_an_image_in_the_picture() -> None:
+    scores = np.linspace(0.1, 0.9, 3000)
+    parts = [
+        pandas.DataFrame({"item": range(3000), "condition": name, "haspi": values})
+        for name, values in {"a": scores, "b": scores**2}.items()
+    ]
+    table, conditions = pandas.concat(parts), [Condition("a"), Condition("b")]
+    comparisons = compare(table, ["haspi"])
+    evaluation = Evaluation([], conditions, [MEASURES["haspi"]], table, comparisons)
+    (picture,) = scores_pictures(evaluation)
+    assert b"<image" in picture.data and len(picture.data) < 100_000
