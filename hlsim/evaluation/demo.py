@@ -128,7 +128,8 @@ def _process(
 ) -> tuple[_Signals, _Signals]:
     """Return the outputs of all conditions, and what the ear perceives of these outputs.
 
-    The perceived signals also have what a normal ear perceives of clean speech, as the first entry.
+    Both are dicts from the name of a condition to one signal per item, (time,) in pascals. The
+    first entry of the perceived signals is what a normal ear perceives of clean speech.
     """
     perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
     outputs = {}
@@ -155,7 +156,10 @@ def _measure_gains(
 
 
 def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
-    """Compare the aid with NAL-R at its level by the mean scores of each voice."""
+    """Compare the aid with NAL-R at its level by HASPI, over the mean scores of each voice.
+
+    Returns: The planned comparison alone; the list is empty if it is not defined.
+    """
     means = table.groupby(["voice", "condition"], sort=False)[["haspi", "level"]].mean()
     rows = means.reset_index().rename(columns={"voice": "item"})
     planned = [("haspi", NAL_R_AT_LEVEL, TRAINED)]

@@ -93,7 +93,7 @@ class Picture:
 
     @cached_property
     def data(self) -> bytes:
-        """Contents of the file."""
+        """Contents of the SVG or PNG file, which is drawn at the first access."""
         return self.draw()
 
 

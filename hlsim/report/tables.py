@@ -120,7 +120,8 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
             values the rows are split, too, in ascending order. Empty for conditions alone.
 
     Returns:
-        Rows of the table by the name of the condition, which follows the value of ``fact``.
+        Rows of the table by the name of the condition, such as "aid", or with ``fact`` by value
+        and name, such as "5, aid".
 
     >>> import pandas
     >>> rows = [("unaided", 5.0), ("aid", 5.0), ("unaided", 0.0), ("aid", 0.0)]

@@ -183,6 +183,9 @@ def _internal_amplitudes() -> Tensor:
 
 
 def _interpolate(amplitudes: NDArray[Any], hertz: NDArray[np.float64]) -> Tensor:
-    """Interpolate amplitudes to the frequencies of the Fourier transform of a triplet."""
+    """Interpolate amplitudes at ``hertz`` to the frequencies of a triplet's Fourier transform.
+
+    Shape: (n,), (n,) -> (TRIPLET_SAMPLES / 2 + 1,).
+    """
     grid = np.fft.rfftfreq(TRIPLET_SAMPLES, 1.0 / NEURO_RATE)
     return torch.from_numpy(np.interp(grid, hertz, amplitudes).astype(np.float32))
