@@ -44,15 +44,20 @@ def write_ears(path: Path, *names: str) -> Path:
     return write_table(path, rows)
 
 
+def copy_excerpts(paths: Iterable[Path], speech_dir: Path, folder: Path, seconds: int) -> None:
+    """Copy a part of each file below a folder to another one, from half a second on."""
+    for path in paths:
+        samples, rate = soundfile.read(path)
+        target = folder / path.relative_to(speech_dir)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(target, samples[rate // 2 : rate // 2 + seconds * rate], rate)
+
+
 def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
     """Run the demo for an N4 ear, with a second of the last bundled utterances."""
     from hlsim.cli.demo_study import run_demo
 
-    for path in speech_dir.rglob("*-0[34].flac"):
-        samples, rate = soundfile.read(path)
-        target = folder / path.relative_to(speech_dir)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        soundfile.write(target, samples[rate // 2 : rate // 2 + rate], rate)
+    copy_excerpts(speech_dir.rglob("*-0[34].flac"), speech_dir, folder, seconds=1)
     with patch("hlsim.data.bundled.SPEECH", folder):
         return run_demo(folder / "out", Audiogram.standard("N4"), steps=steps, jobs=1)
 

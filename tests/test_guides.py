@@ -1,7 +1,8 @@
 """The commands and programs of the guides run as printed, on a small corpus.
 
-Trainings take two steps, and studies two items of one second. Pages with commands are slow tests,
-and so is that on metrics, whose functions have examples that test_doctests.py runs.
+Trainings take two steps, and studies two items of one second. The bundled speech is two seconds of
+four utterances, and the look-ahead of an aid is measured at one position. Pages with commands are
+slow tests, and so is that on metrics, whose functions have examples that test_doctests.py runs.
 """
 
 import csv
@@ -21,6 +22,7 @@ import torch
 import hlsim
 from hlsim.audio import write_audio
 from hlsim.cli.main import main
+from tests.helpers import copy_excerpts
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/guide").glob("*.md"))]
@@ -71,12 +73,23 @@ def _read_steps(page: Path) -> list[tuple[str, str]]:
     return [step for step in steps if not any(part in step[1] for part in NOT_RUN)]
 
 
+UTTERANCES = (
+    "train/flite-slt-01",
+    "train/espeak-rp-f5-01",
+    "valid/flite-rms-01",
+    "valid/espeak-us-annie-01",
+)
+"""Bundled utterances of four voices, of which the guides find two seconds each."""
+
+
 def _write_corpus(folder: Path) -> None:
     """Write the folders and files that the guides name."""
-    for name in ("hlsim", "compensators", "checkpoints", "examples", "docs"):
+    for name in ("compensators", "checkpoints", "examples", "docs"):
         (folder / name).symlink_to(ROOT / name)
     bundled = ROOT / "hlsim" / "data" / "speech"
-    shutil.copytree(bundled, folder / "speech")
+    paths = [bundled / f"{utterance}.flac" for utterance in UTTERANCES]
+    for name in ("hlsim/data/speech", "speech"):
+        copy_excerpts(paths, bundled, folder / name, seconds=2)
     (folder / "audiograms").mkdir()
     for split in ("train", "valid"):
         shutil.copy(ROOT / "examples" / "ears.csv", folder / "audiograms" / f"{split}.csv")
@@ -172,6 +185,8 @@ def test_commands_and_programs_of_a_page_run(
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.syspath_prepend(ROOT)
+    # all positions would take most of the time
+    monkeypatch.setattr("hlsim.evaluation.aid_properties.CHANGE_POSITIONS", [24001])
     _write_corpus(tmp_path)
     names: dict[str, object] = {}  # each program goes on from the one before it
     for kind, text in _read_steps(page):
