@@ -358,7 +358,8 @@ def _run_study(
 ) -> None:
     """Run an evaluation, write its page, and print its verdict and its first table.
 
-    If scores are missing, their number and the first reason are printed to stderr.
+    The notes of the evaluation are printed to stderr, and if scores are missing, their number and
+    the first reason.
 
     Args:
         options: Options of the command. Each becomes an argument of ``evaluate`` under its name,

@@ -314,15 +314,15 @@ def find_lag(output: Tensor, clean: Tensor) -> int | None:
 
 
 def correlate(output: Tensor, clean: Tensor) -> tuple[int, float]:
-    """Return the lag of the largest cross-correlation of two signals, and its coefficient.
+    """Find the lag at which the cross-correlation of two signals has the largest magnitude.
 
     Args:
         output: The output. Shape: (time,).
         clean: Clean speech. Shape: (time,).
 
     Returns:
-        The number of samples by which the output is later, and the absolute coefficient, 0 to 1,
-        which is 0 if a signal is constant.
+        The number of samples by which the output is later, negative if it is earlier; and the
+        magnitude of the correlation coefficient at this lag, 0 to 1, or 0 if a signal is constant.
 
     >>> speech = torch.randn(1000, generator=torch.Generator().manual_seed(0))
     >>> lag, coefficient = correlate(torch.nn.functional.pad(-speech, (32, 0)), speech)

@@ -348,7 +348,7 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
 
 
 def _describe_unrelated(table: DataFrame) -> list[str]:
-    """Return a sentence about outputs that are not similar to their clean speech, or none."""
+    """Return a list with a note about outputs unlike their clean speech, or an empty list."""
     values = table.reindex(columns=["level", "lag_ms"])
     unrelated = table[values["level"].notna() & values["lag_ms"].isna()]
     if unrelated.empty:

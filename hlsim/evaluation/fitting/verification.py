@@ -198,11 +198,11 @@ def verify(
 def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Tensor, Tensor, float]:
     """Cut two recordings to the sound that both have, in CPU memory and without a gradient.
 
-    If they are not similar enough to find the lag of the output, a lag of 0 is assumed. Shape:
-    (time,), (time,) -> (samples,), (samples,).
+    If they are not similar enough to find the lag of the output, a lag of 0 is assumed.
 
     Returns:
-        The input, the output, and the coefficient of their cross-correlation at the best lag.
+        The input and the output, (samples,) each, and the coefficient of their cross-correlation at
+        the best lag.
 
     Raises:
         ValueError: The output is later or earlier by more than 1 s, or less than 1 s is common.
@@ -227,12 +227,13 @@ def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Ten
 def _check_related(correlation: float, input_powers: Array, output_powers: Array) -> None:
     """Raise ValueError if two recordings are not those of the same sound.
 
-    An aid changes the waveform or the levels of sections, but not both altogether.
+    They are if the waveforms correlate, or if the levels of their sections do. An aid may remove
+    one of these similarities, but not both.
 
     Args:
         correlation: Coefficient of the cross-correlation of the waveforms at the best lag.
-        input_powers: Powers of sections in third octaves, (sections, 18).
-        output_powers: Those of the output.
+        input_powers: Powers of the input in sections and third octaves, (sections, 18).
+        output_powers: Powers of the output in the same sections, (sections, 18).
     """
     levels = [_level(powers) for powers in (input_powers, output_powers)]
     changes = [(level - level.mean(0)).ravel() for level in levels]
