@@ -170,7 +170,8 @@ def _fidelity_to(teacher_name: str) -> Measure:
         return values
 
     settings = fingerprint(teacher)
-    return Measure("fidelity", compute, packages, settings, uses_facts=False)
+    always = ("snr", "raw_mse", "band_error")
+    return Measure("fidelity", compute, packages, settings, uses_facts=False, scores=always)
 
 
 def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:

@@ -376,12 +376,13 @@ def run_measures(
                     store.append(key, values)
             report_progress(len(results), total)
         tasks = tasks_of_crashes
-    table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
-    table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
     columns = {m.name: [c for c, owner in owners.items() if owner == m.name] for m in measures}
-    return table, [
+    measures = [
         replace(m, scores=columns[m.name] if m.scores is None else m.scores) for m in measures
     ]
+    table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
+    table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
+    return table, measures
 
 
 def _check_different(noun: str, names: Sequence[str]) -> None:
@@ -403,10 +404,14 @@ def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> 
         values: Values that the measure has returned, by column.
 
     Raises:
-        ValueError: A column belongs to another measure, to the items or to hlsim.
+        ValueError: A column belongs to another measure, to the items or to hlsim, or differs from
+            another one only in case.
     """
+    # Tables write the names of some columns in capitals.
+    spellings = {column.casefold(): column for column in owners}
     for column in values:
-        if owners.setdefault(column, measure.name) != measure.name:
+        spelling = spellings.get(column.casefold(), column)
+        if owners.setdefault(spelling, measure.name) != measure.name or spelling != column:
             raise ValueError(
                 f"{measure.name} returns {column}, a column that exists already; rename it in "
                 "the measure"
@@ -535,7 +540,11 @@ def _make_rows(
             values = results[number, condition.name, measure.name]
             if isinstance(values, str):
                 reasons.append(values)
-            else:
-                row |= values
+                continue
+            row |= values
+            # A mean over the other items would look like one over all.
+            missing = [column for column in measure.scores or () if column not in values]
+            if missing:
+                reasons.append(f"{measure.name} has returned no {', '.join(missing)}")
         rows.append({**row, "failure": "; ".join(dict.fromkeys(reasons)) or None})
     return rows

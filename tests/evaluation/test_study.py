@@ -190,7 +190,20 @@ def test_a_column_that_exists_is_rejected(items: list[Item]) -> None:
         run_study(items, gains(1), [measure], jobs=1)
 
 
-@pytest.mark.parametrize("column", ["failure", "condition", "gap", "peak"])
+def test_a_measure_without_a_value_for_one_item_is_a_failure_of_this_item(
+    items: list[Item],
+) -> None:
+    def compute(item: Item, output: Tensor) -> dict[str, float]:
+        return {"own": 1.0} if item.name == items[0].name else {}
+
+    table = run_study(items, gains(1), [MEASURES[0], Measure("mine", compute)], jobs=1)
+    assert table["failure"].isna().tolist() == [True, False, False]
+    assert table["failure"].iloc[-1] == "mine has returned no own"
+    assert table["peak"].notna().all()
+
+
+# A page would write PEAK for the columns peak and Peak.
+@pytest.mark.parametrize("column", ["failure", "condition", "gap", "peak", "Peak"])
 def test_a_column_of_the_table_is_rejected_at_the_first_value(
     items: list[Item], column: str
 ) -> None:
