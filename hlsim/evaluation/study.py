@@ -201,7 +201,8 @@ class Measure:
         uses_facts: Whether the values may depend on the name and the facts of an item, such as
             the words that were spoken.
         scores: Columns that are scores, by which conditions are compared; None if all columns are.
-            Other columns, such as levels, only describe an output.
+            An output that lacks one is a failure. Other columns, such as levels, only describe an
+            output, and may be missing.
         may_crash: Whether compiled code of the measure may end its process. Such a measure never
             runs in the process of the caller.
 
