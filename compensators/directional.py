@@ -366,17 +366,29 @@ class DirectionalAid(nn.Module):
 
 
 def look_ahead_samples(sample_rate: int) -> int:
-    """Return the look-ahead of the filters in whole samples, at most 1 ms."""
+    """Return the look-ahead of the filters in whole samples, at most 1 ms.
+
+    >>> look_ahead_samples(16000)
+    16
+    """
     return int(LOOK_AHEAD * sample_rate)
 
 
 def filter_length(sample_rate: int) -> int:
-    """Return the length of the filters in samples, including the look-ahead."""
+    """Return the length of the filters in samples, including the look-ahead.
+
+    >>> filter_length(16000)
+    144
+    """
     return look_ahead_samples(sample_rate) + int(FILTER_SECONDS * sample_rate)
 
 
 def design_frequencies(sample_rate: int) -> NDArray[np.float64]:
-    """Return the frequencies in Hz at which filters are designed, from 0 to half the rate."""
+    """Return the frequencies in Hz at which filters are designed, from 0 to half the rate.
+
+    >>> len(design_frequencies(16000))
+    289
+    """
     points = 4 * filter_length(sample_rate)
     return np.linspace(0.0, sample_rate / 2.0, points // 2 + 1)
 
@@ -394,6 +406,9 @@ def differential_taps(
 
     Returns:
         Impulse responses, (2, length).
+
+    >>> differential_taps(delay=1.0, spacing=0.01, lowest=200.0, sample_rate=16000).shape
+    (2, 144)
     """
     omega = 2.0 * np.pi * design_frequencies(sample_rate)
     travel = spacing / SPEED_OF_SOUND
@@ -415,6 +430,9 @@ def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.fl
 
     Returns:
         Impulse responses, (ears of the output, microphones, ears of the microphones, length).
+
+    >>> mvdr_taps(loading=1e-4, spacing=0.01, sample_rate=16000).shape
+    (2, 2, 2, 144)
     """
     frequencies = design_frequencies(sample_rate)
     noise = head_responses(evenly_spread_directions(_NOISE_DIRECTIONS), frequencies, spacing)
