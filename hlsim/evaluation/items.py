@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from compensators.nalr import NALR
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.audiogram.table import read_audiograms
-from hlsim.calibration import NEURO_RATE, level_spl, set_level
-from hlsim.checks import check_names, check_number
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, level_spl, set_level
+from hlsim.checks import check_attributes, check_names, check_number
 from hlsim.data.augment import compress
 from hlsim.data.clips import Clips
 from hlsim.data.ears import MILDER, draw_thresholds
@@ -204,7 +204,8 @@ def apply_treatments(
         second one. Each has the fact ``treatment``, the name of its treatment.
 
     Raises:
-        ValueError: A treatment is unknown, or ``"compensated"`` lacks a compensator.
+        ValueError: A treatment is unknown, ``"compensated"`` lacks a compensator, or this was built
+            for another rate or level.
 
     >>> clean = torch.ones(1600)
     >>> item = Item("item 1", clean, clean, Audiogram.standard("N3"))
@@ -219,6 +220,8 @@ def apply_treatments(
         "compressed": lambda signal, ear: compress(signal[None], three_to_one, NEURO_RATE)[0],
     }
     if compensator is not None:
+        settings = {"sample_rate": NEURO_RATE, "full_scale_spl": PASCAL_SPL}
+        check_attributes(compensator, "a compensator", **settings)
         functions["compensated"] = compensator
     check_names(treatments, functions, "inputs (compensated needs a compensator)")
     treated = []

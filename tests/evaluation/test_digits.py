@@ -10,6 +10,7 @@ import torch
 from scipy.special import expit, logit
 
 import hlsim
+from compensators import NALR
 from hlsim import Listener, reception_threshold
 from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
@@ -201,6 +202,8 @@ def test_sliders_reach_the_aid() -> None:
         ({"triplets": 3}, "triplets to be a whole number"),
         ({"seed": -1}, "seed"),
         ({"noise_reduction": 0.5}, "no effect without an aid"),
+        ({"aid": NALR(sample_rate=44100)}, "an aid with sample_rate=16000, got 44100"),
+        ({"aid": NALR(full_scale_spl=100.0)}, "an aid with full_scale_spl=94"),
         ({"aid": lambda x, _: x[..., :-1]}, "return as many samples"),
         ({"aid": lambda x, _: x * float("nan")}, "without NaN"),
     ],

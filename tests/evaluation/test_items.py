@@ -105,6 +105,8 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     )
     loud = before > before.max() - 2.0
     assert float(after[loud].std()) < 0.7 * float(before[loud].std())
+    with pytest.raises(ValueError, match="sample_rate=16000, got 44100"):
+        apply_treatments(drawn, ["compensated"], NALR(sample_rate=44100))
     for unknown in ("compensated", "softer"):
         with pytest.raises(ValueError, match=unknown):
             apply_treatments(drawn, [unknown])

@@ -25,8 +25,9 @@ from torch import Tensor, nn
 from compensators import load_compensator
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import DIGIT_LISTENER
-from hlsim.checks import check_number, loud_outputs
+from hlsim.checks import check_attributes, check_number, loud_outputs
 from hlsim.evaluation.digits.listener import DigitListener, load_listener
 from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
 from hlsim.evaluation.digits.people import people_threshold
@@ -275,7 +276,8 @@ def reception_threshold(
 
     Raises:
         ValueError: An ear, an aid, a simulator, a listener or a number is not valid, there are
-            sliders without an aid, or the output of the aid has another shape or is not finite.
+            sliders without an aid, the aid was built for another rate or level, or its output has
+            another shape or is not finite.
 
     >>> import hlsim
     >>> result = hlsim.reception_threshold("N3", "nalr", simulator="attenuation", triplets=30)
@@ -293,6 +295,8 @@ def reception_threshold(
     aids: list[AidFunction | None] = [None]
     if aid is not None:
         function = load_compensator(aid) if isinstance(aid, str | Path) else aid
+        settings = {"sample_rate": NEURO_RATE, "full_scale_spl": PASCAL_SPL}
+        check_attributes(function, "an aid", **settings)
         aids.append(partial(function, **sliders))
     test = DigitTest.draw(
         triplets, simulator=simulator, listener=listener, noise_spl=noise_spl, seed=seed
