@@ -53,6 +53,13 @@ def copy_excerpts(paths: Iterable[Path], speech_dir: Path, folder: Path, seconds
         soundfile.write(target, samples[rate // 2 : rate // 2 + seconds * rate], rate)
 
 
+def measure_aids_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let evaluations measure the properties of aids with one utterance, tone and position."""
+    monkeypatch.setattr("hlsim.evaluation.aid_properties.TONES", (1000,))
+    monkeypatch.setattr("hlsim.evaluation.aid_properties.CHANGE_POSITIONS", [24001])
+    monkeypatch.setattr("hlsim.evaluation.compensators.UTTERANCES", 1)
+
+
 def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
     """Run the demo for an N4 ear, with a second of the last bundled utterances."""
     from hlsim.cli.demo_study import run_demo

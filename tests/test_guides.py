@@ -1,8 +1,9 @@
 """The commands and programs of the guides run as printed, on a small corpus.
 
 Trainings take two steps, and studies two items of one second. The bundled speech is two seconds of
-four utterances, and the look-ahead of an aid is measured at one position. Pages with commands are
-slow tests, and so is that on metrics, whose functions have examples that test_doctests.py runs.
+four utterances, and the properties of aids are measured with one of them, one tone and one
+position. Pages with commands are slow tests, and so is that on metrics, whose functions have
+examples that test_doctests.py runs.
 """
 
 import csv
@@ -22,7 +23,7 @@ import torch
 import hlsim
 from hlsim.audio import write_audio
 from hlsim.cli.main import main
-from tests.helpers import copy_excerpts
+from tests.helpers import copy_excerpts, measure_aids_briefly
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/guide").glob("*.md"))]
@@ -185,8 +186,7 @@ def test_commands_and_programs_of_a_page_run(
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.syspath_prepend(ROOT)
-    # all positions would take most of the time
-    monkeypatch.setattr("hlsim.evaluation.aid_properties.CHANGE_POSITIONS", [24001])
+    measure_aids_briefly(monkeypatch)
     _write_corpus(tmp_path)
     names: dict[str, object] = {}  # each program goes on from the one before it
     for kind, text in _read_steps(page):

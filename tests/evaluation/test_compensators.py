@@ -13,12 +13,13 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
-from hlsim.evaluation import Item, aid_properties
+from hlsim.evaluation import Item
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.conditions import Unaided, load_enhancers
 from hlsim.evaluation.digits import DigitTest, reception_threshold
 from hlsim.evaluation.measures import NORMAL, PERCEPTION, _band_error_db, network_loss
 from hlsim.report.compensators_page import compensators_page
+from tests.helpers import measure_aids_briefly
 
 for module in ("matplotlib", "joblib", "pandas"):
     pytest.importorskip(module)
@@ -44,9 +45,7 @@ def options(
     speech_dir: Path, quick_scores: None, monkeypatch: pytest.MonkeyPatch
 ) -> dict[str, Any]:
     """Return settings of an evaluation that takes seconds."""
-    monkeypatch.setattr(aid_properties, "TONES", (1000,))
-    monkeypatch.setattr(aid_properties, "CHANGE_POSITIONS", [24001])
-    monkeypatch.setattr("hlsim.evaluation.compensators.UTTERANCES", 1)
+    measure_aids_briefly(monkeypatch)
     folders = {"speech": speech_dir / "valid", "noise": speech_dir / "train"}
     settings = {"seconds": 0.4, "levels": (60.0, 75.0), "gain_ears": ("N3",)}
     return {**folders, **settings, "jobs": 1}
