@@ -71,6 +71,9 @@ class HearingAid(Wearable, HubModel):
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal.
+        limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable
+            level of the ear, measured or predicted (``Audiogram.uncomfortable_levels``). A tensor
+            of thresholds has predicted levels. The limit of the peaks stays.
 
     Raises:
         ValueError: A rate or level is out of range.
@@ -96,8 +99,9 @@ class HearingAid(Wearable, HubModel):
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
         linked: bool = False,
+        limit_to_ear: bool = False,
     ) -> None:
-        super().__init__(audiogram, sample_rate, full_scale_spl, linked)
+        super().__init__(audiogram, sample_rate, full_scale_spl, linked, limit_to_ear)
         self.config = config = config or HearingAidConfig()
         self.bands = config.bands
         self.limit_spl = config.limit_spl

@@ -51,6 +51,7 @@ def load_compensator(
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
     linked: bool = False,
+    limit_to_ear: bool = False,
 ) -> Trained | NALR | WDRC:
     """Load a hearing aid by name, in evaluation mode and without gradients of its weights.
 
@@ -65,11 +66,13 @@ def load_compensator(
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay. ``WDRC`` and ``HearingAid`` support this.
+        limit_to_ear: Limit the level of the output in each band to the uncomfortable level of the
+            ear, see ``HearingAid``, in the same aids.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind or has changed since it was
-            saved, the rate or the level is out of range, or ``linked`` is set for an aid that does
-            not support it.
+            saved, the rate or the level is out of range, or ``linked`` or ``limit_to_ear`` is set
+            for an aid that does not support it.
 
     >>> import hlsim
     >>> aid = load_compensator("hearing-aid")
@@ -86,10 +89,16 @@ def load_compensator(
     compensator.eval().requires_grad_(False)
     if isinstance(compensator, Wearable):
         compensator.linked = linked
+        compensator.limit_to_ear = limit_to_ear
     elif linked:
         raise ValueError(
             f"{name} cannot link its gains between ears; load wdrc or hearing-aid, or leave out "
             "linked"
+        )
+    elif limit_to_ear:
+        raise ValueError(
+            f"{name} cannot limit its bands to the ear; load wdrc, camfit or hearing-aid, or leave "
+            "out limit_to_ear"
         )
     return compensator
 

@@ -59,6 +59,9 @@ class WDRC(Wearable):
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal.
         prescription: ``"nal-r"``, ``"nal-rp"`` or ``"camfit"``.
+        limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable
+            level of the ear, measured or predicted (``Audiogram.uncomfortable_levels``). A tensor
+            of thresholds has predicted levels. The limit of the peaks stays.
 
     Raises:
         ValueError: A value is out of range.
@@ -81,8 +84,9 @@ class WDRC(Wearable):
         limit_spl: float = 110.0,
         linked: bool = False,
         prescription: Prescription = "nal-r",
+        limit_to_ear: bool = False,
     ) -> None:
-        super().__init__(audiogram, sample_rate, full_scale_spl, linked)
+        super().__init__(audiogram, sample_rate, full_scale_spl, linked, limit_to_ear)
         check_number("attack", attack, 0.0, 1.0)
         check_number("release", release, 0.01, 2.0)
         check_number("limit_spl", limit_spl, 60.0, 140.0)

@@ -30,27 +30,48 @@ from compensators.filter_bank import (
     RATE,
     apply_gains,
     filter_centres,
+    filter_powers,
     frame_power,
     gain_at_rate,
+    level_db,
 )
 from compensators.limiter import soft_limit
+from compensators.smoothing import follow_peaks
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.audiogram.discomfort import predict_uncomfortable_levels
+from hlsim.audiogram.prescription import highest_band_levels, nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     check_two_channels,
+    find_uncomfortable_levels,
 )
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_device, check_names, check_number, check_waveform
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
-from hlsim.torchtools import Audio, as_samples, as_type_of, broadcast_shape, flatten_items
+from hlsim.torchtools import (
+    Audio,
+    as_samples,
+    as_type_of,
+    broadcast_shape,
+    flatten_items,
+    on_device,
+)
 
 Slider = float | Tensor
 """Value of a slider, 0 to 1: one number, or one value per item."""
 
 State = Mapping[str, Tensor]
 """Tensors that an aid remembers from one hop to the next, by name, (items, ...) each."""
+
+MARGIN_DB = 4.0
+"""Distance in dB of the highest level of a band from the uncomfortable level of the ear.
+
+A third of an octave, and a tone between two bands, may have the power of two bands.
+"""
+
+RELEASE = 0.1
+"""Time constant in seconds with which a band's gain recovers after it was limited to the ear."""
 
 SLIDER_STEP = 0.04
 """Largest change of a slider per hop, so that a change from 0 to 1 takes 0.1 s."""
@@ -80,6 +101,9 @@ class Wearable(Aid):
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal. The output of each ear is
             limited separately.
+        limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable
+            level of the ear, measured or predicted (``Audiogram.uncomfortable_levels``). A tensor
+            of thresholds has predicted levels. The limit of the peaks stays.
 
     Attributes:
         SLIDERS: Default value of each slider under its name.
@@ -109,9 +133,16 @@ class Wearable(Aid):
         sample_rate: int,
         full_scale_spl: float,
         linked: bool,
+        limit_to_ear: bool = False,
     ) -> None:
         super().__init__(audiogram, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
         self.linked = linked
+        self.limit_to_ear = limit_to_ear
+
+    def store_ears(self, audiogram: AudiogramLike | None) -> None:
+        """Store ears as ``Aid.store_ears`` does, and their uncomfortable levels."""
+        super().store_ears(audiogram)
+        self._uncomfortable_levels = find_uncomfortable_levels(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the output for whole signals, see ``Aid.forward``."""
@@ -147,6 +178,28 @@ class Wearable(Aid):
         prescribed = interpolate(nalr_gains_db(thresholds), FREQUENCIES, centres)
         return torch.cat((interpolate(thresholds, FREQUENCIES, centres), prescribed), -1)
 
+    def fit_with_limits(
+        self, thresholds: Tensor, uncomfortable_levels: Tensor | None = None
+    ) -> Tensor:
+        """Compute what ``fit`` does, followed by the highest level of each band if there is one.
+
+        Args:
+            thresholds: Thresholds in dB HL.
+            uncomfortable_levels: Uncomfortable levels in dB HL, by default predicted ones.
+
+        Shape: (items, 8) twice -> (items, n), with ``limit_to_ear`` (items, n + bands).
+        """
+        fitted = self.fit(thresholds)
+        if not self.limit_to_ear:
+            return fitted
+        if uncomfortable_levels is None:
+            uncomfortable_levels = predict_uncomfortable_levels(thresholds)
+        centres = filter_centres(self.bands)
+        limits = highest_band_levels(uncomfortable_levels, centres) - MARGIN_DB
+        # A tone is in two bands, so each band has the lowest limit of itself and its neighbours.
+        padded = nn.functional.pad(limits, (1, 1), value=torch.inf)
+        return torch.cat((fitted, padded.unfold(-1, 3, 1).amin(-1)), -1)
+
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -175,6 +228,8 @@ class Wearable(Aid):
         Returns: Tensors by name, (items, ...) each, of the type and device of ``sliders``.
         """
         shapes = {"past": (HISTORY,), "gains": (2, self.bands), **self.state_shapes}
+        if self.limit_to_ear:
+            shapes["loudest"] = (3, self.bands)
         zeros = {name: sliders.new_zeros(len(sliders), *shape) for name, shape in shapes.items()}
         return {**zeros, "gliding": sliders}
 
@@ -199,11 +254,22 @@ class Wearable(Aid):
             hops).
         """
         padded = torch.cat((state["past"], samples), -1)
-        powers = frame_power(padded)
+        own_powers = powers = frame_power(padded)
+        limits = None
+        if self.limit_to_ear:
+            fitted, limits = fitted[:, : -self.bands], fitted[:, -self.bands :]
         if self.linked:
             powers = powers.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0)
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
         gains_db, changed_state = self.compute_gains(powers, fitted, gliding, state)
+        if limits is not None:
+            band_powers = filter_powers(own_powers, self.bands)
+            neighbours = nn.functional.pad(band_powers, (1, 1)).unfold(-1, 3, 1).sum(-1)
+            # The window of a frame spreads a tone over its band and the next ones.
+            levels, changed_state["loudest"] = follow_peaks(
+                level_db(0.5 * (band_powers + neighbours)), state["loudest"], 0.0, RELEASE
+            )
+            gains_db = torch.minimum(gains_db, limits.unsqueeze(1) - levels)
         # While the first of these hops comes in, the preceding one goes out, because the filters
         # delay by one hop: its two gains are in the state.
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
@@ -216,7 +282,8 @@ class Wearable(Aid):
         ears_per_gain = 2 if self.linked else 1  # the two ears of a pair get the same noise
         signals, ears = (rows.repeat_interleave(ears_per_gain, 0) for rows in (signals, ears))
         sliders = sliders.expand(len(signals), -1)
-        output = self.process_hops(signals, self.fit(ears), sliders, self.initial_state(sliders))[0]
+        fitted = self.fit_with_limits(ears, torch.full_like(ears, 1000.0))  # no limit
+        output = self.process_hops(signals, fitted, sliders, self.initial_state(sliders))[0]
         return output[::ears_per_gain]
 
     def process_portions(
@@ -325,7 +392,16 @@ class Wearable(Aid):
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         own_dtype = next((weight.dtype for weight in self.parameters()), waveform.dtype)
         dtype = torch.promote_types(own_dtype, torch.float32)
-        return batch, self.fit(flatten_items(thresholds, batch, dtype))
+        ears = flatten_items(thresholds, batch, dtype)
+        if not self.limit_to_ear:
+            return batch, self.fit(ears)
+        levels = self._uncomfortable_levels
+        if audiogram is not None:
+            levels = find_uncomfortable_levels(audiogram)
+        if levels is not None:
+            levels = on_device(levels, waveform.device).reshape(thresholds.shape)
+            levels = flatten_items(levels, batch, dtype)
+        return batch, self.fit_with_limits(ears, levels)
 
     def check_sliders(self, names: Iterable[str]) -> None:
         """Raise ValueError unless the aid has sliders of these names."""

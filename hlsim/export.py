@@ -287,7 +287,7 @@ def _simulate(simulator: NeuroMSBG, waveform: Tensor, thresholds: Tensor) -> dic
 
 
 def _fit(aid: Wearable, thresholds: Tensor) -> dict[str, Tensor]:
-    return {"fitted": aid.fit(thresholds)}
+    return {"fitted": aid.fit_with_limits(thresholds)}
 
 
 def _process_hops(aid: Wearable, **inputs: Tensor) -> dict[str, Tensor]:

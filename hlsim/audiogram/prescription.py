@@ -207,6 +207,25 @@ def compressed_gains_db(
     return torch.minimum(amplified.clamp_min(0.0), highest_gains)
 
 
+def highest_band_levels(uncomfortable_levels: Tensor, points: Frequencies) -> Tensor:
+    """Convert uncomfortable levels of an ear to the highest comfortable levels of bands in dB SPL.
+
+    They are levels in a free field, as all signals of hlsim: the reference of headphones (ISO
+    389-8), by which an audiometer shows dB HL, cancels.
+
+    Args:
+        uncomfortable_levels: Levels in dB HL at ``FREQUENCIES``.
+        points: Centre frequencies of the bands in Hz.
+
+    Shape: (..., 8) -> (..., points).
+
+    >>> highest_band_levels(torch.full((8,), 100.0), (500.0, 4000.0))
+    tensor([104.4000,  94.6000])
+    """
+    levels = _interpolate_over_log(uncomfortable_levels, FREQUENCIES, points)
+    return levels + _free_field_threshold(points, like=levels)
+
+
 def _common_gain(three_frequency_sum: Tensor) -> Tensor:
     """Return the gain in dB that NAL-R adds at all frequencies.
 

@@ -107,6 +107,25 @@ def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None
     return (ears, (len(audiogram), *shapes.pop())) if len(shapes) == 1 else None
 
 
+def find_uncomfortable_levels(audiogram: AudiogramLike | None) -> Tensor | None:
+    """Return the uncomfortable levels of ears in dB HL, (..., 8), measured or predicted.
+
+    Args:
+        audiogram: One or more ears. For None and a tensor of thresholds, which have no measured
+            levels, the result is None.
+
+    >>> find_uncomfortable_levels(["N3", "N4"]).shape
+    torch.Size([2, 8])
+    """
+    listed = _list_ears(audiogram)
+    if listed is None:
+        return None
+    ears, shape = listed
+    rows = [ear.uncomfortable_levels() for ear in ears]
+    levels = torch.tensor(rows, dtype=torch.float32, device="cpu")
+    return levels.reshape(*shape, len(FREQUENCIES))
+
+
 def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | None]:
     """Find the ears that were not measured at the eight ``FREQUENCIES``, for the exact MSBG.
 
