@@ -45,12 +45,6 @@ Of the bundled recordings, two different ones reach 0.27. The outputs of the bun
 noise, have at least 0.69.
 """
 
-UNCOMFORTABLE_LEVEL = (88.8, 0.25)
-"""Level in dB HL from which a tone is uncomfortable for a normal ear, and its rise per dB of loss.
-
-The line is fitted to 276 persons at 500 Hz to 4 kHz (docs/people.md); its deviation is 12 dB.
-"""
-
 
 @dataclass(frozen=True)
 class Verification:
@@ -65,7 +59,8 @@ class Verification:
         targets: Insertion gains in dB that the prescription gives at each percentile of the input,
             (3, 18); equal at all three if the prescription is linear.
         thresholds: Hearing thresholds of the ear in dB SPL, (18,).
-        uncomfortable: Predicted levels in dB SPL from which a tone is uncomfortable, (18,).
+        uncomfortable: Levels in dB SPL from which a tone is uncomfortable, (18,), as measured (see
+            ``Audiogram.uncomfortable_levels``), or else predicted.
         unaided_sii: Speech intelligibility index of the input: its audible share, 0 to 1.
         aided_sii: Speech intelligibility index of the output.
 
@@ -179,7 +174,7 @@ def verify(
     )
     losses = _interpolate(audiogram.levels, audiogram.frequencies)
     normal = normal_threshold(hertz)
-    base, slope = UNCOMFORTABLE_LEVEL
+    uncomfortable = np.array(audiogram.uncomfortable_levels(hertz.tolist()))
     unaided_sii, aided_sii = (
         sii(_level(power.mean(0)) - _bandwidth_db(), thresholds=losses) for power in powers
     )
@@ -189,7 +184,7 @@ def verify(
         output_levels=output_levels,
         targets=prescribed_gains(load_compensator(prescription), audiogram, input_levels),
         thresholds=losses + normal,
-        uncomfortable=base + slope * losses + normal,
+        uncomfortable=uncomfortable + normal,
         unaided_sii=unaided_sii,
         aided_sii=aided_sii,
     )
