@@ -2,8 +2,8 @@
 
 They are: no aid; an equaliser with the mean gain of an aid; an aid at the output level of another
 one; an aid behind noise reduction; and an aid of your own. The rival of an aid is the prescription
-with which it is compared, for all ears the same or by a rule for the ear. A hearing aid is a function or module
-``(waveform, ear) -> waveform``.
+with which it is compared, for all ears the same or by a rule for the ear. A hearing aid is a
+function or module ``(waveform, ear) -> waveform``.
 """
 
 from __future__ import annotations
