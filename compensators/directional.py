@@ -429,7 +429,9 @@ def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.fl
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Impulse responses, (ears of the output, microphones, ears of the microphones, length).
+        Impulse responses from each microphone to each ear of the output, (ears of the output,
+        microphones, ears of the microphones, length): front microphone first, left ear first. The
+        first ``look_ahead_samples(sample_rate)`` samples lie before time 0.
 
     >>> mvdr_taps(loading=1e-4, spacing=0.01, sample_rate=16000).shape
     (2, 2, 2, 144)

@@ -184,9 +184,14 @@ def _average_over_stride(levels: Tensor, stride: int) -> Tensor:
 def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
     """Return weights that interpolate from bands to frequencies, linearly over ERB number.
 
-    The centres of the bands are evenly spaced in ERB numbers from 100 Hz to 8 kHz.
+    The centres of the bands are evenly spaced in ERB numbers from 100 Hz to 8 kHz. Frequencies
+    below 100 Hz get the value of the lowest band.
 
-    Returns: (count, fft // 2 + 1).
+    Args:
+        count: Number of bands.
+        fft: Length of the Fourier transform at 16 kHz.
+
+    Returns: Weights, (count, fft // 2 + 1).
     """
     positions = erb_number(np.arange(fft // 2 + 1) * NEURO_RATE / fft)
     lowest, highest = erb_number(np.array([LOWEST_CENTRE, NEURO_RATE / 2.0]))

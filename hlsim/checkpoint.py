@@ -172,12 +172,13 @@ def read_record(name: str | Path) -> dict[str, Any]:
     """Read the record of a checkpoint of any kind, the contents of its ``config.json``.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
+        name: Name of a checkpoint that ships with hlsim, the folder of a checkpoint, or the folder
+            of a training run, which contains it.
 
     Returns:
         Dict with, among others, ``kind``; ``config``, the settings of the model; ``sha256``, which
-        identifies the weights; and ``about``, the record of the training: data, seed, command,
-        time, measures and version.
+        identifies the weights; and ``about``, the record of the training, such as the version of
+        hlsim, the recipe with its seed, the steps, the time in minutes and the validation scores.
 
     Raises:
         ValueError: There is no such checkpoint, or the file cannot be read.
@@ -188,7 +189,7 @@ def read_record(name: str | Path) -> dict[str, Any]:
     folder = _find_folder(name)
     try:
         return dict(json.loads((folder / CONFIG).read_text(encoding="utf-8")))
-    except (ValueError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{folder}: cannot read {CONFIG}: {error}") from error
 
 

@@ -92,7 +92,10 @@ class ProgressLine:
             self._last_line = time.time()
 
     def _watch(self) -> None:
-        """Update the line every second until the work has ended. Runs in a thread of its own."""
+        """Show the line every second, or every 10 without a terminal, until the work has ended.
+
+        While the line of a part of the work is active, this one waits. Runs in a thread of its own.
+        """
         while not self._ended.wait(_TICK):
             if _active_lines[-1] is not self:
                 continue  # The line of a part of the work, such as a training, says more.

@@ -70,7 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 after success, 2 after an error, and 130 after Ctrl-C.
 
     Raises:
-        SystemExit: Help was printed (status 0), or the command or an option is not valid (2).
+        SystemExit: Help or the version was printed (status 0), or the command or an option is not
+            valid (2).
     """
     # NumPy solves only small systems here, for which threads of OpenBLAS wait longer than they
     # compute.
@@ -120,7 +121,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         command with them.
 
     Raises:
-        SystemExit: Help was printed, or the command or an option is not valid.
+        SystemExit: Help or the version was printed, or the command or an option is not valid.
     """
     words = [*arguments] or ["--help"]
     if words[0] == "help":

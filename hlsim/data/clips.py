@@ -174,7 +174,15 @@ class Clips:
         return torch.stack(clips)
 
     def _decode(self, index: int) -> Tensor:
-        """Decode the first channel of a file at the clips' sample rate. Shape: -> (time,)."""
+        """Decode the first channel of a file, or of the noise of a pair, at the clips' sample rate.
+
+        The noise of a pair is its noisy minus its clean speech. Nothing is scaled.
+
+        Shape: -> (time,).
+
+        Raises:
+            ValueError: A file cannot be read, or the files of a pair do not fit together.
+        """
         file, clean_file = self.files[index], self._clean_files[index]
         waveform, rate = read_audio(clean_file or file)
         if clean_file is not None:

@@ -289,7 +289,14 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
 
 
 def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int]) -> list[str]:
-    """Return a list with a note about microphones that no aid receives, or an empty list."""
+    """Return a list with a note about microphones that no aid receives, or an empty list.
+
+    The list is empty unless a scene has files of microphones other than those in ``numbers``.
+
+    Args:
+        pairs: Pairs that are evaluated.
+        numbers: Numbers of the microphones that the aids receive, out of 1, 2 and 3.
+    """
     unused = [number for number in _MICROPHONES if number not in numbers]
     scenes = {pair.scene for pair, n in product(pairs, unused) if pair.microphone(n).is_file()}
     if not scenes:

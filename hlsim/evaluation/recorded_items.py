@@ -341,13 +341,15 @@ def read_recordings(
             known.
         root: Folder to which the paths are relative; by default that of the manifest, or the
             current folder for a DataFrame.
-        audiogram: The ear of rows without an audiogram.
-        audiograms: File of listeners, see ``read_listeners``.
+        audiogram: The ear of rows without an audiogram, if ``audiograms`` is not passed.
+        audiograms: File of listeners, see ``read_listeners``. It must have the listeners of all
+            rows, and the ear of each row that has no audiogram of its own.
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: A file cannot be read, a required column is missing, or a row is not valid; the
-            message names the line.
+        ValueError: A file cannot be read, a required column is missing, there is a column ``spl``
+            (pass the argument ``spl`` instead), a listener is unknown, or a row is not valid; for a
+            row, the message names the line.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -112,9 +112,10 @@ class HearingLossLoss(nn.Module):
         sample_rate: Sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
             below 8 kHz. The criterion ``"paper"`` resamples what it compares to 16000.
         full_scale_spl: Level in dB SPL of RMS 1.0.
-        reference: Signal with which ``"paper"`` and a function compare, and which ``heard``
-            returns: ``"clean"``, the clean speech (the default for ``"paper"``), or
-            ``"normal-hearing"``, what a normal ear perceives of it (the default otherwise).
+        reference: Signal with which ``"paper"`` and a function compare: ``"clean"``, the clean
+            speech (the default for ``"paper"``), or ``"normal-hearing"``, what a normal ear
+            perceives of it (the default otherwise). ``heard`` returns the same choice, and by
+            default ``"normal-hearing"`` for every criterion.
             ``"coherent-bands"`` and ``"bands"`` always compare with a normal ear, and scores and
             ``"interaural"`` with clean speech as it is. Except for ``"bands"``, which has no phase,
             the reference gets the phase of MSBG's filter bank for the severity of the ear
@@ -284,7 +285,9 @@ class HearingLossLoss(nn.Module):
 
         Returns:
             The output as the impaired ear perceives it, and its reference: the clean speech as a
-            normal ear perceives it or, with ``reference="clean"``, as it is.
+            normal ear perceives it or, with ``reference="clean"``, the clean speech itself. Both
+            kinds of reference end at the highest frequency of the simulator, and have the gain of
+            ``loudness`` and, as described for ``reference``, the phase of MSBG's filter bank.
         """
         output, clean, ears, ends = self._prepare(output, clean, audiogram, lengths)
         with torch.autocast(clean.device.type, enabled=False):

@@ -302,7 +302,7 @@ def detail_section(
     values were computed" with the notes, the seed and the versions of packages.
 
     Args:
-        evaluation: Evaluation of the page.
+        evaluation: Evaluation of the page, whose ``settings`` contain ``seed``.
         sections: Sections at the beginning.
         notes: Sentences about how the values were computed.
 

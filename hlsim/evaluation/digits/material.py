@@ -42,9 +42,12 @@ Source: ANSI S3.5-1997, table 3, from 160 Hz; below, an extrapolation.
 class Triplets(NamedTuple):
     """Triplets of digits with their noises, which all ears and aids of a test share.
 
+    Signals have 16 kHz and last 3 s (``TRIPLET_SAMPLES``): 0.5 s of noise, three digits of 0.75 s
+    each, and 0.25 s of noise.
+
     Attributes:
-        speech: Digits without noise, each with RMS 1, (triplets, time), or at several microphones,
-            (triplets, ..., time).
+        speech: Digits without noise, each with RMS 1 without the silence around it, (triplets,
+            time), or at several microphones, (triplets, ..., time).
         noise: Masking noise with RMS 1 and the long-term spectrum of the digits, in the shape of
             ``speech``.
         internal: Internal noise of a normal ear in pascals, (triplets, time).
@@ -160,7 +163,8 @@ def _draw_noise(count: int, amplitudes: Tensor, generator: torch.Generator) -> T
 def _speech_amplitudes() -> Tensor:
     """Compute the long-term magnitude spectrum of all digits, on any scale.
 
-    Returns: Magnitudes at the frequencies of the Fourier transform of a triplet.
+    Returns: Magnitudes at the frequencies of a triplet's real Fourier transform, (TRIPLET_SAMPLES /
+        2 + 1,).
     """
     words = load_digits().double()
     speech = words[words != 0.0]
@@ -174,7 +178,8 @@ def _speech_amplitudes() -> Tensor:
 def _internal_amplitudes() -> Tensor:
     """Compute the factors that turn white noise of RMS 1 into the internal noise in pascals.
 
-    Returns: Factors at the frequencies of the Fourier transform of a triplet.
+    Returns: Factors at the frequencies of a triplet's real Fourier transform (``torch.fft.rfft``),
+        (TRIPLET_SAMPLES / 2 + 1,).
     """
     root_density = 10.0 ** ((np.array(INTERNAL_NOISE_DB) - PASCAL_SPL) / 20.0)
     return _interpolate(

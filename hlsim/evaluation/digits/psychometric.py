@@ -91,7 +91,8 @@ def estimate_threshold(snr: Array, right: Array, asked: int = 3) -> Estimate:
 def subtract(first: Estimate, second: Estimate) -> Estimate:
     """Subtract the second estimate from the first one, as if their errors were independent.
 
-    The difference of two infinite estimates is NaN.
+    If one estimate is infinite, the difference is infinite, with limits that are NaN. The
+    difference of two infinite estimates is NaN.
 
     >>> print(*subtract(Estimate(5.0, 4.7, 5.3), Estimate(1.0, 0.6, 1.4)))
     4.0 3.5 4.5
@@ -100,4 +101,4 @@ def subtract(first: Estimate, second: Estimate) -> Estimate:
         value = first.value - second.value
         below = np.hypot(first.value - first.low, second.high - second.value)
         above = np.hypot(first.high - first.value, second.value - second.low)
-    return Estimate(value, value - below, value + above)
+        return Estimate(value, value - below, value + above)

@@ -166,10 +166,13 @@ def _name(thing: Any) -> str:
 
 
 def _describe(value: Any) -> Any:
-    """Convert an object that JSON cannot represent to values that it can, for ``value_hash``.
+    """Convert an object that JSON cannot represent: the ``default`` function of ``value_hash``.
+
+    A tensor or array becomes its type, shape and hash; a dataclass its name and attributes, which
+    JSON converts in turn; a function or class its name; and a module its fingerprint.
 
     Raises:
-        TypeError: The object cannot be described, as a lambda.
+        TypeError: The object is none of these, or a function within another one, such as a lambda.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()

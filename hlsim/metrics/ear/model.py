@@ -444,7 +444,8 @@ def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tenso
     one in a normal ear.
 
     Args:
-        signal: Sound behind the middle ear. Shape: (items, padded).
+        signal: Sound behind the middle ear, in multiples of 20 uPa at 24 kHz. Shape: (items,
+            padded).
         ear: Hair cells of all channels.
         extent: Number of samples of each item before padding.
 
