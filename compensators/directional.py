@@ -24,6 +24,7 @@ from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_number, check_rate, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
+from hlsim.torchtools import compute_once
 
 LOOK_AHEAD = 0.001
 """Look-ahead of the filters in seconds."""
@@ -420,6 +421,7 @@ def differential_taps(
     return _impulse_responses(np.stack((front, rear)), sample_rate)
 
 
+@compute_once
 def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.float64]:
     """Design the filters of ``BinauralMVDR`` by least squares over their coefficients (Frost 1972).
 
