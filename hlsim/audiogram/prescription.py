@@ -267,7 +267,7 @@ def _nalrp_bias() -> list[float]:
 
 @constant
 def _profound_corrections() -> list[list[float]]:
-    """Return NAL-RP's corrections in dB for profound losses. Shape: (7, 8).
+    """Return NAL-RP's corrections in dB for profound losses (1991, Figure 9). Shape: (7, 8).
 
     The rows are thresholds of 90, 95, ... 120 dB HL at 2 kHz, the columns ``NALRP_FREQUENCIES``.
     """
