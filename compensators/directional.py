@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators.smoothing import exponential_average
+from compensators.wearable import State
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_number, check_rate, check_waveform
@@ -47,8 +48,6 @@ _DISTORTION_WEIGHT = 1e3
 
 _POWER_FLOOR = 1e-12
 """Power in Pa^2, about -26 dB SPL, that is added to denominators."""
-
-State = dict[str, Tensor]
 
 
 class FilterAndSum(nn.Module):
@@ -83,11 +82,6 @@ class FilterAndSum(nn.Module):
         self.sample_rate = check_rate(sample_rate)
         self.latency = look_ahead
         self.register_buffer("taps", torch.as_tensor(taps).float())
-
-    @property
-    def microphones(self) -> int:
-        """Number of microphones at each side."""
-        return self.taps.shape[1]
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the output for whole signals, time-aligned with the front microphones.
@@ -238,14 +232,14 @@ class DifferentialMicrophone(FilterAndSum):
         super().__init__(taps, look_ahead_samples(rate), rate)
 
 
-class AdaptiveDifferentialMicrophone(FilterAndSum):
+class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
     """An adaptive directional microphone at each side, whose null follows the loudest noise behind.
 
-    A share, 0 to 1, of a cardioid to the rear is subtracted from a cardioid to the front. It moves
-    the null from 180 to 90 degrees, and minimises the power of the output. Source: Elko
-    and Nguyen Pong 1995, IEEE ASSP Workshop on Applications of Signal Processing to Audio and
-    Acoustics; here, the average powers of the recent past give the share, instead of an LMS
-    algorithm.
+    A share, 0 to 1, of a cardioid to the rear is subtracted from a cardioid to the front. A larger
+    share moves the null from 180 towards 90 degrees. The share minimises the power of the output:
+    it is computed from average powers of the recent past. Source: Elko and Nguyen Pong 1995, IEEE
+    ASSP Workshop on Applications of Signal Processing to Audio and Acoustics, who use an LMS
+    algorithm instead of averages.
 
     Args:
         seconds: Time constant of the averages in seconds.
@@ -268,14 +262,9 @@ class AdaptiveDifferentialMicrophone(FilterAndSum):
         lowest: float = 200.0,
         sample_rate: int = NEURO_RATE,
     ) -> None:
+        super().__init__("cardioid", spacing=spacing, lowest=lowest, sample_rate=sample_rate)
         check_number("seconds", seconds, 0.001, 10.0)
-        check_number("spacing", spacing, 0.002, 0.1)
-        check_number("lowest", lowest, 20.0, 2000.0)
-        rate = check_rate(sample_rate)
-        one_side = differential_taps(PATTERNS["cardioid"], spacing, lowest, rate)
-        forward = np.einsum("ef,ml->emfl", np.eye(2), one_side)
-        super().__init__(forward, look_ahead_samples(rate), rate)
-        self.past_weight = math.exp(-1.0 / (rate * seconds))
+        self.past_weight = math.exp(-1.0 / (self.sample_rate * seconds))
 
     def initial_state(self, waveform: Tensor) -> State:
         powers = waveform.new_zeros(*waveform.shape[:-3], 2, waveform.shape[-2])

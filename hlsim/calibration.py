@@ -171,11 +171,8 @@ def loudness_at(loudness: Loudness, levels: Tensor) -> Tensor:
         return torch.full_like(levels, loudness)
     points = levels.new_tensor(list(loudness))
     values = levels.new_tensor(list(loudness.values()))
-    end = torch.bucketize(levels.detach(), points).clamp(1, max(len(points) - 1, 1))
-    start, end = end - 1, end.clamp_max(len(points) - 1)
-    width = (points[end] - points[start]).clamp_min(1e-6)
-    share = ((levels - points[start]) / width).clamp(0.0, 1.0)
-    return torch.lerp(values[start], values[end], share)
+    shares = ((levels.unsqueeze(-1) - points[:-1]) / points.diff()).clamp(0.0, 1.0)
+    return values[0] + (shares * values.diff()).sum(-1)
 
 
 def dbfs(waveform: Tensor) -> Tensor:

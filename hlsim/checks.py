@@ -112,10 +112,10 @@ def check_number(
     raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}")
 
 
-def reject_duplicates(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Convert the members of a JSON object to a dict, and reject keys that occur twice.
+def reject_duplicates(pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Convert keys and values of a JSON or YAML file to a dict, and reject keys that occur twice.
 
-    Without this function, ``json`` would use the last value of such a key.
+    Without this function, the last value of such a key would be used.
 
     Args:
         pairs: Keys and values, as ``json.loads`` passes them to its ``object_pairs_hook``.
@@ -131,7 +131,7 @@ def reject_duplicates(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) < len(pairs):
         keys = [key for key, _ in pairs]
         repeated = next(key for key in members if keys.count(key) > 1)
-        raise ValueError(f"the key {repeated!r} occurs twice in an object; remove one of the two")
+        raise ValueError(f"the key {repeated!r} occurs twice; remove one of the two")
     return members
 
 

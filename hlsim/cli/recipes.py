@@ -121,15 +121,13 @@ def _reject_repeated_keys(text: str) -> None:
 
     A text that is not valid YAML passes, because jsonargparse rejects it.
     """
+    from hlsim.checks import reject_duplicates
+
     yaml: Any = require("yaml", "train")
 
     class Loader(yaml.SafeLoader):
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-            keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-            for key in keys:
-                if keys.count(key) > 1:
-                    raise ValueError(f"recipe: {key!r} occurs twice; remove one of the two")
-            return super().construct_mapping(node, deep)
+            return reject_duplicates(self.construct_pairs(node, deep=True))
 
-    with suppress(yaml.YAMLError):
+    with suppress(yaml.YAMLError, TypeError):  # TypeError: a key is a list
         yaml.load(text, Loader=Loader)

@@ -106,11 +106,12 @@ def make_scene(
     )
     noise_at_ears = torch.zeros_like(target_at_ears)
     for masker, azimuth in zip(maskers, azimuths, strict=True):
-        sound, direction = _cut(masker, time)[None], unit_vectors([azimuth])
-        noise_at_ears += sound_at_microphones(sound, direction, spacing, rate)
+        _check_masker(masker, time)
+        direction = unit_vectors([azimuth])
+        noise_at_ears += sound_at_microphones(masker[None, :time], direction, spacing, rate)
     if diffuse is not None:
-        _cut(diffuse, time)
-        shifts = np.random.default_rng(seed).integers(diffuse.shape[-1], size=DIFFUSE_DIRECTIONS)
+        _check_masker(diffuse, time)
+        shifts = np.random.default_rng(seed).integers(len(diffuse), size=DIFFUSE_DIRECTIONS)
         parts = torch.stack([diffuse.roll(int(shift))[:time] for shift in shifts])
         directions = evenly_spread_directions(DIFFUSE_DIRECTIONS)
         gain = DIFFUSE_DIRECTIONS**-0.5
@@ -120,15 +121,14 @@ def make_scene(
     return Scene(mixture.reshape(target_at_ears.shape), target_at_ears)
 
 
-def _cut(signal: Tensor, time: int) -> Tensor:
-    """Validate a masker, (at least time,), and return its beginning."""
+def _check_masker(signal: Tensor, time: int) -> None:
+    """Raise ValueError unless a masker is a single signal of at least ``time`` samples."""
     check_waveform(signal, "masker")
     if signal.ndim != 1 or len(signal) < time:
         raise ValueError(
             f"expected maskers of shape (time,) with at least {time} samples as the target has, "
             f"got {tuple(signal.shape)}; repeat a short masker"
         )
-    return signal[:time]
 
 
 def sound_at_microphones(
