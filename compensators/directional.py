@@ -22,7 +22,7 @@ from compensators.smoothing import exponential_average
 from compensators.wearable import State
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE
-from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.checks import check_attributes, check_number, check_rate, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
 from hlsim.torchtools import compute_once
@@ -107,7 +107,8 @@ class FilterAndSum(nn.Module):
             raise ValueError(
                 f"expected signals of {expected[0]} microphones at {expected[1]} ears, (..., "
                 f"{expected[0]}, {expected[1]}, time), got shape {tuple(waveform.shape)}; stack "
-                "the microphones of each side from front to rear, the left side first"
+                "the microphones of each side from front to rear, the left side first; or place "
+                "mono speech by hlsim.data.scenes.make_scene"
             )
 
     def initial_state(self, waveform: Tensor) -> State:
@@ -177,17 +178,26 @@ class MicrophoneStream:
     def __init__(self, front_end: FilterAndSum) -> None:
         self._front_end = front_end
         self._state: State | None = None
+        self._shape = torch.Size()
 
     @torch.no_grad()
     def __call__(self, chunk: Tensor) -> Tensor:
         """Return the next output. Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The chunk has another number of microphones or ears.
+            ValueError: The chunk has another number of microphones or ears, or other leading
+                dimensions than the first one.
         """
         self._front_end.check_microphones(chunk)
-        state = self._front_end.initial_state(chunk) if self._state is None else self._state
-        output, self._state = self._front_end.process(chunk, state)
+        if self._state is None:
+            self._state = self._front_end.initial_state(chunk)
+            self._shape = chunk.shape[:-1]
+        elif chunk.shape[:-1] != self._shape:
+            raise ValueError(
+                f"expected a chunk of shape {(*self._shape, 'time')} as before, got "
+                f"{tuple(chunk.shape)}; begin another stream for signals of another shape"
+            )
+        output, self._state = self._front_end.process(chunk, self._state)
         return output
 
 
@@ -320,7 +330,10 @@ class DirectionalAid(nn.Module):
 
     Args:
         front_end: Module from (..., microphones, ears, time) to (..., ears, time).
-        aid: Aid of two ears, such as those of ``load_compensator``.
+        aid: Aid of two ears, such as those of ``load_compensator``, at the same sample rate.
+
+    Raises:
+        ValueError: The aid is not a module, or was built for another sample rate.
 
     >>> from compensators import NALR
     >>> aid = DirectionalAid(DifferentialMicrophone(), NALR())
@@ -332,6 +345,9 @@ class DirectionalAid(nn.Module):
 
     def __init__(self, front_end: FilterAndSum, aid: nn.Module) -> None:
         super().__init__()
+        if not isinstance(aid, nn.Module):
+            raise ValueError(f"expected an aid, got {aid!r}; load it by hlsim.load_compensator")
+        check_attributes(aid, "an aid", sample_rate=front_end.sample_rate)
         self.front_end = front_end
         self.aid = aid
 

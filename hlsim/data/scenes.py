@@ -91,6 +91,13 @@ def make_scene(
     rate = check_rate(sample_rate)
     check_number("snr", snr, -100.0, 100.0)
     check_number("seed", seed, 0, 2**32 - 1, whole=True)
+    check_number("spacing", spacing, 0.002, 0.1)
+    if isinstance(maskers, Tensor) or not isinstance(azimuths, Sequence):
+        raise ValueError(
+            "expected lists of maskers and azimuths, got another type; write [masker], [120.0]"
+        )
+    for azimuth in (*azimuths, target_azimuth):
+        check_number("an azimuth", azimuth, -360.0, 360.0)
     if len(maskers) != len(azimuths):
         raise ValueError(
             f"expected one azimuth for each of {len(maskers)} maskers, got {len(azimuths)}"
@@ -106,11 +113,11 @@ def make_scene(
     )
     noise_at_ears = torch.zeros_like(target_at_ears)
     for masker, azimuth in zip(maskers, azimuths, strict=True):
-        _check_masker(masker, time)
+        _check_masker(masker, "a masker", time)
         direction = unit_vectors([azimuth])
         noise_at_ears += sound_at_microphones(masker[None, :time], direction, spacing, rate)
     if diffuse is not None:
-        _check_masker(diffuse, time)
+        _check_masker(diffuse, "diffuse", time)
         shifts = np.random.default_rng(seed).integers(len(diffuse), size=DIFFUSE_DIRECTIONS)
         parts = torch.stack([diffuse.roll(int(shift))[:time] for shift in shifts])
         directions = evenly_spread_directions(DIFFUSE_DIRECTIONS)
@@ -121,12 +128,12 @@ def make_scene(
     return Scene(mixture.reshape(target_at_ears.shape), target_at_ears)
 
 
-def _check_masker(signal: Tensor, time: int) -> None:
+def _check_masker(signal: Tensor, name: str, time: int) -> None:
     """Raise ValueError unless a masker is a single signal of at least ``time`` samples."""
-    check_waveform(signal, "masker")
+    check_waveform(signal, name)
     if signal.ndim != 1 or len(signal) < time:
         raise ValueError(
-            f"expected maskers of shape (time,) with at least {time} samples as the target has, "
+            f"expected {name} of shape (time,) with at least {time} samples as the target has, "
             f"got {tuple(signal.shape)}; repeat a short masker"
         )
 

@@ -191,6 +191,14 @@ def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
             front_end(torch.zeros(shape))
     with pytest.raises(ValueError, match="2 microphones at 2 ears"):
         front_end.stream()(torch.zeros(2, 100))
+    stream = front_end.stream()
+    stream(torch.zeros(2, 2, 100))
+    with pytest.raises(ValueError, match="as before, got"):
+        stream(torch.zeros(3, 2, 2, 100))
+    with pytest.raises(ValueError, match="an aid with sample_rate=16000, got 44100"):
+        DirectionalAid(front_end, NALR(sample_rate=44100))
+    with pytest.raises(ValueError, match="load it by"):
+        DirectionalAid(front_end, "nalr")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected a pattern out of dipole"):
         DifferentialMicrophone("omni")
     with pytest.raises(ValueError, match="spacing"):

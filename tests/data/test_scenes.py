@@ -79,9 +79,17 @@ def test_wrong_arguments_raise_errors(speech: Tensor, noise: Tensor) -> None:
         make_scene(speech, snr=0.0)
     with pytest.raises(ValueError, match="at least 16000 samples"):
         make_scene(speech, [noise[:100]], [0.0], snr=0.0)
-    with pytest.raises(ValueError, match=r"expected maskers of shape \(time,\)"):
+    with pytest.raises(ValueError, match=r"expected diffuse of shape \(time,\)"):
         make_scene(speech, diffuse=noise.repeat(2, 1), snr=0.0)
     with pytest.raises(ValueError, match="a target of shape"):
         make_scene(speech.repeat(2, 1), diffuse=noise, snr=0.0)
+    with pytest.raises(ValueError, match=r"write \[masker\]"):
+        make_scene(speech, noise, [0.0], snr=0.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"write \[masker\]"):
+        make_scene(speech, [noise], 120.0, snr=0.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="spacing"):
+        make_scene(speech, [noise], [0.0], snr=0.0, spacing=10.0)
+    with pytest.raises(ValueError, match="an azimuth"):
+        make_scene(speech, [noise], [500.0], snr=0.0)
     with pytest.raises(ValueError, match="snr"):
         make_scene(speech, diffuse=noise, snr=float("nan"))
