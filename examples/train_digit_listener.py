@@ -27,8 +27,8 @@ from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.checkpoint import DIGIT_LISTENER, save_checkpoint
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.stft import STFT
-from hlsim.evaluation.digits.listener import DigitListener, load_listener
 from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
+from hlsim.evaluation.digits.recogniser import DigitListener, load_listener
 from hlsim.simulators import load_simulator
 from hlsim.version import __version__
 

@@ -62,7 +62,7 @@ def measure_aids_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run_short_demo(folder: Path, speech_dir: Path, steps: int) -> str:
     """Run the demo for an N4 ear, with a second of the last bundled utterances."""
-    from hlsim.cli.demo_study import run_demo
+    from hlsim.cli.demo_run import run_demo
 
     copy_excerpts(speech_dir.rglob("*-0[34].flac"), speech_dir, folder, seconds=1)
     with patch("hlsim.data.bundled.SPEECH", folder):

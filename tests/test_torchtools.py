@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.func import grad
 
 from hlsim import MSBG, torchtools
-from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.filter_bank import BANKS
 from hlsim.msbg.multirate import multirate_bank
 from hlsim.torchtools import constant
 

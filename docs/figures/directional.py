@@ -26,7 +26,7 @@ from hlsim.data.scenes import DIFFUSE_DIRECTIONS, sound_at_microphones
 from hlsim.dsp.sphere import evenly_spread_directions, unit_vectors
 from hlsim.evaluation.digits.material import Triplets
 from hlsim.evaluation.digits.psychometric import subtract
-from hlsim.evaluation.digits.threshold import DigitTest
+from hlsim.evaluation.digits.speech_reception import DigitTest
 
 EARS = ("N2", "N4")
 AZIMUTHS: dict[str, float | None] = {"90": 90.0, "135": 135.0, "180": 180.0, "all": None}

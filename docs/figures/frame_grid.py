@@ -18,7 +18,7 @@ from hlsim.audiogram import SEVERITIES, severity_index
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
-from hlsim.losses.waveform import noise_to_signal_db
+from hlsim.losses.teacher_distance import noise_to_signal_db
 
 RATE = 16000
 SHIFTS = (3, 6, 12)  # samples; half a hop is 11.6

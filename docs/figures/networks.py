@@ -37,7 +37,7 @@ from hlsim.dsp.stft import STFT
 from hlsim.evaluation.conditions import AtLevelOf
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.study import Measure, run_study
-from hlsim.losses.waveform import noise_to_signal_db
+from hlsim.losses.teacher_distance import noise_to_signal_db
 from hlsim.metrics import haspi, hasqi
 from hlsim.metrics.band_levels import band_edges
 

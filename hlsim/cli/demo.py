@@ -21,7 +21,7 @@ def demo(parser: Parser) -> None:
 def _demo(options: argparse.Namespace) -> None:
     check_extras("train", "eval")
     from hlsim.audiogram import as_audiogram
-    from hlsim.cli.demo_study import run_demo
+    from hlsim.cli.demo_run import run_demo
 
     ear = as_audiogram(options.audiogram)
     with ProgressLine("scores", "training", "drawing the page") as progress:

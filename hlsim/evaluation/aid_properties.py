@@ -17,7 +17,7 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.evaluation.digits.psychometric import Estimate, subtract
-from hlsim.evaluation.digits.threshold import DigitTest
+from hlsim.evaluation.digits.speech_reception import DigitTest
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.running.parallel import describe_error, one_thread
 from hlsim.evaluation.study import cut_output

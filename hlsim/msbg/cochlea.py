@@ -24,7 +24,7 @@ from hlsim.msbg.envelope import (
     partial_means,
     smooth,
 )
-from hlsim.msbg.filterbank import FilterBank, gammatone_response
+from hlsim.msbg.filter_bank import FilterBank, gammatone_response
 from hlsim.msbg.filtfilt_end import end_correction
 from hlsim.msbg.multirate import RateBand, multirate_bank
 from hlsim.msbg.recruitment import apply_gains, expand, recruitment_gains
@@ -138,7 +138,7 @@ def simulate_cochlea(
     Returns:
         Fourier transforms of the sums of the channels.
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> signals, ratios = torch.randn(1, 1000), torch.full((1, 19), 2.0)
     >>> simulate_cochlea(signals, ratios, BANKS["severe"], points=4800).shape
     torch.Size([1, 2401])
@@ -215,7 +215,7 @@ def simulate_delayed_cochlea(
         smears: Whether the signals have been smeared.
         is_last: Whether the signals end here, and are not cut from longer ones.
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> ratios, bank = torch.full((1, 19), 2.0), BANKS["severe"]
     >>> simulate_delayed_cochlea(torch.randn(1, 1000), ratios, bank, True, True).shape
     torch.Size([1, 1000])
@@ -254,7 +254,7 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
             ``hlsim.msbg.recruitment``.
         bank: Filter bank for the severity of the ears.
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> waveform = torch.randn(1, 1000)
     >>> simulate_cochlea_at_full_rate(waveform, torch.full((1, 19), 2.0), BANKS["severe"]).shape
     torch.Size([1, 1000])

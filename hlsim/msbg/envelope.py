@@ -22,7 +22,7 @@ from torch import Tensor
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.msbg.filterbank import FilterBank
+from hlsim.msbg.filter_bank import FilterBank
 from hlsim.torchtools import constant
 
 STEP = 24
@@ -208,7 +208,7 @@ def envelope_lowpass(
     Returns:
         Complex responses, (channels, steps // 2 + 1).
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> envelope_lowpass(BANKS["mild"], points=4800).shape
     (36, 101)
     """
@@ -241,7 +241,7 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
     Returns:
         Numerator and denominator for each channel, three coefficients each.
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> len(envelope_filters(BANKS["mild"]))
     36
     """

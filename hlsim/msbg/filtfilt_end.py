@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.msbg.envelope import STEP, envelope_filters
-from hlsim.msbg.filterbank import FilterBank
+from hlsim.msbg.filter_bank import FilterBank
 from hlsim.msbg.recruitment import AHEAD
 from hlsim.torchtools import constant
 
@@ -51,7 +51,7 @@ def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
         Difference of the envelopes, one value for every 24 samples.
 
     >>> import torch
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> end_correction(torch.zeros(19, 240), BANKS["severe"], length=100).shape
     torch.Size([19, 10])
     """

@@ -37,7 +37,7 @@ from hlsim.msbg.cochlea import (
     simulate_delayed_cochlea,
 )
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.filter_bank import BANKS
 from hlsim.msbg.multirate import total_response
 from hlsim.msbg.overlapping_blocks import in_blocks
 from hlsim.msbg.recruitment import expansion_ratios

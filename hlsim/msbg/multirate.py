@@ -31,7 +31,7 @@ from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import fade_out_weights
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, envelope_lowpass, mean_weights
-from hlsim.msbg.filterbank import FilterBank, gammatone_response
+from hlsim.msbg.filter_bank import FilterBank, gammatone_response
 from hlsim.msbg.recruitment import interpolation_kernel
 from hlsim.msbg.smearing import SKIRT_HZ
 from hlsim.torchtools import as_tensor, compute_once, constant
@@ -81,7 +81,7 @@ class RateBand:
             ``"modulus"`` each is repeated, for the real and the imaginary part; of the analytic
             signals of ``"harmonics"`` only the real part is used.
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> device = torch.device("cpu")
     >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, torch.float32, device)
     >>> lowest = bank.bands[0]
@@ -106,7 +106,7 @@ class MultirateBank:
         lowpass: Frequency responses of the envelopes' low-passes, one row per channel,
             (channels, steps // 2 + 1).
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> device = torch.device("cpu")
     >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, torch.float32, device)
     >>> bank.lowpass.shape
@@ -201,7 +201,7 @@ def multirate_bank(
         dtype: Precision of real tensors, and of the parts of complex ones.
         device: Device of the tensors.
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> device = torch.device("cpu")
     >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, torch.float32, device)
     >>> [band.points for band in bank.bands]
@@ -288,7 +288,7 @@ def total_response(bank: FilterBank, points: int, rate_divisor: int) -> NDArray[
     Returns:
         Complex response, (points // rate_divisor // 2 + 1,).
 
-    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.filter_bank import BANKS
     >>> total_response(BANKS["none"], points=4800, rate_divisor=2).shape
     (1201,)
     """

@@ -17,7 +17,7 @@ from torch import Tensor
 from hlsim.audiogram import SEVERITIES, severity_index
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.msbg.ear import MSBG_RATE, ear_filter, lowpass_filter
-from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
+from hlsim.msbg.filter_bank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.torchtools import constant
 
@@ -41,7 +41,7 @@ def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.compl
     The response is that of aligned MSBG, without a delay.
 
     Args:
-        bank: Filter bank of a severity, a value of ``hlsim.msbg.filterbank.BANKS``.
+        bank: Filter bank of a severity, a value of ``hlsim.msbg.filter_bank.BANKS``.
         rate: Sample rate in Hz.
         points: FFT length at ``rate``, whose duration is a whole number of samples at 44.1 kHz.
 

@@ -32,7 +32,7 @@ from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
-from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
+from hlsim.msbg.filter_bank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
-from hlsim.losses.waveform import (
+from hlsim.losses.teacher_distance import (
     band_level_distance_db,
     log_spectral_distance_db,
     noise_to_signal_db,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hlsim.cli.demo_study import DurationEstimate
+from hlsim.cli.demo_run import DurationEstimate
 from hlsim.data.bundled import SPEECH
 from tests.helpers import run_short_demo
 
@@ -77,7 +77,7 @@ def test_the_duration_follows_from_the_pace_of_the_first_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = 0.0
-    monkeypatch.setattr("hlsim.cli.demo_study.time.monotonic", lambda: now)
+    monkeypatch.setattr("hlsim.cli.demo_run.time.monotonic", lambda: now)
     lines: list[str] = []
     estimate, module = DurationEstimate(), SimpleNamespace(print=lines.append)
     for step in range(1, 101):

@@ -11,7 +11,7 @@ from hlsim.cli.main import COMMANDS, main, make_parser
 FUNCTIONS = {
     "simulate": "hlsim.shortcuts",
     "compensate": "hlsim.shortcuts",
-    "demo": "hlsim.cli.demo_study:run_demo",
+    "demo": "hlsim.cli.demo_run:run_demo",
     "haspi-report": "hlsim.evaluation",
     "evaluate-compensator": "hlsim.evaluation.compensators:evaluate_compensators",
     "evaluate-simulator": "hlsim.evaluation.simulators:evaluate_simulators",

@@ -16,7 +16,6 @@ from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
 from hlsim.cli.main import main
 from hlsim.data.bundled import DIGITS
-from hlsim.evaluation.digits.listener import load_listener
 from hlsim.evaluation.digits.material import (
     Triplets,
     draw_triplets,
@@ -26,6 +25,7 @@ from hlsim.evaluation.digits.material import (
 )
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
+from hlsim.evaluation.digits.recogniser import load_listener
 from hlsim.simulators import Attenuation, load_simulator
 from tests.helpers import load_figure
 

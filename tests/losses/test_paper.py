@@ -15,7 +15,7 @@ from hlsim.losses.paper import (
     paper_parts,
     phase_loss,
 )
-from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
+from hlsim.losses.teacher_distance import log_spectral_distance_db, noise_to_signal_db
 from tests.losses.signals import add_noise
 
 Criterion = Callable[[Tensor, Tensor], Tensor]

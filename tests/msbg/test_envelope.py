@@ -9,7 +9,7 @@ import torch
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, detect, envelope, envelope_lowpass
-from hlsim.msbg.filterbank import BANKS, gammatone_response
+from hlsim.msbg.filter_bank import BANKS, gammatone_response
 from hlsim.msbg.filtfilt_end import end_correction
 
 TIME = 2 * STEP * 342

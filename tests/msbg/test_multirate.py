@@ -5,7 +5,7 @@ import torch
 
 from hlsim.msbg.cochlea import simulate_cochlea
 from hlsim.msbg.envelope import envelope, envelope_lowpass
-from hlsim.msbg.filterbank import BANKS, gammatone_response
+from hlsim.msbg.filter_bank import BANKS, gammatone_response
 from hlsim.msbg.recruitment import expand
 
 POINTS = 50400

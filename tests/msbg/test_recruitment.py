@@ -15,7 +15,7 @@ from hlsim.dsp.erb import erb
 from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP
-from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.filter_bank import BANKS
 from hlsim.msbg.recruitment import (
     CATCH_UP_SPL,
     expand,

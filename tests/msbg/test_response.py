@@ -8,7 +8,7 @@ from torch import Tensor
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import set_level
 from hlsim.dsp.resample import resample
-from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.filter_bank import BANKS
 from hlsim.msbg.response import apply_bank_phase, fixed_response
 
 EARS = ("NH", "N1", "N3", "N5")

@@ -11,7 +11,7 @@ from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
-from hlsim.losses.waveform import noise_to_signal_db
+from hlsim.losses.teacher_distance import noise_to_signal_db
 from hlsim.neuro import NeuroConfig, network
 from hlsim.neuro.decoders import phase_factor
 from hlsim.neuro.family.sequences import BidirectionalLSTM, EncoderLayer

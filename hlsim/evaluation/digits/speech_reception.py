@@ -28,7 +28,6 @@ from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import DIGIT_LISTENER
 from hlsim.checks import check_attributes, check_number, loud_outputs
-from hlsim.evaluation.digits.listener import DigitListener, load_listener
 from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import (
@@ -39,6 +38,7 @@ from hlsim.evaluation.digits.psychometric import (
     estimate_threshold,
     subtract,
 )
+from hlsim.evaluation.digits.recogniser import DigitListener, load_listener
 from hlsim.evaluation.running.parallel import one_thread
 from hlsim.metrics.reference import map_on_cores
 from hlsim.simulators import EXACT, load_simulator

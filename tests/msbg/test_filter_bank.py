@@ -10,7 +10,7 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
-from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
+from hlsim.msbg.filter_bank import BANKS, FilterBank, gammatone_response
 
 msbg = pytest.importorskip("clarity.evaluator.msbg.msbg")
 msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
