@@ -4,7 +4,6 @@ Recordings of any length are read by ``scan_audio`` and ``read_parts``, and writ
 ``write_parts``, so that only a part of them is in memory.
 """
 
-import io
 import math
 import os
 import struct
@@ -271,28 +270,6 @@ def write_parts(
                 )
             written += values.shape[-1]
             file.write(values.mT.contiguous().numpy().astype("<f4", copy=False).tobytes())
-
-
-def encode_wav(waveform: Tensor, sample_rate: int) -> bytes:
-    """Encode a signal as the contents of a 16-bit WAV file, for audio players on web pages.
-
-    A FLAC file of libsndfile has half the size, but no seek table: Chromium cannot start to play it
-    at some positions, and stops.
-
-    Args:
-        waveform: Samples from -1 to 1, (time,) or (channels, time). Larger ones are clipped.
-        sample_rate: Sample rate in Hz.
-
-    Returns:
-        The contents of the file.
-
-    >>> encode_wav(torch.zeros(160), 16000)[:4]
-    b'RIFF'
-    """
-    data = io.BytesIO()
-    samples = waveform.detach().cpu().float().resolve_neg().numpy()
-    soundfile.write(data, samples.T, sample_rate, format="WAV", subtype="PCM_16")
-    return data.getvalue()
 
 
 def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from hlsim.extras import require
-from hlsim.files import atomic_path, write_atomically
+from hlsim.files import atomic_path, read_json, write_atomically
 from hlsim.suggestions import suggest
 from hlsim.version import __version__
 
@@ -188,8 +188,8 @@ def read_record(name: str | Path) -> dict[str, Any]:
     """
     folder = _find_folder(name)
     try:
-        return dict(json.loads((folder / CONFIG).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+        return dict(read_json(folder / CONFIG))
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{folder}: cannot read {CONFIG}: {error}") from error
 
 

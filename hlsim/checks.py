@@ -112,29 +112,6 @@ def check_number(
     raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}")
 
 
-def reject_duplicates(pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
-    """Convert keys and values of a JSON or YAML file to a dict, and reject keys that occur twice.
-
-    Without this function, the last value of such a key would be used.
-
-    Args:
-        pairs: Keys and values, as ``json.loads`` passes them to its ``object_pairs_hook``.
-
-    Raises:
-        ValueError: A key occurs twice.
-
-    >>> import json
-    >>> json.loads('{"N3": 1}', object_pairs_hook=reject_duplicates)
-    {'N3': 1}
-    """
-    members = dict(pairs)
-    if len(members) < len(pairs):
-        keys = [key for key, _ in pairs]
-        repeated = next(key for key in members if keys.count(key) > 1)
-        raise ValueError(f"the key {repeated!r} occurs twice; remove one of the two")
-    return members
-
-
 def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[str, float]:
     """Validate weights by name, and return them as floats.
 

@@ -8,11 +8,12 @@ import errno
 import hashlib
 import inspect
 import io
+import json
 import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -181,6 +182,52 @@ def source_hash(code: Any) -> str | None:
         return sha256(Path(inspect.getfile(code)))
     except (OSError, TypeError):
         return None
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the contents of a JSON file.
+
+    Args:
+        path: File in UTF-8.
+
+    Raises:
+        ValueError: The file does not exist, is no JSON, or has an object with a key that occurs
+            twice.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = Path(f"{folder}/pairs.json").write_text('{"S1": ["L1"]}')
+    ...     read_json(f"{folder}/pairs.json")
+    {'S1': ['L1']}
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        return json.loads(text, object_pairs_hook=reject_duplicates)
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: cannot be read as JSON: {error}") from error
+
+
+def reject_duplicates(pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Convert keys and values of a JSON or YAML file to a dict, and reject keys that occur twice.
+
+    Without this function, the last value of such a key would be used.
+
+    Args:
+        pairs: Keys and values, as ``json.loads`` passes them to its ``object_pairs_hook``.
+
+    Raises:
+        ValueError: A key occurs twice.
+
+    >>> import json
+    >>> json.loads('{"N3": 1}', object_pairs_hook=reject_duplicates)
+    {'N3': 1}
+    """
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        keys = [key for key, _ in pairs]
+        repeated = next(key for key in members if keys.count(key) > 1)
+        raise ValueError(f"the key {repeated!r} occurs twice; remove one of the two")
+    return members
 
 
 def read_table(

@@ -27,7 +27,6 @@ from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.simulators import load_simulator
 from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
-from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from hlsim.report.page import Player
@@ -35,7 +34,9 @@ if TYPE_CHECKING:
 EXAMPLE_SPL = 65.0
 """Level of conversational speech in dB SPL."""
 
-_REPORTED_PACKAGES = ("torch", "numpy", "scipy", "soundfile", "safetensors", "lightning", "pandas")
+_REPORTED_PACKAGES = (
+    *("hlsim", "torch", "numpy", "scipy", "soundfile", "safetensors", "lightning", "pandas"),
+)
 """Packages whose versions ``info`` lists."""
 
 
@@ -233,12 +234,13 @@ def info() -> str:
         >>> hlsim.info().startswith("hlsim")
         True
     """
-    lines = [f"hlsim {__version__}", f"Python {platform.python_version()}", platform.platform()]
+    lines = []
     for package in _REPORTED_PACKAGES:
         try:
             lines.append(f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
             lines.append(f"{package} not installed")
+    lines += [f"Python {platform.python_version()}", platform.platform()]
     cuda = torch.version.cuda if torch.cuda.is_available() else None
     lines.append(f"CUDA {cuda or 'not available'}")
     lines.append(f"{torch.get_num_threads()} threads")

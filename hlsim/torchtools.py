@@ -1,4 +1,4 @@
-"""Tools around torch: stored constants, conversion of arrays, batches, and copies on a GPU.
+"""Tools around torch: constants, threads, conversion of arrays, batches, and copies on a GPU.
 
 A *constant* is a tensor that a function designs from its arguments, such as the taps of a filter.
 It is computed once for each type and device, and then comes from a store. Thresholds are copied
@@ -6,8 +6,9 @@ once from the CPU to a GPU, or back.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import update_wrapper, wraps
 from pathlib import Path
 from threading import Lock
@@ -20,6 +21,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 P = ParamSpec("P")
+Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 Values = TypeVar("Values")
 Samples = Tensor | NDArray[Any]
@@ -103,6 +105,62 @@ def without_modes(
     """
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(function, *arguments, **options).result()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit torch to one thread in a ``with`` block or a decorated function.
+
+    For small tasks, waiting for other threads takes longer than the work itself.
+
+    >>> with one_thread():
+    ...     torch.get_num_threads()
+    1
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def map_on_cores(
+    function: Callable[[Argument], Result], arguments: Sequence[Argument], signal: Tensor
+) -> list[Result]:
+    """Call a function for each of several arguments, in as many threads as torch uses.
+
+    Each call computes on one core. Calls one after another, each on all cores, take longer, because
+    the cores wait for each other after every operation, and much longer while other programs run.
+
+    Args:
+        function: Function to call.
+        arguments: Arguments of the calls.
+        signal: Tensor on which the function depends. If it is not on a CPU or requires a gradient,
+            the calls are made in this thread, to which the hooks of autograd belong.
+
+    Returns:
+        Results in the order of the arguments.
+
+    >>> map_on_cores(abs, [-1, -2], torch.zeros(1))
+    [1, 2]
+    """
+    threads = torch.get_num_threads()
+    workers = min(threads, len(arguments))
+    is_differentiable = signal.requires_grad and torch.is_grad_enabled()
+    if workers == 1 or signal.device.type != "cpu" or is_differentiable:
+        return [function(argument) for argument in arguments]
+    inference = torch.is_inference_mode_enabled()
+
+    def call(argument: Argument) -> Result:
+        with torch.inference_mode(inference), torch.no_grad():
+            return function(argument)
+
+    try:
+        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(call, arguments))
+    finally:
+        torch.set_num_threads(threads)  # the workers have changed it for threads to come
 
 
 class constant(Generic[P, Values]):

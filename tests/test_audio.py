@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import (
-    encode_wav,
     find_audio,
     read_audio,
     read_parts,
@@ -137,13 +136,6 @@ def test_files_of_folders_are_sorted_and_hidden_ones_left_out(tmp_path: Path) ->
             find_audio(folder)
 
 
-def test_an_encoded_sound_is_the_signal_to_16_bits(tmp_path: Path) -> None:
-    signal = torch.linspace(-1.0, 0.99, 16000)
-    (tmp_path / "x.wav").write_bytes(encode_wav(signal, 16000))
-    samples, rate = read_audio(tmp_path / "x.wav")
-    assert rate == 16000 and float((samples[0] - signal).abs().max()) <= 2**-15
-
-
 def test_parts_of_a_recording_are_read_and_written_as_the_whole_one(tmp_path: Path) -> None:
     samples = torch.randn(2, 5000, generator=torch.Generator().manual_seed(0))
     write_audio(tmp_path / "whole.wav", samples, 16000)
@@ -245,7 +237,6 @@ def test_a_tensor_with_the_negative_bit_is_written(tmp_path: Path) -> None:
     assert signal.is_neg()
     write_audio(tmp_path / "a.wav", signal, 16000)
     assert torch.equal(read_audio(tmp_path / "a.wav")[0][0], signal)
-    assert encode_wav(signal, 16000) == encode_wav(signal.resolve_neg(), 16000)
 
 
 def test_the_first_invalid_sample_is_placed(tmp_path: Path) -> None:

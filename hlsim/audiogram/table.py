@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -15,8 +14,7 @@ from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, EarName
 from hlsim.audiogram.standard import STANDARD
 from hlsim.audiogram.value import Audiogram, ears_in_row
-from hlsim.checks import reject_duplicates
-from hlsim.files import convert_at, read_table
+from hlsim.files import convert_at, read_json, read_table
 
 _Builders = Mapping[str, Callable[[], Listener]]
 """Functions without arguments that build listeners, under the names of the listeners."""
@@ -115,11 +113,7 @@ def _read_entries(path: str | Path) -> _Builders:
     Raises:
         ValueError: The file is no JSON, or has another structure.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-        entries = json.loads(text, object_pairs_hook=reject_duplicates)
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: cannot read listeners: {error}") from error
+    entries = read_json(path)
     if not isinstance(entries, Mapping) or not entries:
         raise ValueError(f"{path}: expected one entry per listener, as in Clarity's listeners.json")
     return {

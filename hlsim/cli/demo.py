@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hlsim.cli.inputs import check_extras
+from hlsim.cli.inputs import check_extras, use_one_thread
 from hlsim.cli.options import Parser, count
 from hlsim.progress import ProgressLine
 
@@ -19,6 +19,7 @@ def demo(parser: Parser) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
+    use_one_thread()
     check_extras("train", "eval")
     from hlsim.audiogram import as_audiogram
     from hlsim.cli.demo_run import run_demo

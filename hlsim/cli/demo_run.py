@@ -14,7 +14,6 @@ from hlsim.audiogram import Audiogram
 from hlsim.data import bundled
 from hlsim.evaluation.demo import evaluate_trained_aid
 from hlsim.evaluation.items import ear_name
-from hlsim.evaluation.running.parallel import one_thread
 from hlsim.report.demo_page import demo_page, result_table
 from hlsim.report.writing import write_results
 from hlsim.training.batches import TrainingData
@@ -57,14 +56,13 @@ def run_demo(out: str | Path, audiogram: Audiogram, *, steps: int = 3000, **runn
     """
     ear = f"{ear_name(audiogram)} (pure-tone average {audiogram.pta:.0f} dB HL)"
     print(f"Training an aid for the ear {ear}, {steps} steps")
-    with one_thread():  # the steps are small: on a busy machine two threads wait for each other
-        checkpoint = train_compensator(
-            TrainingData(speech=find_audio(bundled.SPEECH / "train")),
-            CompensatorRecipe(steps=steps),
-            out=Path(out) / "training",
-            audiogram=audiogram,
-            callbacks=[DurationEstimate()],
-        )
+    checkpoint = train_compensator(
+        TrainingData(speech=find_audio(bundled.SPEECH / "train")),
+        CompensatorRecipe(steps=steps),
+        out=Path(out) / "training",
+        audiogram=audiogram,
+        callbacks=[DurationEstimate()],
+    )
     print("Scoring other utterances without an aid, with NAL-R and with the aid")
     aid = load_compensator(checkpoint)
     evaluation = evaluate_trained_aid(aid, audiogram, ear_name=ear, training_steps=steps, **running)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from hlsim.cli.options import Parser, input_path
 from hlsim.extras import require
+from hlsim.files import reject_duplicates
 from hlsim.training.recipes import TrainingRecipe
 
 Recipe = TypeVar("Recipe", bound=TrainingRecipe)
@@ -121,8 +122,6 @@ def _reject_repeated_keys(text: str) -> None:
 
     A text that is not valid YAML passes, because jsonargparse rejects it.
     """
-    from hlsim.checks import reject_duplicates
-
     yaml: Any = require("yaml", "train")
 
     class Loader(yaml.SafeLoader):

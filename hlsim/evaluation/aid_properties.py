@@ -19,10 +19,11 @@ from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.evaluation.digits.psychometric import Estimate, subtract
 from hlsim.evaluation.digits.speech_reception import DigitTest
 from hlsim.evaluation.measures import NORMAL, perceive
-from hlsim.evaluation.running.parallel import describe_error, one_thread
+from hlsim.evaluation.running.parallel import describe_error
 from hlsim.evaluation.study import cut_output
 from hlsim.metrics.band_levels import band_centres, band_levels, threshold_in_quiet
 from hlsim.progress import track
+from hlsim.torchtools import one_thread
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """Frequencies of steady tones in Hz. All but 3001 Hz have the same phase in frames that are

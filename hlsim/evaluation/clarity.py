@@ -7,7 +7,6 @@ file is 100 dB SPL. A listener has one score per measure, that of the ear with t
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +23,6 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
-from hlsim.checks import reject_duplicates
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.conditions import NAL_R, UNAIDED, Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.measures import find_measures
@@ -35,12 +33,13 @@ from hlsim.evaluation.running.parallel import (
     CRASH,
     Crash,
     describe_error,
-    one_thread,
     run_parallel,
 )
 from hlsim.evaluation.study import Condition, cut_output
+from hlsim.files import read_json
 from hlsim.metrics.pair import common_length
 from hlsim.progress import track
+from hlsim.torchtools import one_thread
 
 FULL_SCALE_SPL = 100.0
 """Level in dB SPL of RMS 1.0 in the challenges' files."""
@@ -269,9 +268,8 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
     Raises:
         ValueError: The file cannot be read, or has another structure.
     """
+    entries = read_json(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        entries = json.loads(text, object_pairs_hook=reject_duplicates)
         pairs = [(scene, name) for scene, listeners in entries.items() for name in listeners]
         # A text instead of a list of names would give its letters.
         if any(isinstance(listeners, str) for listeners in entries.values()):
@@ -280,7 +278,7 @@ def _read_names(path: Path) -> list[tuple[str, str]]:
             raise ValueError("a name is not a text")
         if len({*pairs}) < len(pairs):
             raise ValueError("a scene has the same listener twice")
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
+    except (ValueError, AttributeError, TypeError) as error:
         raise ValueError(
             f"{path}: cannot be read ({error}); expected an object with a list of the names of "
             "listeners for each scene"

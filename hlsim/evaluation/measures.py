@@ -32,8 +32,8 @@ from hlsim.metrics.band_levels import (
 from hlsim.metrics.haaqi_score import HaaqiReference
 from hlsim.metrics.haspi_score import HaspiReference
 from hlsim.metrics.hasqi_score import HasqiReference
-from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
+from hlsim.simulators import EXACT, load_simulator
 from hlsim.torchtools import compute_once
 
 CORRELATION_FLOOR = 0.2
@@ -354,7 +354,7 @@ def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
     torch.Size([1600])
     """
     with torch.no_grad(), loud_outputs():
-        perceived: Tensor = MSBG(sample_rate=sample_rate)(signal, ear)
+        perceived: Tensor = load_simulator(EXACT, sample_rate=sample_rate)(signal, ear)
     return perceived
 
 

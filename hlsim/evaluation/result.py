@@ -17,7 +17,6 @@ from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, ItemSource, Measure, run_measures
 from hlsim.metrics.words import WordsChange, words_change
-from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -173,8 +172,8 @@ class Evaluation:
     def versions(self) -> dict[str, str]:
         """Installed versions of hlsim, SciPy and the packages that the measures use, by name."""
         packages = {package for measure in self.measures for package in measure.packages}
-        versions = {package: metadata.version(package) for package in sorted(packages | {"scipy"})}
-        return {"hlsim": __version__, **versions}
+        names = ["hlsim", *sorted(packages | {"scipy"})]
+        return {name: metadata.version(name) for name in names}
 
     def wide(self, column: str) -> DataFrame:
         """Return a column of the table, such as ``"haspi"``, with one column per condition.

@@ -27,13 +27,13 @@ from hlsim.evaluation.running.parallel import (
     Crash,
     Progress,
     describe_error,
-    one_thread,
     run_parallel,
 )
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
 from hlsim.progress import track
+from hlsim.torchtools import one_thread
 
 if TYPE_CHECKING:
     from pandas import DataFrame

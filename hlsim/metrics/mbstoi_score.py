@@ -29,8 +29,7 @@ from torch.nn import functional
 from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.dsp.fft import power, rfft
 from hlsim.metrics.pair import check_finite, match_pair
-from hlsim.metrics.reference import map_on_cores
-from hlsim.torchtools import Audio, Samples, as_type_of, constant
+from hlsim.torchtools import Audio, Samples, as_type_of, constant, map_on_cores
 
 RATE = 10000
 """Sample rate in Hz at which the score is defined."""

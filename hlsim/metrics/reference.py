@@ -7,9 +7,7 @@ computes items in groups: one at a time on a CPU, all at once on a GPU.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,10 +28,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
 from hlsim.metrics.pair import SHORTEST_SECONDS, Equalisation, Noise, check_finite, check_pair
-from hlsim.torchtools import Samples, as_samples, broadcast_shape
-
-Argument = TypeVar("Argument")
-Result = TypeVar("Result")
+from hlsim.torchtools import Samples, as_samples, broadcast_shape, map_on_cores
 
 
 class PreparedBatch(NamedTuple):
@@ -251,41 +246,3 @@ def _count_bytes(value: Any) -> int:
     if not isinstance(value, list | tuple):
         value = vars(value).values() if hasattr(value, "__dict__") else ()
     return sum(map(_count_bytes, value))
-
-
-def map_on_cores(
-    function: Callable[[Argument], Result], arguments: Sequence[Argument], signal: Tensor
-) -> list[Result]:
-    """Call a function for each of several arguments, in as many threads as torch uses.
-
-    Each call computes on one core. Calls one after another, each on all cores, take longer, because
-    the cores wait for each other after every operation, and much longer while other programs run.
-
-    Args:
-        function: Function to call.
-        arguments: Arguments of the calls.
-        signal: Tensor on which the function depends. If it is not on a CPU or requires a gradient,
-            the calls are made in this thread, to which the hooks of autograd belong.
-
-    Returns:
-        Results in the order of the arguments.
-
-    >>> map_on_cores(abs, [-1, -2], torch.zeros(1))
-    [1, 2]
-    """
-    threads = torch.get_num_threads()
-    workers = min(threads, len(arguments))
-    is_differentiable = signal.requires_grad and torch.is_grad_enabled()
-    if workers == 1 or signal.device.type != "cpu" or is_differentiable:
-        return [function(argument) for argument in arguments]
-    inference = torch.is_inference_mode_enabled()
-
-    def call(argument: Argument) -> Result:
-        with torch.inference_mode(inference), torch.no_grad():
-            return function(argument)
-
-    try:
-        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(call, arguments))
-    finally:
-        torch.set_num_threads(threads)  # the workers have changed it for threads to come

@@ -238,7 +238,7 @@ def test_a_change_of_the_code_or_of_facts_that_a_measure_uses_computes_scores_ag
     assert [count_calls(text) for text in ("one", "one", "two", "one")] == [1, 0, 1, 0]
     assert count_calls("one", uses_facts=False) == 1
     assert count_calls("two", uses_facts=False) == 0, "a measure that uses no facts"
-    monkeypatch.setattr("hlsim.evaluation.running.fingerprint.__version__", "9.9.9")
+    monkeypatch.setattr("hlsim.evaluation.running.fingerprint._hash_sources", "{}".format)
     assert count_calls("one") == 1
 
 

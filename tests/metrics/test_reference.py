@@ -8,7 +8,7 @@ from torch import Tensor
 
 import hlsim
 from hlsim.metrics import hasqi
-from hlsim.metrics.reference import map_on_cores
+from hlsim.torchtools import map_on_cores
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from hlsim.report.page import SPECTROGRAM_COLOURS, SPECTROGRAM_LEVELS
-from hlsim.report.players import make_player, spectrogram_levels
+from hlsim.report.players import encode_wav, make_player, spectrogram_levels
 
 pytest.importorskip("matplotlib")
 
@@ -83,3 +83,11 @@ def test_little_colour_is_almost_nothing() -> None:
     signal[:800] = tone(30.0)[:800]
     (sound,) = make_player({"": {"a": signal}}, 16000).sounds
     assert sound.note == "almost nothing is perceived"
+
+
+def test_an_encoded_sound_is_the_signal_to_16_bits() -> None:
+    signal = torch.linspace(-1.0, 0.99, 16000)
+    samples, rate = soundfile.read(io.BytesIO(encode_wav(signal, 16000)), dtype="float32")
+    assert rate == 16000 and abs(samples - signal.numpy()).max() <= 2**-15
+    negative = torch.view_as_complex(torch.stack((signal, signal), -1)).conj().imag
+    assert negative.is_neg() and encode_wav(negative, 16000) == encode_wav(-signal, 16000)

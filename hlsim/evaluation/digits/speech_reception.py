@@ -39,9 +39,8 @@ from hlsim.evaluation.digits.psychometric import (
     subtract,
 )
 from hlsim.evaluation.digits.recogniser import DigitListener, load_listener
-from hlsim.evaluation.running.parallel import one_thread
-from hlsim.metrics.reference import map_on_cores
 from hlsim.simulators import EXACT, load_simulator
+from hlsim.torchtools import map_on_cores, one_thread
 
 NOISE_SPL = 65.0
 """Level of the noise in dB SPL by default."""

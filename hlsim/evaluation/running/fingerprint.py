@@ -22,7 +22,6 @@ from torch import Tensor, nn
 import compensators
 from hlsim.files import source_hash
 from hlsim.plugins import WaveformPlugin
-from hlsim.version import __version__
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 """Attributes that every ``nn.Module`` has, which do not describe its outputs."""
@@ -32,16 +31,14 @@ _ROOMS_WITHOUT_SCORES = frozenset({"cli", "report", "training"})
 
 
 def code_version() -> str:
-    """Return the version of hlsim with a hash of its source code, on which all scores depend.
+    """Return a hash of the source code of hlsim, on which all scores depend.
 
     The code of commands, pages and training does not count.
 
     >>> code_version() == code_version()
     True
     """
-    return (
-        f"{__version__} {_hash_sources(Path(__file__).parents[2], Path(compensators.__path__[0]))}"
-    )
+    return _hash_sources(Path(__file__).parents[2], Path(compensators.__path__[0]))
 
 
 @cache

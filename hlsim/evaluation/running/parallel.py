@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import Any, TypeVar
-
-import torch
 
 from hlsim.extras import require
 
@@ -48,24 +46,6 @@ def describe_error(error: Exception) -> str:
     """
     kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
     return kind + " ".join(str(error).split())
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Limit torch to one thread in a ``with`` block or a decorated function.
-
-    For small tasks, waiting for other threads takes longer than the work itself.
-
-    >>> with one_thread():
-    ...     torch.get_num_threads()
-    1
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def run_parallel(
