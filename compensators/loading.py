@@ -118,8 +118,8 @@ def save_compensator(
         audiogram: Ear for which the compensator was trained; None if it was trained for all ears.
 
     Raises:
-        ValueError: The model is no ``MappingCompensator`` or ``HearingAid``, or the folder cannot
-            be written.
+        ValueError: The model is no ``MappingCompensator`` or ``HearingAid``, a weight is NaN or
+            infinite, or the folder cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -6,6 +6,7 @@ Recordings of any length are read by ``scan_audio`` and ``read_parts``, and writ
 
 import math
 import os
+import re
 import struct
 import warnings
 from collections import deque
@@ -32,6 +33,12 @@ _SCANNED_SAMPLES = 250_000
 
 _LARGEST_SIZE = 2**32 - 1
 """Largest size in bytes that the header of a WAV file can state."""
+
+_STATED_SIZE = re.compile(r": (\d+) \(should be (\d+)\)")
+"""Line of libsndfile's log: the size in bytes that a header states, and the actual one."""
+
+_SMALLEST_UNKNOWN_SIZE = 2**31 - 2**16
+"""Smallest size in bytes that stands for an unknown one, as programs write it into a pipe."""
 
 _HEADER = struct.Struct("<4sI4s4sIHHIIHHH4sII4sI")
 """Header of a WAV file in 32-bit float: the chunks RIFF, fmt and fact, and the head of data."""
@@ -62,11 +69,11 @@ def read_audio(path: str | Path) -> tuple[Tensor, int]:
     (torch.Size([1, 64320]), 16000)
     """
     with _open_audio(path) as file:
-        rate, expected = file.samplerate, file.frames
-        samples = file.read(expected, dtype="float32", always_2d=True)
+        rate = file.samplerate
+        samples = file.read(file.frames, dtype="float32", always_2d=True)
+        _warn_if_truncated(file, len(samples))
     waveform = torch.from_numpy(samples.T.copy())
     _check_contents(path, rate, bool(waveform.isfinite().all()), bool(waveform.any()))
-    _warn_if_truncated(path, expected, len(samples))
     return waveform, rate
 
 
@@ -110,13 +117,13 @@ def scan_audio(path: str | Path) -> AudioInfo:
     """
     energy, samples = 0.0, 0
     with _open_audio(path) as file:
-        rate, channels, expected = file.samplerate, file.channels, file.frames
+        rate, channels = file.samplerate, file.channels
         # Of a truncated file, ``file.blocks`` returns samples beyond its end.
         while len(block := file.read(_SCANNED_SAMPLES, dtype="float32", always_2d=True)):
             samples += len(block)
             energy += float(np.square(block, dtype=np.float64).sum())
+        _warn_if_truncated(file, samples)
     _check_contents(path, rate, math.isfinite(energy), energy > 0.0)
-    _warn_if_truncated(path, expected, samples)
     return AudioInfo(Path(path), rate, channels, samples, energy / (samples * channels))
 
 
@@ -183,12 +190,21 @@ def _check_contents(path: str | Path, rate: int, is_finite: bool, has_sound: boo
         raise ValueError(f"{path}: the file is empty or silent; replace or remove it")
 
 
-def _warn_if_truncated(path: str | Path, expected: int, samples: int) -> None:
-    """Warn if fewer samples per channel could be read than the header of a file states."""
-    if samples < expected:
+def _warn_if_truncated(file: soundfile.SoundFile, samples: int) -> None:
+    """Warn if a file ends before its header says so.
+
+    Args:
+        file: Open file, which was read to its end.
+        samples: Number of samples per channel that could be read.
+    """
+    # Of files without compression, libsndfile counts the samples that are there, and logs the rest.
+    sizes = [(int(stated), int(size)) for stated, size in _STATED_SIZE.findall(file.extra_info)]
+    if samples < file.frames or any(
+        size < stated < _SMALLEST_UNKNOWN_SIZE for stated, size in sizes
+    ):
         warnings.warn(
-            f"{path}: the file is truncated; its header states {expected} samples per channel, but "
-            f"only {samples} could be read",
+            f"{file.name}: the file is truncated; its header states a longer duration than the "
+            f"{samples} samples per channel that could be read",
             stacklevel=3,
         )
 

@@ -252,7 +252,7 @@ def save_checkpoint(
         card: Further metadata of the card, such as ``{"license": "mit"}``.
 
     Raises:
-        ValueError: The folder cannot be written.
+        ValueError: A weight is NaN or infinite, or the folder cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -263,6 +263,12 @@ def save_checkpoint(
     state = {
         name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
     }
+    for name, tensor in state.items():
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(
+                f"expected finite weights, got NaN or infinity in {name}; load an earlier "
+                "checkpoint, and train with a lower learning rate"
+            )
     weights = safetensors.torch.save(state)
     hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(config)}
     record = {"kind": kind, "config": config, **hashes, "about": about}
@@ -352,7 +358,7 @@ class HubModel:
             about: Record of the training for the card, such as ``{"seed": 0}``.
 
         Raises:
-            ValueError: The folder cannot be written.
+            ValueError: A weight is NaN or infinite, or the folder cannot be written.
         """
         assert isinstance(self, nn.Module)
         card: dict[str, Any] = {}

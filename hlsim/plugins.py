@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.machinery
 import importlib.util
 import itertools
 import os
@@ -58,7 +59,7 @@ def load_plugin(name: str, kind: str) -> Any:
         if source.endswith(".py"):
             module = _import_file(Path(source).resolve())
         else:
-            sys.path.insert(0, os.getcwd())
+            _search_first(Path.cwd())
             module = importlib.import_module(source)
         plugin = getattr(module, attribute)
         plugin = plugin() if isinstance(plugin, type) else plugin
@@ -124,7 +125,8 @@ class WaveformPlugin:
             arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: The plug-in fails, its output is not a real tensor of this shape, or the
+            ValueError: The plug-in fails, its output is not a floating-point tensor of this shape, or
+                the
                 output contains NaN or infinity. These are accepted in an output with a gradient,
                 so that a gradient scaler can detect them.
         """
@@ -139,7 +141,7 @@ class WaveformPlugin:
             output = self.function(*copies)
         except Exception as error:  # because code of a plug-in may raise anything
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
-        is_real = isinstance(output, Tensor) and not output.is_complex()
+        is_real = isinstance(output, Tensor) and output.is_floating_point()
         # An aid may change the duration, and its input may be that of several microphones.
         is_aid = self.kind == "aid"
         shape, end = (waveform.shape[-2:], -1) if is_aid else (waveform.shape, None)
@@ -148,7 +150,7 @@ class WaveformPlugin:
             kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
             raise ValueError(
                 f"{self.kind} {self.name} returned {kind} of shape "
-                f"{tuple(getattr(output, 'shape', ()))}, expected a real tensor of shape "
+                f"{tuple(getattr(output, 'shape', ()))}, expected a floating-point tensor of shape "
                 f"{tuple(shape)}"
             )
         if not output.requires_grad and not bool(output.isfinite().all()):
@@ -204,13 +206,37 @@ def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
     return WaveformPlugin(name, kind)
 
 
+_folders: set[Path] = set()
+"""Folders in which Python has searched for modules of plug-ins."""
+
+
+def _search_first(folder: Path) -> None:
+    """Make Python search for modules in the folder of a plug-in first.
+
+    Raises:
+        ImportError: A module that was imported from the folder of another plug-in has the name of
+            one in this folder. Python would use it instead.
+    """
+    for name, module in [*sys.modules.items()]:
+        file = Path(getattr(module, "__file__", None) or "")
+        home = file.parents[1] if file.name == "__init__.py" else file.parent
+        is_foreign = home in _folders and home != folder
+        if is_foreign and importlib.machinery.PathFinder.find_spec(name, [str(folder)]):
+            raise ImportError(
+                f"the module {name} of {home} was imported before, and would be used instead of "
+                f"that of {folder}; rename one of the two"
+            )
+    _folders.add(folder)
+    sys.path.insert(0, str(folder))
+
+
 def _import_file(path: Path) -> ModuleType:
     """Import a file, which can import modules from its folder.
 
     Raises:
         ImportError: Python has no loader for the file. The file may raise other errors.
     """
-    sys.path.insert(0, str(path.parent))
+    _search_first(path.parent)
     spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")

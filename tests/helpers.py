@@ -2,7 +2,8 @@
 
 import importlib.util
 import sys
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -10,12 +11,23 @@ from unittest.mock import patch
 
 import pytest
 import soundfile
+import torch
 
 from hlsim import Audiogram
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 FIGURES = ROOT / "docs" / "figures"
+
+
+@contextmanager
+def default_type(dtype: torch.dtype) -> Iterator[None]:
+    """Set torch's default type in a ``with`` block."""
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def mostly_slow(cases: Iterable[Any], fast: Container[Any]) -> list[Any]:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,15 +57,28 @@ def test_everything_that_libsndfile_reads_is_read_and_found(tmp_path: Path, name
     assert read_audio(path)[0].shape[-1] == pytest.approx(16000, rel=0.05)
 
 
-def test_a_truncated_file_is_read_with_a_warning(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp3"
+@pytest.mark.parametrize("name", ["a.mp3", "a.wav", "a.aiff", "a.au", "a.w64", "a.rf64"])
+def test_a_truncated_file_is_read_with_a_warning(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
     soundfile.write(path, noise(48000), 16000)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.warns(UserWarning, match=r"a\.mp3: the file is truncated"):
+    with pytest.warns(UserWarning, match=f"{re.escape(name)}: the file is truncated"):
         samples = read_audio(path)[0].shape[-1]
-    with pytest.warns(UserWarning, match=r"a\.mp3: the file is truncated"):
+    with pytest.warns(UserWarning, match=f"{re.escape(name)}: the file is truncated"):
         assert scan_audio(path).samples == samples
     assert 0 < samples < 48000
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [2**32 - 1, 2**31 - 1, 2**31 - 2**12])
+def test_a_size_that_was_unknown_when_a_file_was_begun_is_no_truncation(
+    tmp_path: Path, size: int
+) -> None:
+    path = tmp_path / "piped.wav"
+    soundfile.write(path, noise(1000), 16000)
+    header, samples = path.read_bytes().split(b"data", 1)
+    path.write_bytes(header + b"data" + size.to_bytes(4, "little") + samples[4:])
+    assert read_audio(path)[0].shape == (1, 1000)
 
 
 BAD_SIGNALS: dict[str, tuple[np.ndarray, int]] = {

@@ -137,6 +137,14 @@ def test_a_checkpoint_can_be_loaded_after_a_save_that_stopped_at_any_point(
     assert {path.name for path in folder.iterdir()} == FILES
 
 
+def test_weights_that_are_not_finite_are_not_saved(folder: Path) -> None:
+    model = load_pretrained(folder)
+    next(model.parameters()).flatten()[0] = torch.nan
+    with pytest.raises(ValueError, match="expected finite weights, got NaN or infinity in"):
+        save(folder, model)
+    load_pretrained(folder)
+
+
 def test_changed_weights_are_rejected(folder: Path) -> None:
     path = folder / "model.safetensors"
     weights = path.read_bytes()

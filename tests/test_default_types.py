@@ -1,7 +1,6 @@
 """Models are built in float32 on the CPU, whatever torch's default type and device."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -11,18 +10,10 @@ from compensators import NALR, WDRC, HearingAid, MappingCompensator, load_compen
 from compensators.aid import Aid
 from hlsim import MSBG, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.simulators import Attenuation, PluginSimulator, load_simulator
+from tests.helpers import default_type
 
 EAR = [22.3, 27.7, 31.1, 40.9, 50.3, 55.7, 60.1, 60.9]
 """Thresholds that bfloat16 would round."""
-
-
-@contextmanager
-def default_type(dtype: torch.dtype) -> Iterator[None]:
-    torch.set_default_dtype(dtype)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(torch.float32)
 
 
 LOADERS: dict[str, Callable[[], nn.Module]] = {

@@ -32,6 +32,9 @@ def short(waveform):
 def complex_numbers(waveform):
     return waveform + 0j
 
+def integers(waveform):
+    return (32767 * waveform).to(torch.int16)
+
 def array(waveform):
     return waveform.numpy()
 
@@ -79,6 +82,15 @@ def test_a_module_and_a_file_give_the_same_plugin(module: str) -> None:
     assert load_plugin(f"{module}.py:four", "measure")() == 4
 
 
+def test_modules_beside_two_plugins_are_not_mixed_up(module: str) -> None:
+    load_plugin(f"{module}.py:half", "aid")
+    Path("louder").mkdir()
+    Path(f"louder/{module}.py").write_text(CODE)
+    Path("louder/neighbour.py").write_text("GAIN = 2.0\n")
+    with pytest.raises(ValueError, match=r"the module neighbour of .* would be used instead"):
+        load_plugin(f"louder/{module}.py:half", "aid")
+
+
 def test_another_process_loads_the_plugin_once_under_the_same_name(module: str) -> None:
     plugin = WaveformPlugin(f"{module}.py:Quieter", "aid")
     copy = pickle.loads(pickle.dumps(plugin))
@@ -86,7 +98,9 @@ def test_another_process_loads_the_plugin_once_under_the_same_name(module: str) 
     assert str(copy) == str(plugin) == f"{module}.py:Quieter (version 2)"
 
 
-@pytest.mark.parametrize("attribute", ["short", "complex_numbers", "array", "infinite", "broken"])
+@pytest.mark.parametrize(
+    "attribute", ["short", "complex_numbers", "integers", "array", "infinite", "broken"]
+)
 def test_outputs_that_are_no_waveform_are_rejected(module: str, attribute: str) -> None:
     plugin = WaveformPlugin(f"{module}:{attribute}", "teacher")
     with pytest.raises(ValueError, match=f"^teacher {module}:{attribute} "):

@@ -277,7 +277,7 @@ def run_study(
     Returns:
         One row per item and condition: ``item`` (its number), ``name``, the item's facts,
         ``condition``, one column per measured value, and ``failure``, the reason why values are
-        measure has its values.
+        missing; it is None if every measure has its values.
 
     Raises:
         ValueError: There are no items, conditions or measures; two conditions or measures have the
@@ -507,16 +507,16 @@ def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The output has other leading dimensions, differs in length by more than 0.1 s,
-            or has samples that are not finite.
+        ValueError: The output is complex or of whole numbers, has other leading dimensions, differs
+            in length by more than 0.1 s, or has samples that are not finite.
 
     >>> cut_output(torch.ones(1601), torch.ones(1600), 16000).shape
     torch.Size([1600])
     """
-    if output.shape[:-1] != signal.shape[:-1]:
+    if output.shape[:-1] != signal.shape[:-1] or not output.is_floating_point():
         raise ValueError(
-            f"expected an output of shape {tuple(signal.shape)}, got {tuple(output.shape)}; return "
-            "a signal of the input's shape"
+            f"expected a floating-point output of shape {tuple(signal.shape)}, got {output.dtype} "
+            f"of shape {tuple(output.shape)}; return a signal of the input's shape and type"
         )
     if not output.isfinite().all():
         raise ValueError(

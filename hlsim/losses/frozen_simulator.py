@@ -202,7 +202,7 @@ def _normal_ear() -> Tensor:
 
 
 def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
-    """Return an output, or raise ValueError unless it is a tensor of the expected shape.
+    """Return an output, or raise ValueError unless it is a real tensor of the expected shape.
 
     Args:
         output: Value to validate.
@@ -212,9 +212,13 @@ def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
     >>> check_shape(torch.zeros(2), "criterion", (2,))
     tensor([0., 0.])
     """
-    if not isinstance(output, Tensor) or output.shape != shape:
-        result = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
+    is_real = isinstance(output, Tensor) and output.is_floating_point()
+    if not is_real or output.shape != shape:
+        result = type(output).__name__
+        if isinstance(output, Tensor):
+            result = f"{output.dtype} of shape {tuple(output.shape)}"
         raise ValueError(
-            f"expected the {source} to return a tensor of shape {tuple(shape)}, got {result}"
+            f"expected the {source} to return a floating-point tensor of shape {tuple(shape)}, "
+            f"got {result}"
         )
     return output

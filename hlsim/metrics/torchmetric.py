@@ -78,7 +78,9 @@ class _MeanScore(_Metric):
         self.limit = limit
         self.audiogram = audiogram
         for name in ("total", "total_level"):
-            self.add_state(name, torch.tensor(0.0), dist_reduce_fx="sum")
+            # Whatever torch's default type is: sums in half precision soon stop to grow.
+            zero = torch.tensor(0.0, dtype=torch.float32)
+            self.add_state(name, zero, dist_reduce_fx="sum")
         for name in ("count", "seen", "failed"):
             self.add_state(name, torch.tensor(0), dist_reduce_fx="sum")
         # A MetricCollection merges metrics with equal states, such as those of a batch without any
@@ -115,12 +117,34 @@ class _MeanScore(_Metric):
         state = incoming_state
         if isinstance(state, _MeanScore):
             state = state.metric_state
-        if int(state.get("signature", -1)) != int(self.signature):
+        self._check_signature(state.get("signature", -1))
+        super().merge_state(state)
+
+    def _check_signature(self, signature: "Tensor | int") -> None:
+        """Raise ValueError unless a state has the signature of this metric, that of its settings."""
+        if int(signature) != int(self.signature):
             raise ValueError(
                 f"expected the state of {type(self).__name__} with the settings of this metric; "
                 "create both with the same sample_rate, audiogram, full_scale_spl and limit"
             )
-        super().merge_state(state)
+
+    def _load_from_state_dict(
+        self, state_dict: "dict[str, Any]", prefix: str, *arguments: Any, **settings: Any
+    ) -> None:
+        """Load the metric's part of a state dict, or raise ValueError if the settings differ."""
+        self._check_signature(state_dict.get(f"{prefix}signature", self.signature))
+        super()._load_from_state_dict(state_dict, prefix, *arguments, **settings)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = ()) -> Any:
+        """Apply ``fn``, such as that of ``.to()``, to the state.
+
+        Only ``set_dtype`` changes the type of the sums, which need the precision of float32.
+        """
+
+        def move(tensor: Tensor) -> Tensor:
+            return fn(tensor).to(tensor.dtype)
+
+        return super()._apply(fn if self._dtype_convert else move, exclude_state)
 
     @torch.no_grad()
     def update(

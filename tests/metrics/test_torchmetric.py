@@ -17,7 +17,7 @@ pytest.importorskip("torchmetrics")
 
 import hlsim.metrics
 from hlsim.metrics import HAAQI, HASPI, HASQI, MBSTOI, mbstoi
-from tests.helpers import mostly_slow
+from tests.helpers import default_type, mostly_slow
 
 N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
 
@@ -256,6 +256,22 @@ def test_states_of_other_settings_are_not_merged(clean: Tensor) -> None:
     for other in (*metrics, HASQI(audiogram=N3), {"total": torch.tensor(1.0)}):
         with pytest.raises(ValueError, match="with the settings of this metric"):
             metric.merge_state(other)
+    for other in metrics:
+        other.persistent(True)
+        with pytest.raises(ValueError, match="with the settings of this metric"):
+            metric.load_state_dict(other.state_dict())
+
+
+@pytest.mark.usefixtures("quick_scores")
+@pytest.mark.parametrize("is_built_so", [True, False])
+def test_sums_are_not_in_half_precision(clean: Tensor, is_built_so: bool) -> None:
+    with default_type(torch.bfloat16 if is_built_so else torch.float32):
+        metric = HASPI(audiogram=N3)
+    if not is_built_so:
+        torch.nn.ModuleList([metric]).to(torch.bfloat16)
+    metric.update(noisy(clean), clean)
+    expected = HASPI(audiogram=N3)(noisy(clean), clean)
+    torch.testing.assert_close(metric.compute(), expected, rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
