@@ -6,7 +6,6 @@ import importlib
 import importlib.machinery
 import importlib.util
 import itertools
-import os
 import re
 import sys
 import traceback
@@ -125,10 +124,9 @@ class WaveformPlugin:
             arguments: Further arguments of the plug-in.
 
         Raises:
-            ValueError: The plug-in fails, its output is not a floating-point tensor of this shape, or
-                the
-                output contains NaN or infinity. These are accepted in an output with a gradient,
-                so that a gradient scaler can detect them.
+            ValueError: The plug-in fails, its output is not a floating-point tensor of this shape,
+                or the output contains NaN or infinity. These are accepted in an output with a
+                gradient, so that a gradient scaler can detect them.
         """
         if isinstance(self.function, nn.Module):
             self.function.to(waveform.device)
@@ -150,7 +148,7 @@ class WaveformPlugin:
             kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
             raise ValueError(
                 f"{self.kind} {self.name} returned {kind} of shape "
-                f"{tuple(getattr(output, 'shape', ()))}, expected a floating-point tensor of shape "
+                f"{tuple(getattr(output, 'shape', ()))}, expected floating-point samples of shape "
                 f"{tuple(shape)}"
             )
         if not output.requires_grad and not bool(output.isfinite().all()):

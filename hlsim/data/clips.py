@@ -54,7 +54,8 @@ class Clips:
     Recordings are scaled to a peak of 1.0, so that clips have no calibrated level. Recordings are
     decoded when they are first drawn, and stored as 16-bit samples, up to 2 GB; beyond that, the
     recording that was decoded first is dropped, and decoded again when it is drawn. A file that is
-    broken or has an unsupported sample rate causes a warning, and another one is drawn instead.
+    broken, silent or has an unsupported sample rate causes a warning, and another one is drawn
+    instead.
 
     Args:
         source: Folder or files, see ``AudioFiles``.
@@ -181,12 +182,17 @@ class Clips:
         Shape: -> (time,).
 
         Raises:
-            ValueError: A file cannot be read, or the files of a pair do not fit together.
+            ValueError: A file cannot be read, the files of a pair do not fit together, or the first
+                channel or the noise is silent.
         """
         file, clean_file = self.files[index], self._clean_files[index]
         waveform, rate = read_audio(clean_file or file)
         if clean_file is not None:
             waveform = _read_noise(file, waveform, rate)
+        if not bool(waveform[0].any()):
+            # Its clips would never be drawn.
+            part = "its first channel" if clean_file is None else "its difference from clean speech"
+            raise ValueError(f"{file}: {part} is silent; replace or remove the file")
         return resample(waveform[:1], rate, self.sample_rate).squeeze(0)
 
 

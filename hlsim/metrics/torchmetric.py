@@ -120,8 +120,8 @@ class _MeanScore(_Metric):
         self._check_signature(state.get("signature", -1))
         super().merge_state(state)
 
-    def _check_signature(self, signature: "Tensor | int") -> None:
-        """Raise ValueError unless a state has the signature of this metric, that of its settings."""
+    def _check_signature(self, signature: Any) -> None:
+        """Raise ValueError unless a state has the signature of this metric's settings."""
         if int(signature) != int(self.signature):
             raise ValueError(
                 f"expected the state of {type(self).__name__} with the settings of this metric; "

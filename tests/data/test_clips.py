@@ -65,6 +65,15 @@ def test_no_drawn_clip_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         Clips(folder, sample_rate=16000, seconds=1.0).draw(1, torch.Generator().manual_seed(0))
 
 
+def test_recordings_of_which_nothing_can_be_drawn_are_named(tmp_path: Path) -> None:
+    folder_with(tmp_path, a=ramp(4000), right=torch.stack((torch.zeros(4000), ramp(4000))))
+    a, right = tmp_path / "a.wav", tmp_path / "right.wav"
+    for source, reason in ((right, "its first channel"), ((a, a), "its difference from clean")):
+        clips = Clips([source], sample_rate=16000, seconds=0.1)
+        with pytest.warns(UserWarning, match=f"left out: .*{reason}.* is silent"):
+            clips.read_recording(0)
+
+
 def test_memory_is_limited_and_changes_no_draw(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
