@@ -3,7 +3,7 @@
 import math
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -257,22 +257,34 @@ def test_a_crash_costs_only_its_score(items: list[Item]) -> None:
     assert "crash in compiled code" in table.failure[1]
 
 
-@pytest.mark.slow  # Processes take seconds to start.
-def test_a_crash_of_a_users_code_does_not_end_a_study_of_one_item(
+def test_code_of_a_user_runs_in_another_process_unless_there_is_one_job(
     items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("crash.py").write_text(
-        "import os, signal\n\ndef crash(*arguments):\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+    Path("own.py").write_text(
+        "def measure(item, output):\n    return {'one': 1.0}\n\n"
+        "def process(waveform, *ear):\n    return waveform\n"
     )
-    own_aid = Condition("own", PluginAid("crash:crash", 16000))
-    assert Enhanced(WaveformPlugin("crash:crash", "enhancer"), Unaided()).may_crash
-    table = run_study(items[:1], gains(1), [MEASURES[0], load_measure("crash:crash")])
-    assert table.peak.tolist() == pytest.approx([0.2])
-    assert "crash in compiled code" in table.failure[0]
-    table = run_study(items[:1], [own_aid, *gains(1)], MEASURES[:1])
-    assert table.peak.tolist() == pytest.approx([np.nan, 0.2], nan_ok=True)
-    assert "crash in compiled code" in table.failure[0]
+    own_aid = Condition("own", PluginAid("own:process", 16000))
+    own_enhancer = Enhanced(WaveformPlugin("own:process", "enhancer"), Unaided())
+    own_measure = load_measure("own:measure")
+    isolated = []
+
+    def run_here(function: Any, tasks: list[Any], **running: Any) -> Iterator[tuple[Any, Any]]:
+        isolated.append(running["in_processes"])
+        return ((task, function(task)) for task in tasks)
+
+    monkeypatch.setattr("hlsim.evaluation.study.run_parallel", run_here)
+    for jobs in (None, 1):
+        for condition, measure in (
+            (gains(1)[0], MEASURES[0]),
+            (gains(1)[0], own_measure),
+            (own_aid, MEASURES[0]),
+            (Condition("enhanced", own_enhancer), MEASURES[0]),
+        ):
+            table = run_study(items[:1], [condition], [measure], jobs=jobs)
+            assert table.failure.isna().all()
+    assert isolated == [False, True, True, True, False, False, False, False]
 
 
 def test_only_missing_values_are_computed(items: list[Item], tmp_path: Path) -> None:

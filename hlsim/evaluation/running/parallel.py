@@ -89,25 +89,46 @@ def run_parallel(
             jobs = None
         stack.enter_context(joblib.parallel_config(**settings))
         pool = joblib.Parallel(n_jobs=jobs or -1, return_as="generator")
-        single_pool = joblib.Parallel(n_jobs=2)  # With 1, it would be no process of its own.
-        call = joblib.delayed(function)
+        calls = [joblib.delayed(function)(task) for task in tasks]
         finished = 0
         alone = len(tasks) if in_processes and jobs == 1 else 0
         while finished < len(tasks):
-            workers, stop = (single_pool, finished + 1) if alone else (pool, len(tasks))
+            if not alone:
+                results = pool(calls[finished:])
+            elif dask is None:
+                results = _run_in_one_process(calls[finished : finished + alone])
+            else:
+                results = pool(calls[finished : finished + 1])
             try:
-                for result in workers(map(call, tasks[finished:stop])):
+                for result in results:
                     yield tasks[finished], result
                     finished += 1
+                    alone = max(0, alone - 1)
             except Exception as error:
                 if type(error).__name__ not in DEAD_PROCESS_ERRORS:
                     raise
                 if not alone:
-                    alone = _TASKS_IN_FLIGHT * joblib.cpu_count() + 1
-                else:
-                    yield tasks[finished], Crash()
-                    finished += 1
-            alone = max(0, alone - 1)
+                    alone = _TASKS_IN_FLIGHT * joblib.cpu_count()
+                    continue
+                yield tasks[finished], Crash()
+                finished += 1
+                alone -= 1
+
+
+def _run_in_one_process(calls: Sequence[Any]) -> Iterator[Any]:
+    """Yield the results of joblib's delayed calls, which another process computes one by one.
+
+    joblib would use two processes, because its only one would be this process.
+    """
+    from joblib.externals.loky import ProcessPoolExecutor
+
+    environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    executor = ProcessPoolExecutor(1, env=environment)
+    try:
+        for function, arguments, options in calls:
+            yield executor.submit(function, *arguments, **options).result()
+    finally:
+        executor.shutdown(kill_workers=True)
 
 
 def _connect(scheduler: str) -> Any:
