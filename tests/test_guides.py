@@ -1,8 +1,8 @@
 """The commands and programs of the guides run as printed, on a small corpus.
 
 Trainings take two steps, and studies two items of one second. The bundled speech is two seconds of
-four utterances, and the properties of aids are measured with one of them, one tone and one
-position. Pages with commands are slow tests, and so is that on metrics, whose functions have
+four utterances, the properties of aids are measured with one of them, one tone and one position,
+and evaluations have quick scores. Pages with commands are slow tests, and so is that on metrics, whose functions have
 examples that test_doctests.py runs.
 """
 
@@ -176,6 +176,7 @@ def _cases() -> Iterator[Any]:
             yield pytest.param(page, marks=pytest.mark.slow if is_slow else (), id=page.stem)
 
 
+@pytest.mark.usefixtures("quick_scores")
 @pytest.mark.parametrize("page", list(_cases()))
 def test_commands_and_programs_of_a_page_run(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
