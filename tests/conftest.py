@@ -129,7 +129,8 @@ def seeded() -> None:
 
     random.seed(0)
     np.random.seed(0)
-    torch.manual_seed(0)
+    # torch.manual_seed would also write down for each GPU where it was called, in milliseconds.
+    torch.default_generator.manual_seed(0)
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ If the output of a case should change, write that case again::
 
     python -m tests.golden "resample 44100 to 16000 Hz"
 
-Without a name, the command adds cases that are missing in the file, and ``--all`` writes every
-case.
+Without a name, the command adds cases that are missing in the file. ``--all`` writes every case,
+and ``--fast`` those that are no slow tests.
 
 The last bits of an output depend on the processor and on the versions of the libraries. The
 environment variable ``HLSIM_GOLDEN`` names another golden file, written by this machine, whose
@@ -23,6 +23,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -605,6 +606,15 @@ CASES: dict[str, Case] = {
 }
 
 
+# scores that take as long as all other cases together, and of which other cases cover most
+SLOW = re.compile(
+    "(haspi|hasqi|haaqi)(, float64| at 44100 Hz| with noise .*)"
+    "|(hasqi|haaqi)(, float32| with lengths)"
+    "|(HASPILoss|loss hasqi) through .*|loss haspi through msbg"
+)
+FAST_CASES = [name for name in CASES if not SLOW.fullmatch(name)]
+
+
 def excerpts() -> dict[str, NDArray[Any]]:
     """Return 0.8 s each of two bundled utterances. Shape: (12800,) int16."""
     folder = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
@@ -624,6 +634,8 @@ def main() -> None:
     names = sys.argv[1:] or [name for name in CASES if name not in stored]
     if names == ["--all"]:
         names = list(CASES)
+    elif names == ["--fast"]:
+        names = FAST_CASES
     computed = {name: compute(CASES[name]) for name in names}
     summaries = {name: computed.get(name, stored.get(name)) for name in CASES}
     write_file(path, speech_arrays, {name: value for name, value in summaries.items() if value})

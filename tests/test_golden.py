@@ -1,19 +1,9 @@
 """Outputs and gradients keep to the golden file: within tolerances, or bit by bit if asked for."""
 
-import re
-
 import pytest
 
-from tests.golden import CASES, COMMITTED_FILE, LOCAL_FILE, compute, read_file
+from tests.golden import CASES, COMMITTED_FILE, FAST_CASES, LOCAL_FILE, compute, read_file
 from tests.helpers import mostly_slow
-
-# scores that take as long as all other cases together, and of which other cases cover most
-SLOW = re.compile(
-    "(haspi|hasqi|haaqi)(, float64| at 44100 Hz| with noise .*)"
-    "|(hasqi|haaqi)(, float32| with lengths)"
-    "|(HASPILoss|loss hasqi) through .*|loss haspi through msbg"
-)
-FAST_CASES = [name for name in CASES if not SLOW.fullmatch(name)]
 
 _, SUMMARIES = read_file(LOCAL_FILE or COMMITTED_FILE)
 

@@ -2,8 +2,8 @@
 
 Trainings take two steps, and studies two items of one second. The bundled speech is two seconds of
 four utterances, the properties of aids are measured with one of them, one tone and one position,
-and evaluations have quick scores. Pages with commands are slow tests, and so is that on metrics, whose functions have
-examples that test_doctests.py runs.
+and evaluations have quick scores. Pages with commands are slow tests, and so is that on metrics,
+whose functions have examples that test_doctests.py runs.
 """
 
 import csv
