@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import codecs
 import csv
-import errno
 import hashlib
 import inspect
 import io
 import json
 import os
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
+from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 
@@ -67,7 +60,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     """Keep other processes out of a folder, as long as they call this function as well.
 
     The operating system releases the lock when the ``with`` block or the process ends, even if the
-    process is killed. On a file system without locks, nothing is locked.
+    process is killed.
 
     Args:
         folder: Folder to lock, which is created if there is none.
@@ -78,37 +71,25 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     >>> with tempfile.TemporaryDirectory() as folder, lock_folder(folder):
     ...     pass
     """
-    path = Path(folder) / _LOCK
+    from filelock import FileLock, Timeout  # takes longer to import than this module
+
+    lock = FileLock(Path(folder) / _LOCK)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+")
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise ValueError(
+            f"{folder}: another process is writing to this folder; wait until it ends, or choose "
+            "another folder"
+        ) from error
     except OSError as error:
         raise ValueError(
             f"{folder}: cannot write to this folder ({error.strerror or error}); choose another one"
         ) from error
-    with file:
-        try:
-            _lock(file)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
-                file.seek(0)
-                raise ValueError(
-                    f"{folder}: process {file.read()} is writing to this folder; wait until it "
-                    "ends, or choose another folder"
-                ) from error
-            # Some file systems of clusters have no locks.
-        file.truncate(0)
-        print(os.getpid(), end="", file=file, flush=True)
+    try:
         yield
-
-
-def _lock(file: TextIO) -> None:
-    """Lock an open file, or raise OSError if another process has locked it."""
-    if sys.platform == "win32":
-        file.seek(2**20)  # Locked bytes cannot be read by other processes.
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    else:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    finally:
+        lock.release()
 
 
 def write_atomically(path: str | Path, data: str | bytes) -> None:

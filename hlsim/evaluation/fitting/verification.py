@@ -17,10 +17,10 @@ from compensators import load_compensator
 from compensators.aid import Aid
 from compensators.filter_bank import SPEECH_SPECTRUM
 from hlsim.audiogram import FREQUENCIES, Audiogram, as_audiogram
+from hlsim.audiogram.prescription import FREE_FIELD_THRESHOLD_SPL
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.evaluation.measures import CORRELATION_FLOOR, correlate
-from hlsim.metrics.band_levels import normal_threshold
 from hlsim.metrics.pair import check_finite
 from hlsim.metrics.sii import SII_BANDS, sii
 
@@ -173,7 +173,7 @@ def verify(
         np.percentile(_level(power), PERCENTILES, axis=0) for power in powers
     )
     losses = _interpolate(audiogram.levels, audiogram.frequencies)
-    normal = normal_threshold(hertz)
+    normal = np.array([FREE_FIELD_THRESHOLD_SPL[band] for band in SII_BANDS])
     uncomfortable = np.array(audiogram.uncomfortable_levels(hertz.tolist()))
     unaided_sii, aided_sii = (
         sii(_level(power.mean(0)) - _bandwidth_db(), thresholds=losses) for power in powers
