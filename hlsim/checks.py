@@ -226,6 +226,24 @@ def check_waveform(
     return waveform
 
 
+def check_finite(signals: Tensor, name: str = "waveform") -> None:
+    """Raise ValueError if a sample is NaN or infinite. This synchronises with a GPU.
+
+    Args:
+        signals: Signals, (time,) or (items, ..., time).
+        name: Name of the signals, for the message.
+
+    >>> check_finite(torch.ones(2, 9000), "clean")
+    """
+    items = torch.atleast_2d(signals.detach()).flatten(1)
+    is_finite = items.isfinite().all(-1).tolist()
+    if not all(is_finite):
+        item = f" in item {is_finite.index(False)}" if len(is_finite) > 1 else ""
+        raise ValueError(
+            f"{name} has samples that are NaN or infinite{item}; correct it, or leave it out"
+        )
+
+
 def check_device(module: nn.Module, device: torch.device | None = None) -> None:
     """Raise ValueError if a module lacks its weights, or has them on another device than its input.
 

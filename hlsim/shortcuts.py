@@ -22,7 +22,7 @@ from hlsim.calibration import (
     gain_to_pascals,
     set_level,
 )
-from hlsim.checks import check_number, check_rate
+from hlsim.checks import check_finite, check_number, check_rate
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.simulators import load_simulator
@@ -216,8 +216,7 @@ def listen(
                 f"expected shape (time,) or (2, time), got {tuple(tensor.shape)} for {label!r}; "
                 "pass one item, such as x[0]"
             )
-        if not bool(tensor.isfinite().all()):
-            raise ValueError(f"some samples of {label!r} are NaN or infinite; leave it out")
+        check_finite(tensor, repr(label))
         pascals[label.replace("_", " ")] = tensor * gain
     from hlsim.report.players import make_player
 
@@ -254,10 +253,5 @@ def _as_finite_tensor(audio: Samples) -> Tensor:
         ValueError: A sample is NaN or infinite.
     """
     samples = as_samples(audio)
-    invalid = int((~samples.isfinite()).sum())
-    if invalid:
-        raise ValueError(
-            f"expected finite samples, got NaN or infinity in {invalid} of {samples.numel()}; "
-            "remove or replace them"
-        )
+    check_finite(samples, "audio")
     return samples

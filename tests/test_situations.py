@@ -96,8 +96,11 @@ REJECTED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda path: hlsim.simulate(hlsim.load_audio(path), "N3"),  # type: ignore[type-var]
         "got a tuple; write: speech, rate = hlsim.load_audio",
     ),
-    "NaN": (lambda _: hlsim.compensate(SPEECH * torch.nan, "N3"), "NaN or infinity in 16000 of"),
-    "infinity": (lambda _: hlsim.simulate(SPEECH / 0.0, "N3"), "NaN or infinity in 1"),
+    "NaN": (
+        lambda _: hlsim.compensate(SPEECH * torch.nan, "N3"),
+        "audio has samples that are NaN or infinite",
+    ),
+    "infinity": (lambda _: hlsim.simulate(SPEECH / 0.0, "N3"), "audio has samples that are NaN"),
     "no player": (lambda _: hlsim.listen(), "pass signals by name"),
     "a batch to play": (lambda _: hlsim.listen(batch=torch.ones(3, 99)), "got .3, 99. for 'batch'"),
     "a diverged output to play": (

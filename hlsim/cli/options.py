@@ -285,21 +285,19 @@ def ear(text: str) -> str | list[float] | dict[float, float]:
     >>> ear("20,30,40,50,60,60,70,70")
     [20.0, 30.0, 40.0, 50.0, 60.0, 60.0, 70.0, 70.0]
     """
-    try:
-        if ":" not in text:
-            return [float(level) for level in text.split(",")] if "," in text else text
-        points = [point.split(":") for point in text.split(",")]
-        levels = {float(frequency): float(level) for frequency, level in points}
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected a name such as N3, eight levels in dB HL separated by commas, "
-            "or a level for each frequency, such as 500:30,4000:60"
-        ) from None
-    if len(levels) < len(points):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected one level for each frequency; leave all but one out"
-        )
-    return levels
+    expected = (
+        "a name such as N3, eight levels in dB HL separated by commas, or one level for each "
+        "frequency, such as 500:30,4000:60"
+    )
+    if ":" in text:
+        return _checked_type(_read_points, bool, expected)(text)
+    if "," in text:
+        return _checked_type(_read_levels, bool, expected)(text)
+    return text
+
+
+def _read_levels(text: str) -> list[float]:
+    return [float(level) for level in text.split(",")]
 
 
 def loudness(text: str) -> float | dict[float, float]:
@@ -314,20 +312,22 @@ def loudness(text: str) -> float | dict[float, float]:
     >>> loudness("-5"), loudness("50:0,80:-9")
     (-5.0, {50.0: 0.0, 80.0: -9.0})
     """
-    try:
-        if ":" not in text:
-            return float(text)
-        points = [point.split(":") for point in text.split(",")]
-        numbers = {float(level): float(value) for level, value in points}
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected a number of dB, or numbers by level such as 50:0,65:-5,80:-9"
-        ) from None
-    if len(numbers) < len(points):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected one number for each level; leave all but one out"
-        )
-    return numbers
+    expected = "a number of dB, or one number for each level such as 50:0,65:-5,80:-9"
+    read = _read_points if ":" in text else float
+    return _checked_type(read, lambda value: True, expected)(text)
+
+
+def _read_points(text: str) -> dict[float, float]:
+    """Read numbers by frequency or level, such as 500:30,4000:60.
+
+    Raises:
+        ValueError: The text has another form, or a frequency or level occurs twice.
+    """
+    pairs = [point.split(":") for point in text.split(",")]
+    points = {float(key): float(number) for key, number in pairs}
+    if len(points) < len(pairs):
+        raise ValueError(f"a number occurs twice before a colon in {text!r}; leave one out")
+    return points
 
 
 def _limited(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import NEURO_RATE, dbfs, set_level
-from hlsim.checks import check_rate
+from hlsim.checks import check_finite, check_rate
 from hlsim.dsp.active_level import active_level_db
 from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
 
@@ -64,8 +64,8 @@ def mix(
             f"{tuple(signal.shape)} and {tuple(as_samples(noise).shape)}; repeat short noise, or "
             "expand it to the shape of the speech"
         )
-    if not bool((signal.isfinite() & masker.isfinite()).all()):
-        raise ValueError("expected finite samples, got NaN or infinity; replace or remove them")
+    check_finite(signal, "speech")
+    check_finite(masker, "noise")
     if bool((masker == 0.0).all((-2, -1) if channels else -1).any()):
         raise ValueError("expected noise, got silence; use another part of the recording")
     if bool(ratio.isnan().any()):

@@ -18,12 +18,11 @@ _ORDERS_ABOVE = 20
 """Number of terms of the series after the order at which the terms begin to fall."""
 
 
-def unit_vectors(azimuths: ArrayLike, elevations: ArrayLike = 0.0) -> NDArray[np.float64]:
-    """Return the unit vectors (front, left, up) of directions.
+def unit_vectors(azimuths: ArrayLike) -> NDArray[np.float64]:
+    """Return the unit vectors (front, left, up) of directions in the horizontal plane.
 
     Args:
         azimuths: Azimuths in degrees, (...).
-        elevations: Elevations in degrees, which broadcast with the azimuths.
 
     Returns:
         Unit vectors, (..., 3).
@@ -32,11 +31,8 @@ def unit_vectors(azimuths: ArrayLike, elevations: ArrayLike = 0.0) -> NDArray[np
     array([[1., 0., 0.],
            [0., 1., 0.]])
     """
-    azimuth, elevation = np.broadcast_arrays(np.radians(azimuths), np.radians(elevations))
-    horizontal = np.cos(elevation)
-    return np.stack(
-        (horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)), -1
-    )
+    azimuth = np.radians(azimuths)
+    return np.stack((np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)), -1)
 
 
 def evenly_spread_directions(count: int) -> NDArray[np.float64]:
@@ -58,12 +54,10 @@ def evenly_spread_directions(count: int) -> NDArray[np.float64]:
     return np.stack((width * np.cos(turn), width * np.sin(turn), height), -1)
 
 
-def sphere_response(
-    cosines: ArrayLike, frequencies: ArrayLike, radius: float = HEAD_RADIUS
-) -> NDArray[np.complex128]:
-    """Compute the sound pressure of plane waves on a rigid sphere, relative to the free field.
+def sphere_response(cosines: ArrayLike, frequencies: ArrayLike) -> NDArray[np.complex128]:
+    """Compute the sound pressure of plane waves on a rigid head, relative to the free field.
 
-    The free field is the pressure at the centre of the sphere without the sphere. This is the limit
+    The head is a sphere; the free field is the pressure at its centre without it. This is the limit
     of Equation 2 of Duda and Martens 1998, Journal of the Acoustical Society of America 104(5), for
     distant sources, with a positive sign of the time in exponents, as numpy has it.
 
@@ -71,7 +65,6 @@ def sphere_response(
         cosines: Cosine of the angle between the direction of the source and that of the point on
             the sphere, (...).
         frequencies: Frequencies in Hz, (n,), 0 or more.
-        radius: Radius of the sphere in m.
 
     Returns:
         Complex responses, (..., n). They contain the advance or delay with respect to the centre.
@@ -82,7 +75,7 @@ def sphere_response(
     """
     hertz = np.asarray(frequencies, dtype=np.float64)
     # At 0 Hz, the functions are infinite, and the limit is 1, as at this frequency.
-    wave_number = 2.0 * np.pi * np.maximum(hertz, 1e-3) * radius / SPEED_OF_SOUND
+    wave_number = 2.0 * np.pi * np.maximum(hertz, 1e-3) * HEAD_RADIUS / SPEED_OF_SOUND
     orders = np.arange(int(wave_number.max(initial=0.0)) + _ORDERS_ABOVE)
     with np.errstate(over="ignore", invalid="ignore"):
         derivative = scipy.special.spherical_jn(
@@ -96,14 +89,13 @@ def sphere_response(
     return np.moveaxis(np.asarray(series, dtype=np.complex128), 0, -1)
 
 
-def microphone_positions(spacing: float = 0.01, radius: float = HEAD_RADIUS) -> NDArray[np.float64]:
+def microphone_positions(spacing: float = 0.01) -> NDArray[np.float64]:
     """Return the positions of a front and a rear microphone at each side of a spherical head.
 
     They lie on the sphere in the horizontal plane, the same way in front of and behind each ear.
 
     Args:
         spacing: Distance between the two microphones of a side along the sphere in m.
-        radius: Radius of the sphere in m.
 
     Returns:
         Unit vectors (front, left, up), (microphones, ears, 3): front and rear, left and right.
@@ -112,7 +104,7 @@ def microphone_positions(spacing: float = 0.01, radius: float = HEAD_RADIUS) -> 
     array([[ 0.057,  0.998,  0.   ],
            [ 0.057, -0.998,  0.   ]])
     """
-    offset = np.degrees(0.5 * spacing / radius)
+    offset = np.degrees(0.5 * spacing / HEAD_RADIUS)
     return unit_vectors([[90.0 - offset, offset - 90.0], [90.0 + offset, -90.0 - offset]])
 
 

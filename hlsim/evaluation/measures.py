@@ -65,76 +65,35 @@ class _CleanSignal:
     samples: Tensor = field(compare=False)
 
 
-@compute_once
-def _prepare_haspi(clean: _CleanSignal, sample_rate: int, full_scale_spl: float) -> HaspiReference:
-    settings: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
-    return HaspiReference(clean.samples, **settings, whole_khz=True)
-
-
-@compute_once
-def _prepare_quality(
-    kind: type[HasqiReference] | type[HaaqiReference],
-    clean: _CleanSignal,
-    sample_rate: int,
-    full_scale_spl: float,
-    ear: Audiogram,
-) -> HasqiReference | HaaqiReference:
-    settings: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
-    return kind(clean.samples, ear, **settings, whole_khz=True)
-
-
-def _clean_signal(item: Item, precision: torch.dtype) -> _CleanSignal:
-    """Return the clean signal of an item, converted to a number type."""
-    samples = item.clean.to(precision)
-    return _CleanSignal(value_hash(samples), samples)
-
-
-def _noise(item: Item) -> dict[str, Any]:
-    """Return the arguments of a score with which it draws the ear's noise as pyclarity does."""
-    return {"noise": "seeded", "seed": item.seed}
-
-
-def _haspi(precision: torch.dtype, item: Item, output: Tensor) -> Tensor:
-    """Compute HASPI as a scalar tensor.
-
-    A clean signal is prepared once for all conditions and ears.
-    """
-    clean = _clean_signal(item, precision)
-    reference = _prepare_haspi(clean, item.sample_rate, item.full_scale_spl)
-    return reference.score(output.to(precision), item.ear, **_noise(item))
-
-
-def _quality(
-    kind: type[HasqiReference] | type[HaaqiReference],
-    precision: torch.dtype,
-    item: Item,
-    output: Tensor,
-) -> Tensor:
-    """Compute HASQI or HAAQI, depending on ``kind``, as a scalar tensor.
-
-    A clean signal is prepared once for all conditions of an ear.
-    """
-    clean = _clean_signal(item, precision)
-    reference = _prepare_quality(kind, clean, item.sample_rate, item.full_scale_spl, item.ear)
-    return reference.score(output.to(precision), **_noise(item))
-
-
-def _score_for_ear(
-    name: str, score: Callable[[Item, Tensor], Tensor], item: Item, output: Tensor
-) -> Values:
-    """Compute a score that depends on the ear, as a dict with the one column ``name``."""
-    return {name: float(score(item, output))}
-
-
-_EAR_SCORES: dict[str, Callable[..., Tensor]] = {
-    "haspi": _haspi,
-    "hasqi": partial(_quality, HasqiReference),
-    "haaqi": partial(_quality, HaaqiReference),
+REFERENCES: dict[str, Callable[..., Any]] = {
+    "haspi": HaspiReference,
+    "hasqi": HasqiReference,
+    "haaqi": HaaqiReference,
 }
-"""Functions ``(number type, item, output) -> score`` of the scores for an ear, by name.
+"""Classes that prepare a clean signal for the scores of its outputs, by the name of the score."""
 
-They draw the ear's noise, and round the sample rate to whole kHz, as pyclarity does.
-"""
+
+@compute_once
+def _prepare(
+    score: str, clean: _CleanSignal, sample_rate: int, full_scale_spl: float, *ear: Audiogram
+) -> Any:
+    """Prepare a clean signal once for all conditions, and for HASPI also for all ears."""
+    settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "whole_khz": True}
+    return REFERENCES[score](clean.samples, *ear, **settings)
+
+
+def _score_for_ear(name: str, precision: torch.dtype, item: Item, output: Tensor) -> Values:
+    """Compute HASPI, HASQI or HAAQI, as a dict with the one column ``name``.
+
+    As in pyclarity, the ear's noise is drawn, and the sample rate is rounded to whole kHz.
+    """
+    samples = item.clean.to(precision)
+    clean = _CleanSignal(value_hash(samples), samples)
+    # HASPI compares with the clean signal in a normal ear, the others with that in the item's ear.
+    prepared_ear, scored_ear = ([], [item.ear]) if name == "haspi" else ([item.ear], [])
+    reference = _prepare(name, clean, item.sample_rate, item.full_scale_spl, *prepared_ear)
+    score = reference.score(output.to(precision), *scored_ear, noise="seeded", seed=item.seed)
+    return {name: float(score)}
 
 
 def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
@@ -147,14 +106,13 @@ def _ear_measure(name: str, bits: int = 32) -> Measure:
 
     The number of bits is part of the key of stored scores.
     """
-    compute = partial(_score_for_ear, name, partial(_EAR_SCORES[name], PRECISIONS[bits]))
+    compute = partial(_score_for_ear, name, PRECISIONS[bits])
     packages = ["numpy"]  # NumPy draws the ear's noise.
-    settings = f"{bits} bits"
-    return Measure(name, compute, packages, settings, uses_facts=False, scores=[name])
+    return Measure(name, compute, packages, f"{bits} bits", uses_facts=False, scores=[name])
 
 
 MEASURES = {
-    **{name: _ear_measure(name) for name in _EAR_SCORES},
+    **{name: _ear_measure(name) for name in REFERENCES},
     "stoi": Measure(
         "stoi",
         partial(_score_signal, "stoi", fidelity.stoi),
@@ -201,7 +159,7 @@ def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
     measures = []
     for name in dict.fromkeys(names):
         measure = MEASURES[name] if name in MEASURES else load_measure(name)
-        if precision != 32 and name in _EAR_SCORES:
+        if precision != 32 and name in REFERENCES:
             measure = _ear_measure(name, precision)
         measures.append(measure)
     return measures
@@ -330,14 +288,10 @@ def correlate(output: Tensor, clean: Tensor) -> tuple[int, float]:
     (32, 1.0)
     """
     signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
-    # scipy.signal.correlate takes longer, and scipy.signal takes a second to import.
-    points = scipy.fft.next_fast_len(len(output) + len(clean), real=True)
-    first, second = (scipy.fft.rfft(signal, points) for signal in signals)
-    correlation = np.abs(scipy.fft.irfft(first * second.conj(), points))
+    correlation = np.abs(scipy.signal.correlate(*signals, method="fft"))
     peak = int(correlation.argmax())
-    lag = peak if peak < len(output) else peak - points
     scale = np.prod([np.linalg.norm(signal) for signal in signals])
-    return lag, float(correlation[peak] / scale) if scale else 0.0
+    return peak - (len(clean) - 1), float(correlation[peak] / scale) if scale else 0.0
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import gain_to_pascals
+from hlsim.checks import check_finite
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.evaluation.running.parallel import describe_error
@@ -126,8 +127,7 @@ def try_conditions(
         try:
             with torch.no_grad():
                 signal = process(condition)
-            if not signal.isfinite().all():
-                raise ValueError("some samples are NaN or infinite")
+            check_finite(signal, "the sound")
             signals[condition.name] = signal
         except Exception as error:  # The study has scored the item: one sound may be missing.
             failures[condition.name] = describe_error(error)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
-from hlsim.checks import check_waveform, loud_outputs
+from hlsim.checks import check_finite, check_waveform, loud_outputs
 from hlsim.evaluation.running.fingerprint import code_version, fingerprint, value_hash
 from hlsim.evaluation.running.parallel import (
     CRASH,
@@ -518,10 +518,7 @@ def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
             f"expected a floating-point output of shape {tuple(signal.shape)}, got {output.dtype} "
             f"of shape {tuple(output.shape)}; return a signal of the input's shape and type"
         )
-    if not output.isfinite().all():
-        raise ValueError(
-            "expected finite samples in the output, got NaN or infinite ones; correct the aid"
-        )
+    check_finite(output, "the output")
     lengths = signal.shape[-1], output.shape[-1]
     return output[..., : common_length(lengths, sample_rate, ("the input", "the output"))]
 

@@ -27,8 +27,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audiogram.thresholds import check_two_channels
+from hlsim.checks import check_finite
 from hlsim.dsp.fft import power, rfft
-from hlsim.metrics.pair import check_finite, match_pair
+from hlsim.metrics.pair import match_pair
 from hlsim.torchtools import Audio, Samples, as_type_of, constant, map_on_cores
 
 RATE = 10000
@@ -97,7 +98,7 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
     *items, _, time = clean.shape
     precision = torch.float32 if clean.device.type == "mps" else torch.float64
     signals = torch.stack([clean, matched], -3).to(precision).reshape(-1, 2, 2, time)
-    check_finite("output or clean", signals)
+    check_finite(signals, "output or clean")
     is_sounding = signals[:, 0].flatten(1).any(-1).tolist()
     if not all(is_sounding):
         index = is_sounding.index(False)

@@ -69,23 +69,6 @@ def check_pair(output: Tensor, clean: Tensor) -> None:
         )
 
 
-def check_finite(name: str, signals: Tensor) -> None:
-    """Raise ValueError if a sample is NaN or infinite. This synchronises with a GPU.
-
-    Args:
-        name: Name of the signals, for the message.
-        signals: Signals. Shape: (items, ...).
-
-    >>> check_finite("clean", torch.ones(2, 9000))
-    """
-    is_finite = signals.detach().flatten(1).isfinite().all(-1).tolist()
-    if not all(is_finite):
-        item = f" in item {is_finite.index(False)}" if len(is_finite) > 1 else ""
-        raise ValueError(
-            f"{name} holds samples that are NaN or infinite{item}; leave this signal out"
-        )
-
-
 def match_pair(
     output: Samples, clean: Samples, sample_rate: int, lengths: Lengths | None = None
 ) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -18,6 +18,7 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import (
     Lengths,
     check_choice,
+    check_finite,
     check_lengths,
     check_number,
     check_rate,
@@ -27,7 +28,7 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
-from hlsim.metrics.pair import SHORTEST_SECONDS, Equalisation, Noise, check_finite, check_pair
+from hlsim.metrics.pair import SHORTEST_SECONDS, Equalisation, Noise, check_pair
 from hlsim.torchtools import Samples, as_samples, broadcast_shape, map_on_cores
 
 
@@ -107,7 +108,7 @@ class Reference(ABC):
                 f"clean has an item of {seconds:.2g} s; expected {SHORTEST_SECONDS} s or more, "
                 "because a score means nothing below; pass longer signals"
             )
-        check_finite("clean", self._rows)
+        check_finite(self._rows, "clean")
         self._ears = self._thresholds(audiogram)
         self._groups = [slice(0, items)]
         if clean.device.type == "cpu":
@@ -228,7 +229,7 @@ class Reference(ABC):
         check_waveform(outputs, "output", full_scale_spl=self._full_scale_spl)
         check_pair(outputs, self._clean)
         rows = outputs.reshape(self._rows.shape)
-        check_finite("output", rows)
+        check_finite(rows, "output")
 
         def compare(group: int) -> Tensor:
             batch = self._batches[group] if self._batches else self._prepare(self._groups[group])

@@ -68,6 +68,6 @@ def test_spread_directions_have_equal_shares_of_the_sphere() -> None:
     np.testing.assert_allclose(moments, np.eye(3) / 3.0, atol=2e-3)
 
 
-def test_unit_vectors_turn_to_the_left_and_up() -> None:
+def test_unit_vectors_turn_to_the_left() -> None:
     np.testing.assert_allclose(unit_vectors(90.0), [0.0, 1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(unit_vectors(0.0, 90.0), [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(unit_vectors(180.0), [-1.0, 0.0, 0.0], atol=1e-12)

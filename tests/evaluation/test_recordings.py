@@ -16,6 +16,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.cli.main import main
 from hlsim.evaluation import haspi_report
+from hlsim.evaluation.measures import REFERENCES
 from hlsim.evaluation.recorded_items import RecordedItem, read_recordings
 from hlsim.files import sha256
 from hlsim.metrics import HaspiReference, haspi
@@ -88,7 +89,7 @@ def test_clean_speech_is_prepared_once_for_all_conditions_and_listeners(
             prepared.append(arguments)
             super().__init__(*arguments, **settings)
 
-    monkeypatch.setattr("hlsim.evaluation.measures.HaspiReference", CountedReference)
+    monkeypatch.setitem(REFERENCES, "haspi", CountedReference)
     ears = corpus / "ears.csv"
     ears.write_text("listener,hl_500,hl_4000\nL1,20,40\nL2,50,60\n")
     table = haspi_report(**folders(corpus), audiograms=ears, seed=9).table

@@ -122,7 +122,7 @@ def test_recordings_that_do_not_belong_together_are_refused() -> None:
         verify(speech[:8000], speech[:8000], "N3", RATE)
     with pytest.raises(ValueError, match="save the channel of the ear as a mono file"):
         verify(torch.stack([speech, speech]), speech, "N3", RATE)
-    with pytest.raises(ValueError, match="output holds samples that are NaN or infinite"):
+    with pytest.raises(ValueError, match="output has samples that are NaN or infinite"):
         verify(speech, speech * torch.nan, "N3", RATE)
     with pytest.raises(ValueError, match="input_ is silent"):
         verify(torch.zeros_like(speech), speech, "N3", RATE)

@@ -195,7 +195,7 @@ def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> Non
     metric = HASPI(16000)
     for spoiled, reason in (
         ((clean[0] * 0, clean[0]), ".*is silent"),
-        ((clean[0], clean[0] / 0), "output holds samples that are NaN"),
+        ((clean[0], clean[0] / 0), "output has samples that are NaN"),
     ):
         metric.reset()
         reference, output = (torch.stack([signal, clean[1]]) for signal in spoiled)

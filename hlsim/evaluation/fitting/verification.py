@@ -19,9 +19,8 @@ from compensators.filter_bank import SPEECH_SPECTRUM
 from hlsim.audiogram import FREQUENCIES, Audiogram, as_audiogram
 from hlsim.audiogram.prescription import FREE_FIELD_THRESHOLD_SPL
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
-from hlsim.checks import check_rate, check_waveform
+from hlsim.checks import check_finite, check_rate, check_waveform
 from hlsim.evaluation.measures import CORRELATION_FLOOR, correlate
-from hlsim.metrics.pair import check_finite
 from hlsim.metrics.sii import SII_BANDS, sii
 
 Array = NDArray[np.float64]
@@ -152,7 +151,7 @@ def verify(
             f"{tuple(output.shape)}; save the channel of the ear as a mono file"
         )
     for name, signal in (("input_", input_), ("output", output)):
-        check_finite(name, check_waveform(signal, name, full_scale_spl=full_scale_spl)[None])
+        check_finite(check_waveform(signal, name, full_scale_spl=full_scale_spl), name)
     if not bool(input_.any()):
         raise ValueError("input_ is silent; pass the sound that the aid received")
     if not bool(output.any()):
