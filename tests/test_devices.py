@@ -130,7 +130,6 @@ def value_and_gradient(call: Call, module: nn.Module, *tensors: Tensor) -> tuple
 # each kind of module once; the others are slow
 FAST = [
     "msbg",
-    "haspi",
     "neuro-msbg",
     "nalr",
     "hearing-aid",

@@ -84,7 +84,7 @@ def test_a_program_gives_the_simulators_outputs(name: str, items: int, samples: 
     [
         pytest.param("wdrc", 2, 1, marks=pytest.mark.slow),
         pytest.param("wdrc", 1, 5, marks=pytest.mark.slow),
-        ("aid", 2, 3),
+        pytest.param("aid", 2, 3, marks=pytest.mark.slow),
     ],
 )
 def test_a_program_of_hops_gives_the_outputs_of_the_stream(

@@ -2,8 +2,7 @@
 
 Trainings take two steps, and studies two items of one second. The bundled speech is two seconds of
 four utterances, the properties of aids are measured with one of them, one tone and one position,
-and evaluations have quick scores. Pages with commands are slow tests, and so is that on metrics,
-whose functions have examples that test_doctests.py runs.
+and evaluations have quick scores.
 """
 
 import csv
@@ -172,10 +171,10 @@ def _cases() -> Iterator[Any]:
     for page in PAGES:
         kinds = {kind for kind, _ in _read_steps(page)}
         if kinds:
-            is_slow = "sh" in kinds or page.stem == "metrics"
-            yield pytest.param(page, marks=pytest.mark.slow if is_slow else (), id=page.stem)
+            yield pytest.param(page, id=page.stem)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_scores")
 @pytest.mark.parametrize("page", list(_cases()))
 def test_commands_and_programs_of_a_page_run(

@@ -125,6 +125,7 @@ def test_pieces_end_in_pauses_and_are_kept_where_recognisers_agree(
     assert example.transcribe(tmp_path, [lambda x: "a b a b"] * 2) == []
 
 
+@pytest.mark.slow
 def test_aids_are_compared_at_equal_level(
     example: ModuleType,
     tmp_path: Path,

@@ -15,6 +15,7 @@ from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, Listener, load_pr
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import set_level
 from hlsim.metrics import haspi, hasqi
+from tests.helpers import mostly_slow
 
 LEFT, RIGHT = Audiogram.standard("N2"), Audiogram.standard("N4")
 BOTH = Listener(LEFT, RIGHT)
@@ -60,7 +61,7 @@ def test_both_ears_in_one_call_are_each_ear_alone(name: str, scene: Tensor) -> N
                 stored(scene[0])
 
 
-@pytest.mark.parametrize("kind", [HearingLossLoss, HASPILoss])
+@pytest.mark.parametrize("kind", mostly_slow([HearingLossLoss, HASPILoss], [HearingLossLoss]))
 def test_the_loss_is_the_mean_over_both_ears_and_reaches_both(kind: Any, scene: Tensor) -> None:
     loss, output = kind(), (0.5 * scene).requires_grad_()
     value = loss(output[None], scene[None], BOTH)
@@ -181,6 +182,7 @@ def test_ears_in_batches_pass_through_lightning(tmp_path: Path) -> None:
     assert next(iter(fabric.setup_dataloaders(loader)))[1:] == [[LEFT, RIGHT], BOTH]
 
 
+@pytest.mark.slow
 def test_bootstrap_takes_ears_as_tensors_and_refuses_lists(scene: Tensor) -> None:
     """A list of audiograms would keep its order while the signals are drawn anew."""
     wrappers = pytest.importorskip("torchmetrics.wrappers")

@@ -114,6 +114,7 @@ def test_conditions_groups_and_page(
     assert "my_enhancer:half" in page.markdown() and page.html().count("<audio") == 4
 
 
+@pytest.mark.slow
 def test_another_prescription_may_be_the_rival(
     options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

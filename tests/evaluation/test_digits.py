@@ -98,7 +98,7 @@ def test_known_thresholds_are_found_within_their_interval(threshold: float) -> N
     span = 0.9 - 0.01
     share = 0.1 + span * expit(0.4 * (snr - threshold) + logit((TARGET - 0.1) / span))
     inside, errors = [], []
-    for _ in range(20):
+    for _ in range(10):
         estimate = estimate_threshold(snr, rng.binomial(3, share))
         inside.append(estimate.low <= threshold <= estimate.high)
         errors.append(estimate.value - threshold)

@@ -15,6 +15,7 @@ from hlsim.losses.teacher_distance import noise_to_signal_db
 from hlsim.neuro import NeuroConfig, network
 from hlsim.neuro.decoders import phase_factor
 from hlsim.neuro.family.sequences import BidirectionalLSTM, EncoderLayer
+from tests.helpers import mostly_slow
 
 N3 = Audiogram.standard("N3")
 
@@ -60,7 +61,9 @@ LIMITED_FIELD: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("kind", LIMITED_FIELD)
+@pytest.mark.parametrize(
+    "kind", mostly_slow(LIMITED_FIELD, ["default", "paper's transform", "monolithic"])
+)
 def test_items_and_blocks_one_by_one_equal_processing_at_once(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

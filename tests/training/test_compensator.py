@@ -18,7 +18,7 @@ from hlsim.training.batches import Batch, TrainingData, make_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
 from hlsim.training.module import describe_simulator
 from hlsim.training.recipes import CompensatorRecipe
-from tests.helpers import write_table
+from tests.helpers import mostly_slow, write_table
 from tests.training.gradients import check_gradients
 
 SMALL = CompensatorRecipe(
@@ -52,7 +52,13 @@ def noisy(data: TrainingData) -> TrainingData:
 
 @pytest.mark.parametrize(
     "recipe",
-    [SMALL, replace(SMALL_AID, weights={"coherent-bands": 1.0, "denoising": 10.0}, unreduced=0.5)],
+    mostly_slow(
+        [
+            SMALL,
+            replace(SMALL_AID, weights={"coherent-bands": 1.0, "denoising": 10.0}, unreduced=0.5),
+        ],
+        [SMALL],
+    ),
 )
 def test_an_aid_learns_from_random_weights(
     noisy: TrainingData, tmp_path: Path, recipe: CompensatorRecipe
