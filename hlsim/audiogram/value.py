@@ -27,6 +27,7 @@ from hlsim.audiogram.scale import (
     LOWEST_UCL,
     SEVERITIES,
     SEVERITY_LIMITS,
+    UCL_NOT_REACHED,
     WHO_GRADES,
     EarName,
 )
@@ -60,7 +61,8 @@ class Audiogram:
 
     Raises:
         ValueError: The numbers of levels and frequencies differ, no level was measured, one is out
-            of range, or the frequencies do not ascend, or all lie below 250 or above 8000 Hz.
+            of range, an uncomfortable level is below the threshold, or the frequencies do not
+            ascend, or all lie below 250 or above 8000 Hz.
 
     Example:
         >>> from hlsim import Audiogram
@@ -89,7 +91,6 @@ class Audiogram:
             object.__setattr__(self, "levels", ear.levels)
             object.__setattr__(self, "frequencies", ear.frequencies)
             object.__setattr__(self, "ucl", self.ucl or ear.ucl)
-            return
         levels, frequencies = _as_array(self.levels), _as_array(self.frequencies)
         if len(levels) != len(frequencies):
             raise ValueError(
@@ -115,6 +116,13 @@ class Audiogram:
             )
         object.__setattr__(self, "levels", tuple(levels.tolist()))
         object.__setattr__(self, "frequencies", tuple(frequencies.tolist()))
+        thresholds = self._interpolate([hz for hz, _ in self.ucl]).tolist()
+        for (hz, level), threshold in zip(self.ucl, thresholds, strict=True):
+            if level < min(threshold, UCL_NOT_REACHED):
+                raise ValueError(
+                    f"expected uncomfortable levels above the thresholds, got {level:g} dB HL at "
+                    f"{hz:g} Hz, where the threshold is {threshold:g} dB HL; correct one of them"
+                )
 
     @classmethod
     def standard(cls, name: str) -> Audiogram:

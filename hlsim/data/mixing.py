@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import NEURO_RATE, dbfs, set_level
-from hlsim.checks import check_finite, check_rate
+from hlsim.checks import check_finite, check_rate, check_waveform
 from hlsim.dsp.active_level import active_level_db
 from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
 
@@ -50,8 +50,8 @@ def mix(
         >>> noisy.shape
         torch.Size([64320])
     """
-    signal = as_samples(speech)
-    masker = as_samples(noise)[..., : signal.shape[-1]].to(signal)
+    signal = check_waveform(as_samples(speech), "speech")
+    masker = check_waveform(as_samples(noise), "noise")[..., : signal.shape[-1]].to(signal)
     ratio = torch.as_tensor(snr, device=signal.device)
     if signal.ndim < 1 + channels:
         raise ValueError(

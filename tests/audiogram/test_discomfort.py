@@ -40,8 +40,8 @@ def test_measured_levels_are_returned_and_shift_the_prediction_elsewhere() -> No
 def test_a_level_that_was_not_reached_is_a_lower_bound(measured: float, expected: float) -> None:
     ear = Audiogram({1000: 40}, ucl={1000: measured})
     assert ear.uncomfortable_levels([1000.0]) == (expected,)
-    deaf = Audiogram({1000: 120}, ucl={1000: measured})  # 119.5 dB HL are predicted
-    assert deaf.uncomfortable_levels([1000.0]) == (max(measured, 119.5) if measured > 114 else 114,)
+    deaf = Audiogram({1000: 110}, ucl={1000: measured})  # 116.9 dB HL are predicted
+    assert deaf.uncomfortable_levels([1000.0]) == (max(measured, 116.9) if measured > 114 else 114,)
 
 
 def test_an_ear_keeps_its_levels_wherever_it_goes() -> None:
@@ -98,6 +98,8 @@ def test_a_series_may_have_uncomfortable_levels() -> None:
 def test_bad_levels_are_rejected(ucl: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Audiogram({500: 20}, ucl=ucl)
+    with pytest.raises(ValueError, match="got 60 dB HL at 500 Hz, where the threshold is 70 dB HL"):
+        Audiogram({250: 50, 1000: 90}, ucl={500: 60})
     assert Audiogram({500: 20}, ucl={500: None, 1000: float("nan")}) == Audiogram({500: 20})
 
 

@@ -57,6 +57,8 @@ def test_arrays_give_arrays_and_longer_noise_is_cut() -> None:
         ({"noise": torch.ones(2, 1000)}, "repeat short noise"),
         ({"channels": True}, "leave out channels for a single channel"),
         ({"noise": torch.zeros(1000)}, "expected noise, got silence"),
+        ({"noise": torch.ones(1000, dtype=torch.complex64)}, "expected noise to be a floating"),
+        ({"speech": torch.ones(1000, dtype=torch.int16)}, "expected speech to be a floating"),
         ({"noise": torch.full((1000,), torch.inf)}, "noise has samples that are NaN"),
         ({"speech": torch.full((1000,), torch.nan)}, "speech has samples that are NaN"),
         ({"snr": float("nan")}, "expected an SNR in dB"),
