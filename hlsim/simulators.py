@@ -218,8 +218,8 @@ def load_simulator(
             spectral smearing; ``"attenuation"``, a linear ear; the name of a checkpoint that ships
             with hlsim, such as ``"neuro-msbg"``, or the folder of a checkpoint;
             ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
-            (``PluginSimulator``); or a module, which is returned. If a module has an attribute
-            ``sample_rate``, ``full_scale_spl`` or ``aligned``, it is validated.
+            (``PluginSimulator``); or a module, which is set to evaluation mode. If a module has an
+            attribute ``sample_rate``, ``full_scale_spl`` or ``aligned``, it is validated.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
@@ -233,7 +233,7 @@ def load_simulator(
     if isinstance(simulator, nn.Module):
         settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "aligned": True}
         check_attributes(simulator, "a simulator", **settings)
-        return simulator
+        return simulator.eval()
     name = str(simulator)
     if name in BUILT_IN:
         return BUILT_IN[name](sample_rate=sample_rate, full_scale_spl=full_scale_spl)

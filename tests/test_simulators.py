@@ -170,6 +170,18 @@ def test_a_simulator_that_changes_its_arguments_changes_nothing_of_the_caller(pl
     assert torch.equal(clean, before) and float(ear.mean()) == 40.0
 
 
+def test_a_module_is_set_to_evaluation_mode() -> None:
+    class Dropping(torch.nn.Dropout):
+        def forward(self, waveform: torch.Tensor, audiogram: object) -> torch.Tensor:
+            return super().forward(waveform)
+
+    clean = torch.linspace(0.01, 0.02, 8000)
+    assert torch.equal(hlsim.simulate(clean, "N3", simulator=Dropping(0.5)), clean)
+    aid = Dropping(0.5)
+    hlsim.reception_threshold("NH", aid, simulator="attenuation", triplets=30)
+    assert not aid.training
+
+
 def test_unknown_names_and_modules_of_another_rate_are_rejected() -> None:
     with pytest.raises(ValueError, match="pyclarty"):
         load_simulator("pyclarty")

@@ -206,6 +206,7 @@ def test_sliders_reach_the_aid() -> None:
         ({"aid": NALR(full_scale_spl=100.0)}, "an aid with full_scale_spl=94"),
         ({"aid": lambda x, _: x[..., :-1]}, "return as many samples"),
         ({"aid": lambda x, _: x * float("nan")}, "without NaN"),
+        ({"aid": lambda x, _: (32767 * x).short()}, "floating-point samples .* got torch.int16"),
     ],
 )
 def test_invalid_arguments_are_rejected(settings: dict[str, Any], words: str) -> None:

@@ -227,11 +227,12 @@ def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) ->
     inputs = signals[portion]
     outputs = aid(inputs, ear)
     expected = len(inputs), inputs.shape[-1]
-    if outputs.shape != expected or not bool(outputs.isfinite().all()):
+    is_finite = outputs.is_floating_point() and bool(outputs.isfinite().all())
+    if outputs.shape != expected or not is_finite:
         raise ValueError(
-            f"expected the aid to return finite samples of shape {expected}, "
-            f"got shape {tuple(outputs.shape)}; return as many samples as the input has, "
-            "without NaN or infinity"
+            f"expected the aid to return finite floating-point samples of shape {expected}, "
+            f"got {outputs.dtype} of shape {tuple(outputs.shape)}; return as many samples as the "
+            "input has, without NaN or infinity"
         )
     return outputs
 
@@ -259,7 +260,8 @@ def reception_threshold(
         audiogram: One or more ears. The results have their shape: numbers for one ear, (batch,) for
             a list of ears, (2,) for a ``Listener``, whose better ear has the lower threshold.
         aid: Name or folder of an aid, as in ``load_compensator``, or a function of signals in
-            pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL; None for no aid.
+            pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL; None for no aid. A module
+            is set to evaluation mode.
         simulator: Simulator of the hearing loss, as in ``load_simulator``.
         listener: Name of the shipped listener, or the folder of another one
             (examples/train_digit_listener.py).
@@ -296,6 +298,8 @@ def reception_threshold(
         function = load_compensator(aid) if isinstance(aid, str | Path) else aid
         settings = {"sample_rate": NEURO_RATE, "full_scale_spl": PASCAL_SPL}
         check_attributes(function, "an aid", **settings)
+        if isinstance(function, nn.Module):
+            function.eval()
         aids.append(partial(function, **sliders))
     test = DigitTest.draw(
         triplets, simulator=simulator, listener=listener, noise_spl=noise_spl, seed=seed
