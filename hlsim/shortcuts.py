@@ -250,7 +250,8 @@ def _as_finite_tensor(audio: Samples) -> Tensor:
     """Convert samples to a tensor, and reject NaN and infinity.
 
     Raises:
-        ValueError: A sample is NaN or infinite.
+        ValueError: The samples are not those of a tensor or of an array of floating-point numbers,
+            or one is NaN or infinite.
     """
     samples = as_samples(audio)
     check_finite(samples, "audio")

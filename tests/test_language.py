@@ -110,6 +110,18 @@ def _names_bound_by(node: ast.AST) -> Iterator[str]:
         yield node.name
 
 
+def test_docstrings_name_the_error_of_a_missing_extra() -> None:
+    silent = []
+    for path in sorted((ROOT / "hlsim").rglob("*.py")):
+        functions = [n for n in ast.walk(ast.parse(path.read_text())) if type(n) is ast.FunctionDef]
+        for function in functions:
+            names = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
+            docstring = ast.get_docstring(function)
+            if "require" in names and docstring and "MissingExtraError" not in docstring:
+                silent.append(f"{path.name}:{function.lineno} {function.name}")
+    assert silent == []
+
+
 def finished_files() -> list[Path]:
     files = {path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
     return sorted(files - {ROOT / name for name in UNFINISHED})

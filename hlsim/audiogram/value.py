@@ -522,10 +522,10 @@ def _check_remark(text: str, column: str) -> None:
 
 
 def _parse_level(text: str, column: str, lowest: float, highest: float) -> float:
-    """Convert the text of a threshold in dB HL, which may have a decimal comma, into a number.
+    """Convert the text of a threshold or an uncomfortable level in dB HL into a number.
 
     Args:
-        text: Text to convert.
+        text: Text to convert, which may have a decimal comma.
         column: Name of the column, for the message.
         lowest: Lowest level allowed, in dB HL.
         highest: Highest level allowed, in dB HL.

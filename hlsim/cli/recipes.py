@@ -95,6 +95,7 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
     Raises:
         ValueError: The file cannot be read, or a setting is unknown, invalid or given twice.
         OSError: There is no such file.
+        MissingExtraError: jsonargparse or PyYAML is not installed, and there are settings.
     """
     arguments = [*settings] if file is None else [f"--recipe={file}", *settings]
     if not arguments:
@@ -120,7 +121,8 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
 def _reject_repeated_keys(text: str) -> None:
     """Raise ValueError if a mapping in a YAML text has a key twice, of which the last would count.
 
-    A text that is not valid YAML passes, because jsonargparse rejects it.
+    A text that is not valid YAML passes, because jsonargparse rejects it. Without PyYAML, the error
+    is MissingExtraError.
     """
     yaml: Any = require("yaml", "train")
 

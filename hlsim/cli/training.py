@@ -102,7 +102,7 @@ def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
     They are the data and the settings that both functions have.
 
     Raises:
-        ValueError: There is a root without a manifest.
+        ValueError: There is a root without a manifest, or the manifest is not valid.
     """
     from hlsim.training.batches import TrainingData
 

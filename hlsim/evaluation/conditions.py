@@ -288,6 +288,9 @@ class Enhanced(nn.Module):
         """Enhance the waveform, and return the aid's output for the enhanced signal.
 
         Shape: (..., time) -> (..., time).
+
+        Raises:
+            ValueError: The enhancer fails, or returns a signal of another shape, NaN or infinity.
         """
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
         aided: Tensor = self.aid(enhanced, ear)

@@ -315,7 +315,8 @@ def _files_by_name(folder: str | Path) -> dict[str, Path]:
     """Return the audio files of a folder, by their path below it without extension.
 
     Raises:
-        ValueError: Two files differ only in their extension.
+        ValueError: There is no such folder, it contains no audio, or two files differ only in their
+            extension.
     """
     files: dict[str, Path] = {}
     for path in find_audio(folder, by_name=True):

@@ -165,7 +165,7 @@ def _assign_rates(
 
     Returns:
         For each group of neighbouring channels with the same choice: their indices, the number of
-        samples per step, and the detector.
+        samples per step, and the detector (see ``RateBand``).
     """
     centre_hz = np.array(bank.centre_frequencies)
     top_hz = centre_hz + _BANDWIDTHS_ABOVE_CENTRE * bank.broadening * erb(centre_hz)

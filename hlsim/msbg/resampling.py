@@ -208,6 +208,8 @@ def _rate_ratio(rate: int, rate_divisor: int) -> tuple[int, int]:
 def _fft_lengths(samples: int, up: int, down: int) -> tuple[int, int]:
     """Return FFT lengths at the outer and at the inner rate that span the same time.
 
+    The outer rate is that of input and output, the inner one that of the model.
+
     Args:
         samples: Smallest length at the outer rate.
         up: Inner rate, in the same unit as ``down``.

@@ -207,6 +207,6 @@ class NeuroConfig(NetworkConfig):
 
     @property
     def receptive_field(self) -> int | None:
-        """Receptive field as in ``NetworkConfig``, but None unless the network is level-aware."""
+        """Receptive field in samples, see ``NetworkConfig``; None if ``level_aware`` is False."""
         # The scale of a normalised network depends on the whole signal.
         return super().receptive_field if self.level_aware else None

@@ -197,7 +197,7 @@ def _details(evaluation: Evaluation) -> Section:
 
 
 def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Return one picture per ear and aid, with the gains of the aid and of the rival."""
+    """Return one picture per ear and aid, also of WDRC, with the gains of the aid and the rival."""
     colours = condition_colours(evaluation.conditions)
     curves = evaluation.details["gain_curves"]
     rival = evaluation.settings["rival"]

@@ -64,6 +64,9 @@ class Table:
     def text(self) -> str:
         """Return the table as text for a terminal, without caption and title of the first column.
 
+        Raises:
+            MissingExtraError: pandas is not installed.
+
         >>> print(Table("Scores", ("Aid", "HASPI"), [("none", "0.27"), ("NAL-R", "0.9")]).text())
               HASPI
         none   0.27
@@ -312,7 +315,11 @@ def _find_pictures(sections: Sequence[Section]) -> Iterator[Picture]:
 
 @cache
 def _environment() -> Any:
-    """Return jinja2's environment with the templates and the script of the players."""
+    """Return jinja2's environment with the templates and the script of the players.
+
+    Raises:
+        MissingExtraError: jinja2 is not installed.
+    """
     jinja2 = require("jinja2", "eval")
     loader = jinja2.FileSystemLoader(_TEMPLATES)
     environment = jinja2.Environment(

@@ -220,6 +220,9 @@ def _spectrogram_png(levels: Tensor) -> bytes:
 
     Args:
         levels: Levels in dB SPL. Shape: (bins, frames).
+
+    Raises:
+        MissingExtraError: Pillow or matplotlib is not installed.
     """
     image = require("PIL.Image", "eval")
     colours = require("matplotlib.colors", "eval").LinearSegmentedColormap

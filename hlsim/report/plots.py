@@ -91,7 +91,11 @@ def _draw_picture(
 
 
 def _draw_svg(draw: Callable[[Any], None], height: float) -> bytes:
-    """Return the contents of an SVG file, see ``_draw_picture``."""
+    """Return the contents of an SVG file, see ``_draw_picture``.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
     figures = require("matplotlib.figure", "eval")
     data = io.BytesIO()
     matplotlib = require("matplotlib", "eval")

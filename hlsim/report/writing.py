@@ -70,6 +70,9 @@ def scores_table(evaluation: Evaluation) -> DataFrame:
     Args:
         evaluation: Evaluation with the table.
 
+    Raises:
+        MissingExtraError: pandas is not installed.
+
     >>> import pandas
     >>> row = {"item": 0, "condition": "aid", "audiogram": [20.0] * 8, "haspi": 0.5}
     >>> list(scores_table(Evaluation([], [], [], pandas.DataFrame([row]))))[-2:]

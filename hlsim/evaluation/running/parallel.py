@@ -136,6 +136,7 @@ def _connect(scheduler: str) -> Any:
 
     Raises:
         ValueError: No scheduler answers.
+        MissingExtraError: distributed is not installed.
     """
     distributed = require("distributed", "cluster")
     try:

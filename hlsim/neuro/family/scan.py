@@ -113,9 +113,10 @@ def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Ten
 
 
 class _SelectiveScan(torch.autograd.Function):
-    """The selective scan with its gradient, which computes the states again, not storing them.
+    """The product C[t] h[t] of ``selective_scan``, whose gradient computes the states h again.
 
-    Channels are the last dimension, so that each step of the recurrence works on whole rows.
+    The step sizes ``delta`` are those after the softplus. Channels are the last dimension, so that
+    each step of the recurrence works on whole rows.
 
     Shape: (items, time, channels) for delta and u, (items, time, states) for B and C, (states,
         channels) for A -> (items, time, channels).
@@ -208,7 +209,7 @@ def _kernel_for(u: Tensor) -> Callable[..., Any] | None:
 
 @cache
 def _kernel() -> Callable[..., Any] | None:
-    """Import the scan of ``mamba_ssm``; None if it or its compiled kernel is not installed."""
+    """Return the selective scan of ``mamba_ssm``, or None if it or its kernel is not installed."""
     try:
         from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
     except Exception:  # because a build for another torch or GPU may raise anything
