@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import scipy
 import torch
 from torch import Tensor, nn
 
@@ -174,7 +172,7 @@ def _fidelity_to(teacher_name: str) -> Measure:
     return Measure("fidelity", compute, packages, settings, uses_facts=False, scores=always)
 
 
-def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
+def agreement(rows: DataFrame, score: str) -> dict[str, float]:
     """Compute how well scores of a simulator's outputs agree with those of the teacher's outputs.
 
     Args:
@@ -183,7 +181,7 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
 
     Returns:
         Linear correlation ``lcc``, rank correlation ``srcc`` and mean squared difference ``mse``,
-        by name; None where they are not defined.
+        by name; NaN where they are not defined.
 
     >>> import pandas
     >>> rows = pandas.DataFrame({"stoi_teacher": [0.1, 0.5], "stoi_simulator": [0.2, 0.6]})
@@ -191,12 +189,12 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
     1.0
     """
     columns = [f"{score}_teacher", f"{score}_simulator"]
-    x, y = rows.reindex(columns=columns).astype(float).dropna().to_numpy().T
-    is_defined = len(x) >= 2 and np.ptp(x) > 0.0 and np.ptp(y) > 0.0
+    scores = rows.reindex(columns=columns).astype(float)
+    difference = scores[columns[0]] - scores[columns[1]]
     return {
-        "lcc": float(scipy.stats.pearsonr(x, y)[0]) if is_defined else None,
-        "srcc": float(scipy.stats.spearmanr(x, y)[0]) if is_defined else None,
-        "mse": float(np.mean((x - y) ** 2)) if len(x) else None,
+        "lcc": scores.corr().iloc[0, 1],
+        "srcc": scores.corr(method="spearman").iloc[0, 1],
+        "mse": (difference**2).mean(),
     }
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float | None]:
+def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float]:
     """Return a function that computes a statistic of ``agreement`` from the rows of a simulator.
 
     Args:
