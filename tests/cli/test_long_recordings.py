@@ -70,7 +70,7 @@ import numpy as np, soundfile
 import compensators, hlsim.simulators
 from hlsim.cli.main import main
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-rate, minutes, command = int(sys.argv[2]), 5, sys.argv[3:]
+rate, minutes, command = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
 noise = 0.01 * np.random.default_rng(0).standard_normal((60 * rate, 2), dtype=np.float32)
 with soundfile.SoundFile(sys.argv[1] + "/in.wav", "w", rate, 2, "PCM_16") as file:
     for _ in range(minutes):
@@ -85,17 +85,21 @@ print(before, peak() - before)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "command",
+    ("minutes", "rate", "command"),
     [
-        "16000 simulate --audiogram N3 --spl 65",
-        "48000 simulate --audiogram N3 --simulator neuro-msbg",
-        "16000 compensate --audiogram N3 --no-clipping",
-        "48000 compensate --audiogram N3 --compensator wdrc",
-        "48000 compensate --audiogram N3 --compensator nalr --spl 100 --no-clipping",
+        (2, 16000, "simulate --audiogram N3 --spl 65"),
+        (2, 48000, "simulate --audiogram N3 --simulator neuro-msbg"),
+        (5, 16000, "compensate --audiogram N3 --no-clipping"),
+        (2, 48000, "compensate --audiogram N3 --compensator wdrc"),
+        (5, 48000, "compensate --audiogram N3 --compensator nalr --spl 100 --no-clipping"),
     ],
 )
-def test_memory_does_not_grow_with_the_recording(tmp_path: Path, command: str) -> None:
-    call = [sys.executable, "-c", LONG_RECORDING, str(tmp_path), *command.split()]
+def test_memory_does_not_grow_with_the_recording(
+    tmp_path: Path, minutes: int, rate: int, command: str
+) -> None:
+    """A whole recording of so many minutes would take more than the limit."""
+    script = [sys.executable, "-c", LONG_RECORDING, str(tmp_path)]
+    call = [*script, str(rate), str(minutes), *command.split()]
     ended = subprocess.run(call, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr[-2000:]
     # Imports take 200 MB with a torch for CPUs, and 500 MB with one for GPUs.
