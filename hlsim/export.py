@@ -291,7 +291,16 @@ def _fit(aid: Wearable, thresholds: Tensor) -> dict[str, Tensor]:
 
 
 def _process_hops(aid: Wearable, **inputs: Tensor) -> dict[str, Tensor]:
-    """Call ``Wearable.process_hops`` with the inputs of a program, and limit the output."""
+    """Call ``Wearable.process_hops`` with the inputs of a program, and limit the output.
+
+    Args:
+        aid: Aid of the program.
+        inputs: Tensors of ``first_inputs``, with any samples and state.
+
+    Returns:
+        The output, (items, time), on the scale of the samples, and each tensor of the state after
+        the hops, under its name with the prefix ``next_``.
+    """
     gain = gain_to_pascals(aid.full_scale_spl)
     empty = inputs["samples"][:, :0]
     sliders = inputs.get("sliders", empty)
@@ -314,7 +323,7 @@ def _to_program(
 
 
 def _draw_noise(model: Any, *shape: int) -> Tensor:
-    """Draw noise at 64 dB SPL, on the model's scale, with which a model's file is validated."""
+    """Draw noise of some shape at 64 dB SPL, on the model's scale, to validate a model's file."""
     gain = gain_to_pascals(model.full_scale_spl)
     return 0.03 / gain * torch.randn(*shape, generator=torch.Generator().manual_seed(0))
 

@@ -286,7 +286,7 @@ def _profound_corrections() -> list[list[float]]:
 def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
     """Return the level of 0 dB HL in dB SPL at some frequencies in Hz, in a free field.
 
-    It is interpolated linearly over frequency.
+    It is interpolated linearly over frequency. Shape: (points,).
     """
     return np.interp(
         points, list(FREE_FIELD_THRESHOLD_SPL), list(FREE_FIELD_THRESHOLD_SPL.values())
@@ -297,7 +297,7 @@ def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
 def _cambridge_intercepts(points: Frequencies) -> NDArray[np.float64]:
     """Return the constants in dB of the Cambridge formula at some frequencies in Hz.
 
-    They are interpolated over log frequency.
+    They are interpolated over log frequency. Shape: (points,).
     """
     grid = np.log(list(CAMBRIDGE_INTERCEPTS))
     lowest = min(CAMBRIDGE_INTERCEPTS)

@@ -199,7 +199,10 @@ class Audiogram:
         return tuple(round(level, 6) for level in levels)
 
     def _interpolate(self, frequencies: Sequence[float]) -> NDArray[np.float64]:
-        """Interpolate the thresholds linearly over log frequency, constant beyond the ends."""
+        """Interpolate the thresholds linearly over log frequency, constant beyond the ends.
+
+        Returns: Thresholds in dB HL, one for each of ``frequencies``.
+        """
         values = np.interp(np.log(frequencies), np.log(self.frequencies), self.levels)
         return np.asarray(values)
 

@@ -225,7 +225,7 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
 
 
 def _read_noise(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
-    """Return noisy minus clean speech, with the arguments of ``read_noisy``.
+    """Return noisy minus clean speech, (channels, samples), with the arguments of ``read_noisy``.
 
     Raises:
         ValueError: The noisy speech cannot be read, or does not contain the clean speech.

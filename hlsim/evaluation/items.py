@@ -280,7 +280,7 @@ def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float,
 
 
 def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor, float]:
-    """Add noise to speech at an SNR in dB, and return both the sum and the SNR.
+    """Add noise to speech at an SNR in dB, (time,) each, and return both the sum and the SNR.
 
     Without noise (None), return the speech and NaN.
     """

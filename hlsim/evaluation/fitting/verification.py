@@ -80,7 +80,7 @@ class Verification:
 
     @property
     def gains(self) -> Array:
-        """Insertion gains in dB: each percentile of the output minus that of the input."""
+        """Insertion gains in dB, (3, 18): each percentile of the output minus that of the input."""
         return self.output_levels - self.input_levels
 
     def rows(self) -> list[dict[str, float]]:

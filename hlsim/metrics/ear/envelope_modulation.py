@@ -246,7 +246,10 @@ def _points(frames: int) -> int:
 
 
 def _filters() -> list[NDArray[np.float64]]:
-    """Return the taps of the ten modulation filters: a Hann window, then Hann-windowed cosines."""
+    """Return the taps of the ten modulation filters: a Hann window, then Hann-windowed cosines.
+
+    Each filter has an odd number of taps, (taps,), and is centred on the middle one.
+    """
     filters = []
     for k, rate in enumerate(RATES):
         seconds = MAX_FILTER_SECONDS if k < 2 else MAX_FILTER_SECONDS * RATES[2] / rate

@@ -84,7 +84,7 @@ On a CPU they fit into its caches. On a GPU they take 128 MB per tensor in float
 
 @constant
 def centre_frequencies() -> NDArray[np.float64]:
-    """Return the centre frequencies of the 32 channels in Hz, evenly spaced on the ERB scale.
+    """Return the centre frequencies of all channels in Hz, (32,), evenly spaced on the ERB scale.
 
     >>> centre_frequencies()[[0, -1]].round()
     array([  80., 8000.])
