@@ -1,7 +1,7 @@
 """Settings of the two trainable compensators, which a checkpoint stores as JSON."""
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from hlsim.checks import check_number
 from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
@@ -103,3 +103,37 @@ class HearingAidConfig(ModelConfig):
         for name in ("release", "closing"):
             check_number(name, getattr(self, name), 0.01, 2.0)
         check_number("limit_spl", self.limit_spl, 60.0, 140.0)
+
+
+@dataclass(frozen=True)
+class BeamformerConfig(ModelConfig):
+    """Settings of a ``BeamformingAid``, an ``AdaptiveBeamformer`` before a ``HearingAid``.
+
+    Attributes:
+        bands: Number of bands, 4 to 40, as in ``HearingAidConfig``.
+        hidden: Width of the two layers of the network.
+        seconds: Time constant of the averages in seconds.
+        loading: Loading of the fixed beams, see ``BinauralMVDR``.
+        spacing: Distance between the two microphones of a side in m.
+        aid: Settings of the hearing aid, by the names of ``HearingAidConfig``.
+
+    Raises:
+        ValueError: A value is out of range.
+
+    >>> BeamformerConfig(bands=12).hidden
+    64
+    """
+
+    bands: int = 20
+    hidden: int = 64
+    seconds: float = 0.06
+    loading: float = 1e-4
+    spacing: float = 0.01
+    aid: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_number("bands", self.bands, 4, 40, whole=True)
+        check_number("hidden", self.hidden, 1, 512, whole=True)
+        check_number("seconds", self.seconds, 0.01, 2.0)
+        check_number("loading", self.loading, 1e-6, 1.0)
+        check_number("spacing", self.spacing, 0.002, 0.1)

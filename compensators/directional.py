@@ -19,13 +19,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators.smoothing import exponential_average
-from compensators.wearable import State
+from compensators.wearable import State, Stream
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_attributes, check_number, check_rate, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
-from hlsim.torchtools import compute_once
+from hlsim.torchtools import Audio, as_samples, as_type_of, compute_once
 
 LOOK_AHEAD = 0.001
 """Look-ahead of the filters in seconds."""
@@ -45,6 +45,9 @@ _NOISE_DIRECTIONS = 200
 
 _DISTORTION_WEIGHT = 1e3
 """Weight of the power of the error of sound from the front, relative to that of diffuse noise."""
+
+_LOWEST_BLOCKED = 100.0
+"""Frequency in Hz at which the cardioids of ``front_blocking_taps`` are 3 dB softer."""
 
 _POWER_FLOOR = 1e-12
 """Power in Pa^2, about -26 dB SPL, that is added to denominators."""
@@ -83,11 +86,11 @@ class FilterAndSum(nn.Module):
         self.latency = look_ahead
         self.register_buffer("taps", torch.as_tensor(taps).float())
 
-    def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+    def forward(self, waveform: Audio, audiogram: AudiogramLike | None = None) -> Audio:
         """Return the output for whole signals, time-aligned with the front microphones.
 
         Args:
-            waveform: Signals of the microphones.
+            waveform: Signals of the microphones, a tensor or an array, as is the output.
             audiogram: Ignored, so that the module can be called as an aid.
 
         Shape: (..., microphones, ears, time) -> (..., ears, time).
@@ -95,9 +98,11 @@ class FilterAndSum(nn.Module):
         Raises:
             ValueError: The waveform has another number of microphones or ears.
         """
-        self.check_microphones(waveform)
-        padded = functional.pad(waveform, (0, self.latency))
-        return self.process(padded, self.initial_state(waveform))[0][..., self.latency :]
+        signals = as_samples(waveform)
+        self.check_microphones(signals)
+        padded = functional.pad(signals, (0, self.latency))
+        output, _ = self.process(padded, self.initial_state(signals))
+        return as_type_of(waveform, output[..., self.latency :])
 
     def check_microphones(self, waveform: Tensor) -> None:
         """Raise ValueError unless a waveform has as many microphones and ears as the filters."""
@@ -164,41 +169,63 @@ class FilterAndSum(nn.Module):
 class MicrophoneStream:
     """A front end for signals that arrive in chunks: a function from a chunk to the next output.
 
-    The output is that for the whole signal, delayed by ``front_end.latency`` samples, without
-    gradients.
+    The output is that for the whole signal, delayed by ``latency`` samples, without gradients.
 
     Args:
         front_end: Front end with ``process`` and ``initial_state``.
+        aid: Stream of the aid behind the front end; None for the front end alone.
+
+    Attributes:
+        aid: Stream of the aid, whose sliders ``aid.set`` moves.
 
     >>> stream = DifferentialMicrophone().stream()
     >>> stream(torch.zeros(2, 2, 100)).shape
     torch.Size([2, 100])
     """
 
-    def __init__(self, front_end: FilterAndSum) -> None:
+    def __init__(self, front_end: FilterAndSum, aid: Stream | None = None) -> None:
+        self.aid = aid
         self._front_end = front_end
         self._state: State | None = None
-        self._shape = torch.Size()
+        self._zero: Tensor = torch.empty(0)
 
     @torch.no_grad()
-    def __call__(self, chunk: Tensor) -> Tensor:
+    def __call__(self, chunk: Audio) -> Audio:
         """Return the next output. Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
             ValueError: The chunk has another number of microphones or ears, or other leading
                 dimensions than the first one.
         """
-        self._front_end.check_microphones(chunk)
+        signals = as_samples(chunk)
+        self._front_end.check_microphones(signals)
+        shape = self._zero.shape[:-1]
         if self._state is None:
-            self._state = self._front_end.initial_state(chunk)
-            self._shape = chunk.shape[:-1]
-        elif chunk.shape[:-1] != self._shape:
+            self._state = self._front_end.initial_state(signals)
+            self._zero = torch.zeros_like(signals[..., :1])
+        elif signals.shape[:-1] != shape:
             raise ValueError(
-                f"expected a chunk of shape {(*self._shape, 'time')} as before, got "
-                f"{tuple(chunk.shape)}; begin another stream for signals of another shape"
+                f"expected a chunk of shape {(*shape, 'time')} as before, got "
+                f"{tuple(signals.shape)}; call flush before a signal of another shape"
             )
-        output, self._state = self._front_end.process(chunk, self._state)
-        return output
+        output, self._state = self._front_end.process(signals, self._state)
+        return as_type_of(chunk, output if self.aid is None else self.aid(output))
+
+    def flush(self) -> Tensor:
+        """Return the end of the output, which is still missing because of the delay.
+
+        The next chunk is then the beginning of another signal.
+
+        Shape: -> (..., ears, latency).
+
+        Raises:
+            ValueError: There was no chunk since the beginning of the signal.
+        """
+        if self._state is None:
+            raise ValueError("expected a chunk before flush, got none; there is nothing to return")
+        rest = self(self._zero.expand(*self._zero.shape[:-1], self._front_end.latency))
+        self._state = None
+        return rest if self.aid is None else torch.cat((rest, self.aid.flush()), -1)
 
 
 class DifferentialMicrophone(FilterAndSum):
@@ -343,6 +370,9 @@ class DirectionalAid(nn.Module):
 
     takes_microphones = True
 
+    front_end: FilterAndSum
+    aid: Any
+
     def __init__(self, front_end: FilterAndSum, aid: nn.Module) -> None:
         super().__init__()
         if not isinstance(aid, nn.Module):
@@ -369,6 +399,26 @@ class DirectionalAid(nn.Module):
         """
         output: Tensor = self.aid(self.front_end(waveform), audiogram, **sliders)
         return output
+
+    @property
+    def latency(self) -> int:
+        """Delay of streams in samples, that of the front end and that of the aid."""
+        return self.front_end.latency + int(self.aid.latency)
+
+    def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> MicrophoneStream:
+        """Return a stream, which processes signals that arrive in chunks.
+
+        The gains of the aid change at other times than for the whole signal, because the front end
+        delays its input.
+
+        Args:
+            audiogram: Ears of the listener, by default those of the aid.
+            sliders: Values of the aid's sliders, see the ``stream`` of the aid.
+
+        Raises:
+            ValueError: The aid has no streams, or rejects an ear or a slider.
+        """
+        return MicrophoneStream(self.front_end, self.aid.stream(audiogram, **sliders))
 
 
 def look_ahead_samples(sample_rate: int) -> int:
@@ -416,6 +466,14 @@ def differential_taps(
     >>> differential_taps(delay=1.0, spacing=0.01, lowest=200.0, sample_rate=16000).shape
     (2, 144)
     """
+    return _impulse_responses(
+        differential_responses(delay, spacing, lowest, sample_rate), sample_rate
+    )
+
+
+def differential_responses(
+    delay: float, spacing: float, lowest: float, sample_rate: int
+) -> NDArray[np.complex128]:
     omega = 2.0 * np.pi * design_frequencies(sample_rate)
     travel = spacing / SPEED_OF_SOUND
     # Sound from the front passes the pair in the travel time, and is then delayed once more.
@@ -423,22 +481,24 @@ def differential_taps(
     decay = np.exp(-2.0 * np.pi * lowest * total)
     front = 0.5 * (1.0 + decay) / (1.0 - decay * np.exp(-1j * omega * total))
     rear = -front * np.exp(-1j * omega * travel * delay)
-    return _impulse_responses(np.stack((front, rear)), sample_rate)
+    return np.stack((front, rear))
 
 
 @compute_once
-def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.float64]:
+def mvdr_taps(
+    loading: float, spacing: float, sample_rate: int, before: int | None = None
+) -> NDArray[np.float64]:
     """Design the filters of ``BinauralMVDR`` by least squares over their coefficients (Frost 1972).
 
     Args:
         loading: Power of each microphone's own noise, relative to the diffuse noise.
         spacing: Distance between the microphones of a side in m.
         sample_rate: Sample rate in Hz.
+        before: Number of samples before time 0, by default ``look_ahead_samples(sample_rate)``.
 
     Returns:
         Impulse responses from each microphone to each ear of the output, (ears of the output,
-        microphones, ears of the microphones, length): front microphone first, left ear first. The
-        first ``look_ahead_samples(sample_rate)`` samples lie before time 0.
+        microphones, ears of the microphones, length): front microphone first, left ear first.
 
     >>> mvdr_taps(loading=1e-4, spacing=0.01, sample_rate=16000).shape
     (2, 2, 2, 144)
@@ -450,7 +510,7 @@ def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.fl
     covariance = np.einsum("dif,djf->ijf", noise, noise.conj()) / _NOISE_DIRECTIONS
     covariance += loading * np.eye(4)[..., None]
     covariance += _DISTORTION_WEIGHT * front[:, None] * front.conj()
-    before = look_ahead_samples(sample_rate)
+    before = look_ahead_samples(sample_rate) if before is None else before
     length = filter_length(sample_rate)
     lags = np.arange(length) - np.arange(length)[:, None]
     matrix = np.fft.irfft(covariance)[..., lags]
@@ -462,7 +522,49 @@ def mvdr_taps(loading: float, spacing: float, sample_rate: int) -> NDArray[np.fl
     return np.asarray(taps, dtype=np.float64).reshape(2, 2, 2, length)
 
 
-def _impulse_responses(responses: NDArray[np.complex128], sample_rate: int) -> NDArray[np.float64]:
+def front_blocking_taps(
+    beams: NDArray[np.float64], spacing: float, before: int
+) -> NDArray[np.float64]:
+    """Design filters at 16 kHz from whose outputs sound from the front is removed.
+
+    They are, at each side, a cardioid to the rear, and the difference of the beam and a cardioid to
+    the front. Both have exact nulls in front of a sphere.
+
+    Args:
+        beams: Impulse responses of beams to the front, from ``mvdr_taps``.
+        spacing: Distance between the microphones of a side in m.
+        before: Number of samples of the beams before time 0.
+
+    Returns:
+        Impulse responses, (2, ears of the output, microphones, ears, length), twice as long as the
+        beams.
+
+    >>> front_blocking_taps(np.zeros((2, 2, 2, 144)), 0.01, 8).shape
+    (2, 2, 2, 2, 288)
+    """
+    length = 2 * beams.shape[-1]
+    frequencies = design_frequencies(NEURO_RATE)
+    points = 2 * (len(frequencies) - 1)
+    front = head_responses(unit_vectors([0.0]), frequencies, spacing)[0, :, 0]
+    path = front[1] / front[0]
+    cardioid = differential_responses(1.0, spacing, _LOWEST_BLOCKED, NEURO_RATE)
+    to_rear = np.stack((-cardioid[0] * path, cardioid[0]))
+    passed = cardioid[0] + cardioid[1] * path
+    to_front = _impulse_responses(cardioid, NEURO_RATE, before, length)
+    taps = np.zeros((2, 2, 2, 2, length))
+    taps[1] = _impulse_responses(np.fft.rfft(beams, points) * passed, NEURO_RATE, 0, length)
+    for ear in range(2):
+        taps[0, ear, :, ear] = _impulse_responses(to_rear, NEURO_RATE, before, length)
+        taps[1, ear, :, ear] -= to_front
+    return taps
+
+
+def _impulse_responses(
+    responses: NDArray[np.complex128],
+    sample_rate: int,
+    before: int | None = None,
+    length: int | None = None,
+) -> NDArray[np.float64]:
     """Convert frequency responses to impulse responses that begin ``LOOK_AHEAD`` before time 0.
 
     The highest eighth of the frequencies fades out, so that little of the responses lies before.
@@ -474,5 +576,5 @@ def _impulse_responses(responses: NDArray[np.complex128], sample_rate: int) -> N
     fade = np.ones(bins)
     fade[-fade_bins:] = np.cos(np.linspace(0.0, 0.5 * np.pi, fade_bins)) ** 2
     impulses = np.fft.irfft(responses * fade)
-    before = look_ahead_samples(sample_rate)
-    return np.roll(impulses, before, -1)[..., : filter_length(sample_rate)]
+    before = look_ahead_samples(sample_rate) if before is None else before
+    return np.roll(impulses, before, -1)[..., : length or filter_length(sample_rate)]

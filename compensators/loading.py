@@ -4,7 +4,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from compensators.config import HearingAidConfig, MappingConfig
+from compensators.beamformer import BeamformingAid
+from compensators.config import BeamformerConfig, HearingAidConfig, MappingConfig
 from compensators.hearing_aid import HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR, NALRP
@@ -14,10 +15,12 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record
 
-Trained = MappingCompensator | HearingAid
+Trained = MappingCompensator | HearingAid | BeamformingAid
 
-CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
-    kind.kind: kind.config_class for kind in (MappingCompensator, HearingAid)
+Config = MappingConfig | HearingAidConfig | BeamformerConfig
+
+CONFIGS: dict[str, type[Config]] = {
+    kind.kind: kind.config_class for kind in (MappingCompensator, HearingAid, BeamformingAid)
 }
 """Class of the settings of each kind of compensator, by the name of the kind in ``config.json``."""
 
@@ -30,7 +33,7 @@ UNTRAINED: dict[str, type[NALR | WDRC]] = {
 """Compensators without a checkpoint."""
 
 
-def build_compensator(config: MappingConfig | HearingAidConfig, **levels: Any) -> Trained:
+def build_compensator(config: Config, **levels: Any) -> Trained:
     """Build an untrained compensator from its settings.
 
     Args:
@@ -40,6 +43,8 @@ def build_compensator(config: MappingConfig | HearingAidConfig, **levels: Any) -
     >>> build_compensator(HearingAidConfig(bands=12)).bands
     12
     """
+    if isinstance(config, BeamformerConfig):
+        return BeamformingAid(config=config, **levels)
     if isinstance(config, HearingAidConfig):
         return HearingAid(config=config, **levels)
     return MappingCompensator(config=config, **levels)
@@ -87,9 +92,10 @@ def load_compensator(
         kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
         compensator = read_checkpoint(name, kinds, build)
     compensator.eval().requires_grad_(False)
-    if isinstance(compensator, Wearable):
-        compensator.linked = linked
-        compensator.limit_to_ear = limit_to_ear
+    amplifier = compensator.aid if isinstance(compensator, BeamformingAid) else compensator
+    if isinstance(amplifier, Wearable):
+        amplifier.linked = linked
+        amplifier.limit_to_ear = limit_to_ear
     elif linked:
         raise ValueError(
             f"{name} cannot link its gains between ears; load wdrc or hearing-aid, or leave out "
@@ -118,8 +124,8 @@ def save_compensator(
         audiogram: Ear for which the compensator was trained; None if it was trained for all ears.
 
     Raises:
-        ValueError: The model is no ``MappingCompensator`` or ``HearingAid``, a weight is NaN or
-            infinite, or the folder cannot be written.
+        ValueError: The model is no ``MappingCompensator``, ``HearingAid`` or ``BeamformingAid``, a
+            weight is NaN or infinite, or the folder cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -128,7 +134,8 @@ def save_compensator(
     """
     if not isinstance(model, Trained):
         raise ValueError(
-            f"expected a MappingCompensator or a HearingAid to save, got {type(model).__name__}"
+            "expected a MappingCompensator, a HearingAid or a BeamformingAid to save, got "
+            f"{type(model).__name__}"
         )
     ear = None if audiogram is None else audiogram.to_dict()
     model.save_pretrained(folder, about={"audiogram": ear})

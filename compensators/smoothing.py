@@ -49,7 +49,7 @@ def follow_peaks(
     >>> smoothed.flatten().round()
     tensor([ 0., 60., 54., 49.])
     """
-    fall, rise = _weight_of_past(release), _weight_of_past(attack)
+    fall, rise = weight_of_past(release), weight_of_past(attack)
     # p is the largest of the averages that begin at any of the frames: p = e + d, where e is the
     # average with r, and d[n] = max(x[n] - e[n], r d[n - 1]).
     average, excess, result = memory.unbind(1)
@@ -65,7 +65,7 @@ def follow_peaks(
     return results, torch.stack((averages[:, -1], excess, results[:, -1]), 1)
 
 
-def _weight_of_past(seconds: float) -> float:
+def weight_of_past(seconds: float) -> float:
     """Convert a time constant to the weight of the past in an exponential average, 0 for 0 s."""
     return math.exp(-HOP / (RATE * seconds)) if seconds > 0.0 else 0.0
 

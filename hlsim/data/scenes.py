@@ -9,10 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.calibration import NEURO_RATE
+from hlsim.calibration import NEURO_RATE, set_level
 from hlsim.checks import check_number, check_rate, check_waveform
 from hlsim.data.mixing import mix
 from hlsim.dsp.sphere import evenly_spread_directions, head_responses, unit_vectors
+from hlsim.torchtools import compute_once
 
 DIFFUSE_DIRECTIONS = 64
 """Number of directions from which diffuse noise comes."""
@@ -28,7 +29,7 @@ class Scene(NamedTuple):
     """Signals of the microphones of a scene.
 
     Attributes:
-        input: Target and maskers at the microphones, (microphones, ears, time).
+        input: Target and maskers at the microphones, (..., microphones, ears, time).
         target: Target alone, likewise.
 
     >>> Scene(torch.zeros(2, 2, 10), torch.zeros(2, 2, 10)).input.shape
@@ -40,8 +41,8 @@ class Scene(NamedTuple):
 
     @property
     def reference(self) -> Tensor:
-        """The target at the front microphones, (ears, time), the clean speech of losses."""
-        return self.target[0]
+        """The target at the front microphones, (..., ears, time), the clean speech of losses."""
+        return self.target[..., 0, :, :]
 
 
 def make_scene(
@@ -120,12 +121,76 @@ def make_scene(
         _check_masker(diffuse, "diffuse", time)
         shifts = np.random.default_rng(seed).integers(len(diffuse), size=DIFFUSE_DIRECTIONS)
         parts = torch.stack([diffuse.roll(int(shift))[:time] for shift in shifts])
-        directions = evenly_spread_directions(DIFFUSE_DIRECTIONS)
-        gain = DIFFUSE_DIRECTIONS**-0.5
-        noise_at_ears += gain * sound_at_microphones(parts, directions, spacing, rate)
+        noise_at_ears += _filter_sounds(parts, diffuse_impulse_responses(spacing, rate), rate)
     channels = target_at_ears.flatten(0, 1)
     mixture = mix(channels, noise_at_ears.flatten(0, 1), snr, rate, channels=True)
     return Scene(mixture.reshape(target_at_ears.shape), target_at_ears)
+
+
+def draw_scenes(
+    targets: Tensor,
+    voices: Tensor,
+    noise: Tensor | None,
+    snr: Tensor,
+    generator: torch.Generator,
+    *,
+    mismatch: float = 0.0,
+) -> Scene:
+    """Draw random scenes at 16 kHz for training, see ``make_scene``.
+
+    The target comes from up to 10 degrees beside the front. Up to three maskers come from random
+    directions, each with the same probability the voice of another item or noise, and half of the
+    scenes have diffuse noise, too. Scenes without noise have one to three voices.
+
+    Args:
+        targets: Speech at its level, (items, time).
+        voices: Speech of the same items at any level, (items, time), for maskers.
+        noise: Recordings of noise, (items, time), or None.
+        snr: Signal-to-noise ratio of each scene in dB, (items,).
+        generator: Source of the random numbers.
+        mismatch: Standard deviation in dB of the gains of the microphones.
+
+    Returns:
+        Scenes with leading dimension (items,). The gains of the microphones are those of ``input``
+        alone.
+
+    >>> voices = torch.randn(2, 8000)
+    >>> scenes = draw_scenes(voices, voices, None, torch.zeros(2), torch.Generator())
+    >>> scenes.input.shape
+    torch.Size([2, 2, 2, 8000])
+    """
+
+    def draw(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    count = len(targets)
+    scenes = []
+    for item, target in enumerate(targets):
+        is_diffuse = noise is not None and draw(0.0, 1.0) < 0.5
+        maskers = []
+        for _ in range(int(draw(0.0 if is_diffuse else 1.0, 4.0))):
+            source = voices if noise is None or draw(0.0, 1.0) < 0.5 else noise
+            other = source[(item + int(draw(1.0, max(2.0, count)))) % count]
+            maskers.append(set_level(other, draw(59.0, 71.0)))
+        azimuths = [draw(-180.0, 180.0) for _ in maskers]
+        diffuse = None
+        if noise is not None and is_diffuse:
+            diffuse = set_level(noise[item], draw(59.0, 71.0))
+        scene = make_scene(
+            target,
+            maskers,
+            azimuths,
+            diffuse=diffuse,
+            snr=float(snr[item]),
+            target_azimuth=draw(-10.0, 10.0),
+            seed=int(draw(0.0, 2.0**31)),
+        )
+        normal = np.random.default_rng(int(draw(0.0, 2.0**31))).normal(
+            size=(*scene.input.shape[:2], 1)
+        )
+        gains = 10.0 ** (torch.from_numpy(mismatch * normal).to(target) / 20.0)
+        scenes.append(Scene(scene.input * gains, scene.target))
+    return Scene(*(torch.stack(signals) for signals in zip(*scenes, strict=True)))
 
 
 def _check_masker(signal: Tensor, name: str, time: int) -> None:
@@ -159,8 +224,17 @@ def sound_at_microphones(
     >>> sound_at_microphones(torch.zeros(3, 1, 100), unit_vectors([90.0])).shape
     torch.Size([3, 2, 2, 100])
     """
-    time = signals.shape[-1]
     responses = head_impulse_responses(directions, spacing, sample_rate)
+    return _filter_sounds(signals, responses, sample_rate)
+
+
+def _filter_sounds(signals: Tensor, responses: NDArray[np.float64], sample_rate: int) -> Tensor:
+    """Filter sounds by impulse responses of their directions, and add them up.
+
+    Shape: (..., directions, time), (directions, microphones, ears, length) -> (..., microphones,
+        ears, time).
+    """
+    time = signals.shape[-1]
     lead = int(_LEAD_SECONDS * sample_rate)
     points = scipy.fft.next_fast_len(time + responses.shape[-1], real=True)
     spectra = np.fft.rfft(signals.detach().double().cpu().numpy(), points)
@@ -168,6 +242,25 @@ def sound_at_microphones(
     sums = np.einsum("...df,dmef->...mef", spectra, filters)
     filtered = np.fft.irfft(sums, points)[..., lead : lead + time]
     return torch.from_numpy(filtered).to(signals)
+
+
+@compute_once
+def diffuse_impulse_responses(spacing: float, sample_rate: int) -> NDArray[np.float64]:
+    """Compute impulse responses from the directions of diffuse noise, with a sum of powers of 1.
+
+    Args:
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Impulse responses, see ``head_impulse_responses``.
+
+    >>> diffuse_impulse_responses(0.01, 16000).shape
+    (64, 2, 2, 512)
+    """
+    directions = evenly_spread_directions(DIFFUSE_DIRECTIONS)
+    responses = head_impulse_responses(directions, spacing, sample_rate)
+    return DIFFUSE_DIRECTIONS**-0.5 * responses
 
 
 def head_impulse_responses(

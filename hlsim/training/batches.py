@@ -28,6 +28,7 @@ from hlsim.data.clips import AudioFiles, Clips, hash_source
 from hlsim.data.ears import draw_thresholds
 from hlsim.data.manifest import read_manifest
 from hlsim.data.mixing import mix
+from hlsim.data.scenes import draw_scenes
 from hlsim.data.tones_and_clicks import draw_sounds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 
@@ -54,6 +55,9 @@ _HIGHEST_CLEAN_LEVEL = 80.0
 
 _MEASURED_SHARE = 0.5
 """Share of measured ears, if there are any. The others are random."""
+
+_QUIET_SNR = 60.0
+"""Signal-to-noise ratio in dB of scenes that are not noisy."""
 
 _MAX_BABBLE_VOICES = 4
 """Largest number of voices in babble."""
@@ -242,6 +246,8 @@ class _CompensatorBatches(_RandomBatches):
         voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)
         clips = self.replace_by_sounds(voices, generator)
         clean = set_level(clips, draw_uniform(*recipe.levels, (count,), generator))
+        if recipe.kind == "beamforming-aid":
+            return self._draw_scenes(clean, voices, generator)
         signal = clean
         if self.noise is not None:
             noise = self.noise.draw(count, generator)
@@ -258,6 +264,22 @@ class _CompensatorBatches(_RandomBatches):
             is_reduced = torch.rand(count, generator=generator) >= recipe.unreduced
             batch["noise_reduction"] = is_reduced.to(clean.dtype)
         return batch
+
+    def _draw_scenes(self, clean: Tensor, voices: Tensor, generator: torch.Generator) -> Batch:
+        """Draw the tensors of a batch for several microphones and two equal ears.
+
+        Shape: (items, time) twice -> ``signal`` (items, microphones, 2, time), ``clean`` (items, 2,
+            time), ``thresholds`` (items, 2, 8).
+        """
+        recipe, count = self.recipe, len(clean)
+        noise = self.noise.draw(count, generator) if self.noise is not None else None
+        snr = draw_uniform(*recipe.snr, (count,), generator)
+        is_noisy = torch.rand(count, generator=generator) < recipe.noisy
+        snr = torch.where(is_noisy, snr, _QUIET_SNR)
+        mismatch = recipe.mismatch
+        scenes = draw_scenes(clean, voices, noise, snr, generator, mismatch=mismatch)
+        ears = self.draw_ears(count, generator).unsqueeze(1).expand(-1, 2, -1)
+        return {"clean": scenes.reference, "signal": scenes.input, "thresholds": ears}
 
 
 def _babble(voices: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from compensators.beamformer import BeamformingAid
+from compensators.config import BeamformerConfig
 from compensators.hearing_aid import HearingAid
 from compensators.loading import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
@@ -49,7 +53,10 @@ class CompensatorTraining(TrainingModule):
 
     def __init__(self, recipe: CompensatorRecipe, *, simulator: Simulator = "neuro-msbg") -> None:
         config = CONFIGS[recipe.kind].from_dict(recipe.model)
-        network = initial_network(recipe, partial(build_compensator, config), load_compensator)
+        load: Callable[[str], nn.Module] = load_compensator
+        if isinstance(config, BeamformerConfig):
+            load = partial(_load_beamforming_aid, config)
+        network = initial_network(recipe, partial(build_compensator, config), load)
         super().__init__(network, recipe)
         weights = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.denoising = weights.pop("denoising", 0.0)
@@ -62,6 +69,8 @@ class CompensatorTraining(TrainingModule):
         )
         if not self.trains_amplification:
             network.correct.requires_grad_(False)
+        elif isinstance(network, BeamformingAid):
+            network.aid.requires_grad_(False)
         elif isinstance(network, HearingAid) and not recipe.trains_noise_reduction():
             network.noise_reduction_network.requires_grad_(False)
 
@@ -80,6 +89,9 @@ class CompensatorTraining(TrainingModule):
             loss = loss + self.intelligibility * missing.mean()
         if not self.trains_amplification:
             return loss
+        if isinstance(self.network, BeamformingAid):
+            output = self.network(signal, ears, noise_reduction=0.0)
+            return loss + self.loss(output, clean, ears)
         if "noise_reduction" not in batch:
             return loss + self.loss(self.network(signal, ears), clean, ears)
         slider = batch["noise_reduction"]
@@ -95,6 +107,16 @@ class CompensatorTraining(TrainingModule):
         """
         mean = float(values.double().mean())
         return {"score": -mean, "valid_loss": mean}
+
+
+def _load_beamforming_aid(config: BeamformerConfig, name: str) -> nn.Module:
+    """Load an aid with several microphones, or place a new front end before a hearing aid."""
+    start: Any = load_compensator(name)
+    if not isinstance(start, HearingAid):
+        return start
+    aid = BeamformingAid(config=replace(config, aid=start.config.to_dict()))
+    aid.aid.load_state_dict(start.state_dict())
+    return aid
 
 
 def train_compensator(

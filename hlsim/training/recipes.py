@@ -141,11 +141,14 @@ class CompensatorRecipe(TrainingRecipe):
     ears requires larger batches and hours.
 
     Attributes:
-        kind: Type of the network, ``mapping-compensator`` or ``hearing-aid``.
-        model: Settings of ``MappingConfig`` or ``HearingAidConfig``.
+        kind: Type of the network, ``mapping-compensator``, ``hearing-aid`` or ``beamforming-aid``.
+            The last one is trained in random scenes, see ``draw_scenes``, and the recipe's ``start``
+            may be a hearing aid, before which it is placed. The aid's weights stay.
+        model: Settings of ``MappingConfig``, ``HearingAidConfig`` or ``BeamformerConfig``.
         weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
-            ``hasqi``, ``denoising`` and ``intelligibility``. The first five are those of
-            ``HearingLossLoss`` for one ear. The last two train a hearing aid's noise reduction
+            ``hasqi``, ``interaural``, ``denoising`` and ``intelligibility``. The first six are
+            those of ``HearingLossLoss``; ``interaural`` needs the two ears of a
+            ``beamforming-aid``. The last two train a hearing aid's noise reduction
             alone, and the others its amplification alone: ``denoising`` is the error of the gains
             of noise reduction, ``intelligibility`` is 1 - HASPI at equal level. ``haspi``,
             ``hasqi`` (1 - score) and ``intelligibility`` require clips of 0.7 s or more.
@@ -158,6 +161,7 @@ class CompensatorRecipe(TrainingRecipe):
         babble: Share of noisy clips whose noise consists of up to four other voices.
         snr: Lowest and highest signal-to-noise ratio in dB. The level of the speech is its active
             level, without pauses.
+        mismatch: Standard deviation in dB of the gains of the microphones of a ``beamforming-aid``.
         unreduced: Share of items for which a hearing aid's noise reduction is off.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.
@@ -166,7 +170,7 @@ class CompensatorRecipe(TrainingRecipe):
     3000
     """
 
-    kind: Literal["mapping-compensator", "hearing-aid"] = "mapping-compensator"
+    kind: Literal["mapping-compensator", "hearing-aid", "beamforming-aid"] = "mapping-compensator"
     steps: int = 3_000
     batch: int = 2
     seconds: float = 0.6
@@ -176,6 +180,7 @@ class CompensatorRecipe(TrainingRecipe):
     noisy: float = 0.5
     babble: float = 0.0
     snr: tuple[float, float] = (0.0, 20.0)
+    mismatch: float = 0.0
     unreduced: float = 0.0
     loudness: float | dict[float, float] = 0.0
     validate_every: int = 50
@@ -185,13 +190,15 @@ class CompensatorRecipe(TrainingRecipe):
     def criteria(cls) -> tuple[str, ...]:
         from hlsim.losses.criteria import CRITERIA  # imports torch
 
-        names = (name for name, criterion in CRITERIA.items() if not criterion.two_ears)
-        return (*names, *_NOISE_REDUCTION_CRITERIA)
+        return (*CRITERIA, *_NOISE_REDUCTION_CRITERIA)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         expected = "2 or more, because babble consists of the other items"
         self._require("batch", self.batch > 1 or not self.babble, expected)
+        expected = "beamforming-aid, because interaural compares two ears"
+        has_two_ears = self.kind == "beamforming-aid"
+        self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"
             self._require("kind", self.kind == "hearing-aid", expected)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 import hlsim
 from hlsim.calibration import dbfs
-from hlsim.data.scenes import make_scene
+from hlsim.data.scenes import draw_scenes, make_scene
 from hlsim.dsp.active_level import active_level_db
 
 TIME = 16000
@@ -70,6 +70,30 @@ def test_same_seed_gives_the_same_scene(speech: Tensor, noise: Tensor) -> None:
     )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("has_noise", [False, True])
+def test_random_scenes_have_their_ratio_and_depend_on_the_seed(
+    speech: Tensor, noise: Tensor, has_noise: bool
+) -> None:
+    voices = torch.stack((speech, speech.flip(-1)))
+    recordings = noise[: 2 * TIME].reshape(2, TIME) if has_noise else None
+
+    def draw(seed: int, mismatch: float = 0.0) -> tuple[Tensor, Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        snr = torch.tensor([-5.0, 10.0])
+        return draw_scenes(voices, voices, recordings, snr, generator, mismatch=mismatch)
+
+    signals, targets = draw(0)
+    assert torch.equal(signals, draw(0)[0])
+    assert not torch.equal(signals, draw(1)[0])
+    powers = [values.square().mean((1, 2, 3)) for values in (targets, signals - targets)]
+    ratios = 10.0 * (powers[0] / powers[1]).log10()
+    assert 13.0 < float(ratios[1] - ratios[0]) < 17.0
+    mismatched, same_targets = draw(0, mismatch=1.0)
+    gains = 10.0 * (mismatched.square().mean(-1) / signals.square().mean(-1)).log10()
+    assert torch.equal(targets, same_targets)
+    assert 0.3 < float(gains.std()) < 3.0
 
 
 def test_wrong_arguments_raise_errors(speech: Tensor, noise: Tensor) -> None:

@@ -208,6 +208,34 @@ def test_parts_of_a_hearing_aid_without_a_criterion_are_frozen(
     assert len(trained) == 4
 
 
+def test_a_front_end_is_trained_in_scenes_before_an_aid(
+    noisy: TrainingData, tmp_path: Path
+) -> None:
+    recipe = replace(
+        SMALL,
+        kind="beamforming-aid",
+        model={"hidden": 8},
+        start="hearing-aid",
+        weights={"coherent-bands": 1.0, "interaural": 0.1},
+    )
+    assert draw(recipe, noisy, 2)["signal"].shape == (2, 2, 2, 3200)
+    trained = load_compensator(
+        train_compensator(noisy, recipe, out=tmp_path, simulator="msbg", accelerator="cpu")
+    )
+    before = load_compensator("hearing-aid").state_dict()
+    after = trained.aid.state_dict()
+    assert all(torch.equal(weights, after[name]) for name, weights in before.items())
+    module = CompensatorTraining(recipe, simulator="msbg")
+    module.compute_loss(draw(recipe, noisy, 2)).backward()
+    moved = [
+        name for name, weights in module.network.named_parameters() if weights.grad is not None
+    ]
+    assert moved
+    assert all(name.startswith("front_end.decide") for name in moved)
+    with pytest.raises(ValueError, match="interaural compares two ears"):
+        replace(recipe, kind="hearing-aid")
+
+
 def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: TrainingData) -> None:
     recipe = replace(SMALL_AID, equalised=0.0, noisy=1.0, sounds=0.4, unreduced=0.5)
     batch = draw(recipe, noisy, 64)
