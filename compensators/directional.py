@@ -199,7 +199,7 @@ class MicrophoneStream:
         """
         signals = as_samples(chunk)
         self._front_end.check_microphones(signals)
-        shape = self._zero.shape[:-1]
+        shape: torch.Size = self._zero.shape[:-1]
         if self._state is None:
             self._state = self._front_end.initial_state(signals)
             self._zero = torch.zeros_like(signals[..., :1])

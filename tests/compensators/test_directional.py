@@ -157,11 +157,12 @@ def test_stream_is_the_whole_signal_delayed(build: Callable[[], FilterAndSum]) -
 
 def test_a_directional_aid_has_a_stream_and_takes_arrays(noise: Tensor) -> None:
     aid = DirectionalAid(BinauralMVDR(), load_compensator("wdrc"))
-    signals = 0.02 * noise[:8000].reshape(2, 2, 2000)
+    signals = 0.02 * noise[:8000].double().reshape(2, 2, 2000)
     stream = aid.stream(["N2", "N4"])
     chunks = [stream(chunk.numpy()) for chunk in signals.split([100, 1900], -1)]
     output = torch.cat((*map(torch.from_numpy, chunks), stream.flush()), -1)
-    delayed = torch.nn.functional.pad(aid.front_end(signals), (aid.front_end.latency, 0))
+    front = aid.front_end.stream()
+    delayed = torch.cat((front(signals), front.flush()), -1)
     torch.testing.assert_close(output[..., aid.aid.latency :], aid.aid(delayed, ["N2", "N4"]))
     assert aid.latency == 80
     assert isinstance(aid.front_end(signals.numpy()), np.ndarray)
@@ -207,7 +208,9 @@ def test_beamforming_aid_is_a_checkpoint_of_both_parts(tmp_path: Path, speech: T
     aid = BeamformingAid(config=config).eval()
     assert sum(weights.numel() for weights in AdaptiveBeamformer().parameters()) <= 100_000
     save_compensator(aid, tmp_path / "mine")
-    loaded = load_compensator(tmp_path / "mine", full_scale_spl=114.0)
+    loaded = load_compensator(tmp_path / "mine", full_scale_spl=114.0, limit_to_ear=True)
+    assert loaded.aid.limit_to_ear
+    loaded.aid.limit_to_ear = False
     signals, ears = speech.expand(2, 2, -1), ["N2", "N4"]
     torch.testing.assert_close(loaded(0.1 * signals, ears), 0.1 * aid(signals, ears))
     with pytest.raises(ValueError, match="an aid with sample_rate=16000, got 44100"):
