@@ -142,8 +142,8 @@ class CompensatorRecipe(TrainingRecipe):
 
     Attributes:
         kind: Type of the network, ``mapping-compensator``, ``hearing-aid`` or ``beamforming-aid``.
-            The last one is trained in random scenes, see ``draw_scenes``, and the recipe's ``start``
-            may be a hearing aid, before which it is placed. The aid's weights stay.
+            The last one is trained in random scenes, see ``draw_scenes``. The recipe's ``start``
+            may be a hearing aid, before which it is placed, and whose weights stay.
         model: Settings of ``MappingConfig``, ``HearingAidConfig`` or ``BeamformerConfig``.
         weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
             ``hasqi``, ``interaural``, ``denoising`` and ``intelligibility``. The first six are
