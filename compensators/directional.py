@@ -474,6 +474,17 @@ def differential_taps(
 def differential_responses(
     delay: float, spacing: float, lowest: float, sample_rate: int
 ) -> NDArray[np.complex128]:
+    """Compute the frequency responses of ``differential_taps`` at ``design_frequencies``.
+
+    Args:
+        delay, spacing, lowest, sample_rate: See ``differential_taps``.
+
+    Returns:
+        Responses of the front and of the rear microphone, (2, frequencies).
+
+    >>> differential_responses(delay=1.0, spacing=0.01, lowest=200.0, sample_rate=16000).shape
+    (2, 289)
+    """
     omega = 2.0 * np.pi * design_frequencies(sample_rate)
     travel = spacing / SPEED_OF_SOUND
     # Sound from the front passes the pair in the travel time, and is then delayed once more.

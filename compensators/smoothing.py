@@ -66,7 +66,14 @@ def follow_peaks(
 
 
 def weight_of_past(seconds: float) -> float:
-    """Convert a time constant to the weight of the past in an exponential average, 0 for 0 s."""
+    """Convert a time constant to the weight of the past in an exponential average of frames.
+
+    Args:
+        seconds: Time constant in seconds; 0 has the weight 0.
+
+    >>> round(weight_of_past(0.1), 3)
+    0.961
+    """
     return math.exp(-HOP / (RATE * seconds)) if seconds > 0.0 else 0.0
 
 
