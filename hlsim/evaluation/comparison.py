@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -70,11 +70,6 @@ class ConditionComparison:
     def title(self) -> str:
         """Name of the measure in tables."""
         return column_title(self.measure)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes as a dict for ``report.json``; an unknown level change is None."""
-        level_change = None if math.isnan(self.level_change) else self.level_change
-        return asdict(self) | {"level_change": level_change}
 
 
 def compare(

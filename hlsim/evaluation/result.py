@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -206,20 +206,16 @@ class Evaluation:
         """
         fields = ("name", "kind", "of")
         conditions = [{name: getattr(c, name) for name in fields} for c in self.conditions]
-        groups = {
-            name: [comparison.to_dict() for comparison in group.comparisons]
-            for name, group in self.groups.items()
-        }
-        rows = self.table.astype(object).where(self.table.notna(), None)
+        groups = {name: list(map(asdict, group.comparisons)) for name, group in self.groups.items()}
         contents = {
             "settings": self.settings,
             "versions": self.versions,
             "notes": self.notes,
             "conditions": conditions,
-            "comparisons": [comparison.to_dict() for comparison in self.comparisons],
+            "comparisons": list(map(asdict, self.comparisons)),
             "groups": groups,
             **self.details,
-            "rows": rows.to_dict("records"),
+            "rows": self.table.to_dict("records"),
         }
         return _replace_nonfinite(contents)
 
