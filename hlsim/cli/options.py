@@ -32,6 +32,29 @@ _EAR = re.compile(r"NH|[NS]\d|-?[\d.]+([,:]-?[\d.]+)+", re.IGNORECASE)
 """Text of an ear on the command line: a name, levels, or frequencies with levels."""
 
 
+class _StoreOnce(argparse.Action):
+    """Action that stores the value of an option, and rejects the option if it is repeated.
+
+    argparse would store the last value, so that, for example, the first of two folders of speech
+    would be ignored.
+    """
+
+    namespace: argparse.Namespace | None = None
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if self.namespace is namespace:
+            fix = "write all values after one of them" if self.nargs == "+" else "leave one out"
+            raise argparse.ArgumentError(self, f"appears twice; {fix}")
+        self.namespace = namespace
+        setattr(namespace, self.dest, values)
+
+
 class Parser(argparse.ArgumentParser):
     """Parser of the program or of a command, whose errors are one line without the usage.
 
@@ -110,7 +133,7 @@ class Parser(argparse.ArgumentParser):
             values = default if isinstance(default, list) else [default]
             text += f" (default: {' '.join(map(str, values))})"
         if name.startswith("-"):
-            settings["default"] = default
+            settings = {"action": _StoreOnce, "default": default, **settings}
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:

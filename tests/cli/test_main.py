@@ -424,8 +424,9 @@ def test_haspi_report_of_a_manifest(
     (tmp_path / "study.csv").write_text(MANIFEST)
     out = tmp_path / "out"
     call: tuple[Any, ...] = ("haspi-report", "--manifest", tmp_path / "study.csv", "--out", out)
-    call += ("--jobs", "1", "--measures", "stoi", "--spl", "65", "--seed", "1")
-    assert run(*call) == 0
+    call += ("--jobs", "1", "--spl", "65", "--seed", "1")
+    measures = ("--measures", "stoi")
+    assert run(*call, *measures) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith("aided") and (out / "report.html").as_uri() in printed.out
     assert "1 of 4 outputs (one per item and condition) lack scores (one per" in printed.err
@@ -433,7 +434,7 @@ def test_haspi_report_of_a_manifest(
     scores = [row["stoi"] for row in json.loads((out / "report.json").read_text())["rows"]]
     assert [score is None for score in scores] == [False, False, False, True]
     stored = (out / "scores.jsonl").read_text()
-    assert run(*call) == 0 and (out / "scores.jsonl").read_text() == stored
+    assert run(*call, *measures) == 0 and (out / "scores.jsonl").read_text() == stored
     capsys.readouterr()
     for option, value in (("--measures", "loud"), ("--root", "none"), ("--baseline", "x")):
         assert value in error_of(capsys, *call, option, value)

@@ -79,6 +79,23 @@ def test_two_ears_after_one_option_are_an_error_that_says_so(
     assert "--audiogram takes one ear, got" in line and "repeat the option" in line
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train-compensator --speech . --speech .",
+        "export-gains --audiogram N3 --audiogram N4",
+        "haspi-report --measures stoi --measures haspi",
+        "clarity . --enhancer a:b --enhancer c:d",
+    ],
+)
+def test_an_option_of_which_the_last_would_count_may_not_be_repeated(
+    capsys: pytest.CaptureFixture[str], words: str
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    assert "appears twice" in capsys.readouterr().err
+
+
 def test_lists_that_begin_with_a_minus_are_values() -> None:
     words = "--levels -5 -10 --audiogram -10,0,5,10,20,30,40,50 msbg --speech . --out o".split()
     parsed = make_parser("evaluate-compensator").parse_args(words)

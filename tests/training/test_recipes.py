@@ -101,5 +101,7 @@ def test_a_setting_that_is_given_twice_is_an_error(tmp_path: Path) -> None:
     file.write_text("batch: 4\nsteps: 10\nbatch: 8\n")
     with pytest.raises(ValueError, match="'batch' occurs twice"):
         make_recipe(CompensatorRecipe, file, [])
+    with pytest.raises(ValueError, match=r"--recipe\.batch appears twice"):
+        make_recipe(CompensatorRecipe, None, ["--recipe.batch=4", "--recipe.batch=2"])
     with pytest.raises(ValueError, match="50 occurs twice"):
         make_recipe(CompensatorRecipe, None, ["--recipe.loudness={50: 0, 50.0: -9}"])
