@@ -72,8 +72,9 @@ class HearingAid(Wearable, HubModel):
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal.
         limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable
-            level of the ear, measured or predicted (``Audiogram.uncomfortable_levels``). A tensor
-            of thresholds has predicted levels. The limit of the peaks stays.
+            level of the ear if one was measured, and otherwise to 4 dB below a predicted level with
+            a margin (``hlsim.audiogram.discomfort.predict_limits``). A tensor of thresholds has
+            predicted levels. The limit of the peaks stays.
 
     Raises:
         ValueError: A rate or level is out of range.

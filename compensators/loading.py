@@ -14,6 +14,7 @@ from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record
+from hlsim.checks import check_flag
 
 Trained = MappingCompensator | HearingAid | BeamformingAid
 
@@ -76,13 +77,15 @@ def load_compensator(
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind or has changed since it was
-            saved, the rate or the level is out of range, or ``linked`` or ``limit_to_ear`` is set
-            for an aid that does not support it.
+            saved, the rate or the level is out of range, or ``linked`` or ``limit_to_ear`` is
+            neither True nor False, or True for an aid that does not support it.
 
     >>> import hlsim
     >>> aid = load_compensator("hearing-aid")
     >>> output = aid(hlsim.example_speech(), "N3")
     """
+    check_flag("linked", linked)
+    check_flag("limit_to_ear", limit_to_ear)
     levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     compensator: Trained | NALR | WDRC
     if str(name) in UNTRAINED:

@@ -34,7 +34,7 @@ KNEE_DB = 20.0
 With CAMFIT it is ``SPEECH_RANGE_DB``.
 """
 
-Prescription = Literal["nal-r", "nal-rp", "camfit"]
+Prescription = Literal["nalr", "nalrp", "camfit"]
 """Prescription of the gains of ``WDRC``."""
 
 
@@ -58,10 +58,11 @@ class WDRC(Wearable):
             amplified beyond this level.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal.
-        prescription: ``"nal-r"``, ``"nal-rp"`` or ``"camfit"``.
+        prescription: ``"nalr"``, ``"nalrp"`` or ``"camfit"``.
         limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable
-            level of the ear, measured or predicted (``Audiogram.uncomfortable_levels``). A tensor
-            of thresholds has predicted levels. The limit of the peaks stays.
+            level of the ear if one was measured, and otherwise to 4 dB below a predicted level with
+            a margin (``hlsim.audiogram.discomfort.predict_limits``). A tensor of thresholds has
+            predicted levels. The limit of the peaks stays.
 
     Raises:
         ValueError: A value is out of range.
@@ -83,7 +84,7 @@ class WDRC(Wearable):
         release: float = 0.1,
         limit_spl: float = 110.0,
         linked: bool = False,
-        prescription: Prescription = "nal-r",
+        prescription: Prescription = "nalr",
         limit_to_ear: bool = False,
     ) -> None:
         super().__init__(audiogram, sample_rate, full_scale_spl, linked, limit_to_ear)
@@ -108,7 +109,7 @@ class WDRC(Wearable):
         if self.prescription == "camfit":
             speech_levels = speech_band_levels(self.bands, like=thresholds)
             return torch.cat(camfit_gains(thresholds, speech_levels, centres), -1)
-        prescribe = nalr_gains_db if self.prescription == "nal-r" else nalrp_gains_db
+        prescribe = nalr_gains_db if self.prescription == "nalr" else nalrp_gains_db
         prescribed = interpolate(prescribe(thresholds), FREQUENCIES, centres)
         loss = interpolate(thresholds, FREQUENCIES, centres)
         ratios = 1.0 + ((loss - 10.0) / 40.0).clamp(0.0, 2.0)

@@ -38,15 +38,15 @@ from compensators.filter_bank import (
 from compensators.limiter import soft_limit
 from compensators.smoothing import follow_peaks
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.discomfort import predict_uncomfortable_levels
+from hlsim.audiogram.discomfort import predict_limits
 from hlsim.audiogram.prescription import highest_band_levels, nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     check_two_channels,
-    find_uncomfortable_levels,
+    find_limits,
 )
 from hlsim.calibration import gain_to_pascals
-from hlsim.checks import check_device, check_names, check_number, check_waveform
+from hlsim.checks import check_device, check_flag, check_names, check_number, check_waveform
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import resample
 from hlsim.torchtools import (
@@ -102,8 +102,9 @@ class Wearable(Aid):
             in level between them stay if their audiograms are equal. The output of each ear is
             limited separately.
         limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable
-            level of the ear, measured or predicted (``Audiogram.uncomfortable_levels``). A tensor
-            of thresholds has predicted levels. The limit of the peaks stays.
+            level of the ear if one was measured, and otherwise to 4 dB below a predicted level with
+            a margin (``hlsim.audiogram.discomfort.predict_limits``). A tensor of thresholds has
+            predicted levels. The limit of the peaks stays.
 
     Attributes:
         SLIDERS: Default value of each slider under its name.
@@ -136,13 +137,15 @@ class Wearable(Aid):
         limit_to_ear: bool = False,
     ) -> None:
         super().__init__(audiogram, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+        check_flag("linked", linked)
+        check_flag("limit_to_ear", limit_to_ear)
         self.linked = linked
         self.limit_to_ear = limit_to_ear
 
     def store_ears(self, audiogram: AudiogramLike | None) -> None:
-        """Store ears as ``Aid.store_ears`` does, and their uncomfortable levels."""
+        """Store ears as ``Aid.store_ears`` does, and the levels that limit the output for them."""
         super().store_ears(audiogram)
-        self._uncomfortable_levels = find_uncomfortable_levels(audiogram)
+        self._limits = find_limits(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the output for whole signals, see ``Aid.forward``."""
@@ -178,26 +181,24 @@ class Wearable(Aid):
         prescribed = interpolate(nalr_gains_db(thresholds), FREQUENCIES, centres)
         return torch.cat((interpolate(thresholds, FREQUENCIES, centres), prescribed), -1)
 
-    def fit_with_limits(
-        self, thresholds: Tensor, uncomfortable_levels: Tensor | None = None
-    ) -> Tensor:
+    def fit_with_limits(self, thresholds: Tensor, limits: Tensor | None = None) -> Tensor:
         """Compute what ``fit`` does, followed by the highest level of each band if there is one.
 
         Args:
             thresholds: Thresholds in dB HL.
-            uncomfortable_levels: Uncomfortable levels in dB HL, by default predicted ones.
+            limits: Levels of tones in dB HL that bands stay below, by default predicted ones.
 
         Shape: (items, 8) twice -> (items, n), with ``limit_to_ear`` (items, n + bands).
         """
         fitted = self.fit(thresholds)
         if not self.limit_to_ear:
             return fitted
-        if uncomfortable_levels is None:
-            uncomfortable_levels = predict_uncomfortable_levels(thresholds)
+        if limits is None:
+            limits = predict_limits(thresholds)
         centres = filter_centres(self.bands)
-        limits = highest_band_levels(uncomfortable_levels, centres) - MARGIN_DB
+        highest_levels = highest_band_levels(limits, centres) - MARGIN_DB
         # A tone is in two bands, so each band has the lowest limit of itself and its neighbours.
-        padded = nn.functional.pad(limits, (1, 1), value=torch.inf)
+        padded = nn.functional.pad(highest_levels, (1, 1), value=torch.inf)
         return torch.cat((fitted, padded.unfold(-1, 3, 1).amin(-1)), -1)
 
     def compute_gains(
@@ -395,9 +396,9 @@ class Wearable(Aid):
         ears = flatten_items(thresholds, batch, dtype)
         if not self.limit_to_ear:
             return batch, self.fit(ears)
-        levels = self._uncomfortable_levels
+        levels = self._limits
         if audiogram is not None:
-            levels = find_uncomfortable_levels(audiogram)
+            levels = find_limits(audiogram)
         if levels is not None:
             levels = on_device(levels, waveform.device).reshape(thresholds.shape)
             levels = flatten_items(levels, batch, dtype)

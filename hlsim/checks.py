@@ -112,6 +112,19 @@ def check_number(
     raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}")
 
 
+def check_flag(name: str, value: Any) -> None:
+    """Raise ValueError unless a setting is True or False.
+
+    Args:
+        name: Name of the setting, for the message.
+        value: Value to validate.
+
+    >>> check_flag("linked", True)
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"expected {name} to be True or False, got {describe(value)}")
+
+
 def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[str, float]:
     """Validate weights by name, and return them as floats.
 

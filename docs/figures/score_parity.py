@@ -33,7 +33,7 @@ EARS = ("N1", "N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 
 def process(clean: Tensor, index: int, ear: Audiogram, generator: torch.Generator) -> Tensor:
     """Process speech in one of six ways. Shape: (time,) -> (time,)."""
-    kind = ("clean", "noisy", "nal-r", "clipped", "low-passed", "noisy nal-r")[index % 6]
+    kind = ("clean", "noisy", "nalr", "clipped", "low-passed", "noisy nalr")[index % 6]
     noise = clean.norm() * torch.nn.functional.normalize(
         torch.randn(clean.shape, generator=generator), dim=-1
     )
@@ -46,7 +46,7 @@ def process(clean: Tensor, index: int, ear: Audiogram, generator: torch.Generato
         spectrum = torch.fft.rfft(output)
         spectrum[..., 2000 * clean.shape[-1] // RATE :] = 0.0
         output = torch.fft.irfft(spectrum, clean.shape[-1])
-    return NALR(ear, sample_rate=RATE)(output) if "nal-r" in kind else output
+    return NALR(ear, sample_rate=RATE)(output) if "nalr" in kind else output
 
 
 def pyclarity_score(name: str, clean: Tensor, output: Tensor, ear: Audiogram, seed: int) -> float:

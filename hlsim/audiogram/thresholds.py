@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hlsim.audiogram.discomfort import predict_limits
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EARS, FREQUENCIES, HIGHEST_SIMULATED, LOWEST_LEVEL
 from hlsim.audiogram.value import Audiogram, EarLike, check_range, find_audiogram
@@ -107,21 +108,27 @@ def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None
     return (ears, (len(audiogram), *shapes.pop())) if len(shapes) == 1 else None
 
 
-def find_uncomfortable_levels(audiogram: AudiogramLike | None) -> Tensor | None:
-    """Return the uncomfortable levels of ears in dB HL, (..., 8), measured or predicted.
+def find_limits(audiogram: AudiogramLike | None) -> Tensor | None:
+    """Return the levels in dB HL to which an aid may limit its output for ears, (..., 8).
+
+    They are the uncomfortable levels of the ear if some were measured, and otherwise those that
+    ``predict_limits`` returns.
 
     Args:
         audiogram: One or more ears. For None and a tensor of thresholds, which have no measured
             levels, the result is None.
 
-    >>> find_uncomfortable_levels(["N3", "N4"]).shape
+    >>> find_limits(["N3", "N4"]).shape
     torch.Size([2, 8])
     """
     listed = _list_ears(audiogram)
     if listed is None:
         return None
     ears, shape = listed
-    rows = [ear.uncomfortable_levels() for ear in ears]
+    rows = [
+        ear.uncomfortable_levels() if ear.ucl else predict_limits(np.array(ear.thresholds)).tolist()
+        for ear in ears
+    ]
     levels = torch.tensor(rows, dtype=torch.float32, device="cpu")
     return levels.reshape(*shape, len(FREQUENCIES))
 

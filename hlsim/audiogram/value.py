@@ -36,6 +36,16 @@ from hlsim.extras import require
 
 _UNMEASURED = ("", "na", "n/a", "null", "none", "nan")
 
+_THRESHOLD_ADVICE = (
+    "For no response write the highest level that was presented; for a frequency that was not "
+    "measured leave the value empty, and it will be interpolated"
+)
+
+_UCL_ADVICE = (
+    f"If no level was uncomfortable write {UCL_NOT_REACHED:g}; for a frequency that was not "
+    "measured leave the value empty, and it will be predicted"
+)
+
 
 @dataclass(frozen=True, repr=False)
 class Audiogram:
@@ -185,6 +195,9 @@ class Audiogram:
         Args:
             frequencies: Frequencies of the result in Hz.
 
+        Raises:
+            ValueError: The frequencies are no sequence of numbers above 0.
+
         Example:
             >>> from hlsim import Audiogram
             >>> Audiogram({500: 20, 4000: 60}).uncomfortable_levels([500, 4000])
@@ -192,9 +205,17 @@ class Audiogram:
             >>> Audiogram({500: 20, 4000: 60}, ucl={4000: 91.8}).uncomfortable_levels([4000, 8000])
             (91.8, 91.8)
         """
+        try:
+            hertz = [float(hz) for hz in frequencies]
+        except (TypeError, ValueError):
+            hertz = [math.nan]
+        if not all(hz > 0.0 for hz in hertz):
+            raise ValueError(
+                f"expected a list of frequencies in Hz, such as [500, 1000], got {frequencies!r}"
+            )
         measured_hz = [hz for hz, _ in self.ucl]
         levels = uncomfortable_levels_at(
-            self.ucl, self._interpolate(measured_hz), frequencies, self._interpolate(frequencies)
+            self.ucl, self._interpolate(measured_hz), hertz, self._interpolate(hertz)
         )
         return tuple(round(level, 6) for level in levels)
 
@@ -466,9 +487,12 @@ def ears_in_row(
         if meaning.is_remark:
             _check_remark(text, column)
         elif text.lower() not in _UNMEASURED:
-            limits = (LOWEST_UCL, HIGHEST_UCL) if meaning.is_ucl else (LOWEST_LEVEL, highest)
-            ears = ucl if meaning.is_ucl else points
-            ears.setdefault(meaning.ear, {})[meaning.hz] = _parse_level(text, column, *limits)
+            if meaning.is_ucl:
+                level = _parse_level(text, column, LOWEST_UCL, HIGHEST_UCL, _UCL_ADVICE)
+                ucl.setdefault(meaning.ear, {})[meaning.hz] = level
+            else:
+                level = _parse_level(text, column, LOWEST_LEVEL, highest, _THRESHOLD_ADVICE)
+                points.setdefault(meaning.ear, {})[meaning.hz] = level
     if not points:
         raise ValueError(
             "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got the "
@@ -524,7 +548,7 @@ def _check_remark(text: str, column: str) -> None:
     )
 
 
-def _parse_level(text: str, column: str, lowest: float, highest: float) -> float:
+def _parse_level(text: str, column: str, lowest: float, highest: float, advice: str) -> float:
     """Convert the text of a threshold or an uncomfortable level in dB HL into a number.
 
     Args:
@@ -532,6 +556,7 @@ def _parse_level(text: str, column: str, lowest: float, highest: float) -> float
         column: Name of the column, for the message.
         lowest: Lowest level allowed, in dB HL.
         highest: Highest level allowed, in dB HL.
+        advice: End of the message about a text that is not valid.
 
     Raises:
         ValueError: The text is not a number from ``lowest`` to ``highest``.
@@ -542,9 +567,8 @@ def _parse_level(text: str, column: str, lowest: float, highest: float) -> float
         level = math.nan
     if not lowest <= level <= highest:
         raise ValueError(
-            f"column {column} is {text!r}; expected a level from {lowest:g} to {highest:g} "
-            "dB HL. For no response write the highest level that was presented; for a frequency "
-            "that was not measured leave the value empty, and it will be interpolated"
+            f"column {column} is {text!r}; expected a level from {lowest:g} to {highest:g} dB HL. "
+            f"{advice}"
         )
     return level
 

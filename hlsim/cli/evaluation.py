@@ -50,7 +50,7 @@ def evaluate_simulator(parser: Parser) -> None:
     option("--audiograms", str, EARS_TABLE, required=True)
     parser.teacher("simulator to compare with")
     _declare_items(parser, "items", 240, [50, 60, 65, 70, 80])
-    text = "input of the simulators: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
+    text = "input of the simulators: as-is, louder (20 dB), nalr, compressed (3:1), compensated"
     option("--inputs", str, text, ["as-is"], nargs="+")
     option("--compensator", str, "compensator of the input compensated, by name or folder")
     _declare_study(parser)
@@ -101,15 +101,16 @@ def evaluate_compensator(parser: Parser) -> None:
     text = "measure thresholds for digits in noise as well, for the ears of the gain curves"
     parser.flag("--srt", text)
     text = (
-        "prescription with which each compensator is compared at its level; for-ear is nal-rp if "
-        "the threshold at 2 kHz is above 90 dB HL, and otherwise nal-r"
+        "prescription with which each compensator is compared at its level; for-ear is nalrp if "
+        "the threshold at 2 kHz is above 90 dB HL, and otherwise nalr"
     )
-    option("--rival", str, text, "nal-r", choices=["nal-r", "nal-rp", "camfit", "for-ear"])
+    option("--rival", str, text, "nalr", choices=["nalr", "nalrp", "camfit", "for-ear"])
     text = (
         "loudness in dB relative to a normal ear at which the loudness error is 0, a number or "
         "numbers by level, such as 50:0,65:-5,80:-9"
     )
     option("--loudness", loudness, text, 0.0)
+    parser.limit_to_ear()
     _declare_study(parser)
 
 
@@ -126,7 +127,10 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         evaluate_compensators,
         compensators_page,
         notes=warn_of_other_ears(checkpoints, ear),
-        compensators={label: load_compensator(name) for label, name in checkpoints.items()},
+        compensators={
+            label: load_compensator(name, limit_to_ear=options.limit_to_ear)
+            for label, name in checkpoints.items()
+        },
         audiogram=ear,
         store=options.out / STORE,
     )
@@ -363,7 +367,8 @@ def _run_study(
 
     Args:
         options: Options of the command. Each becomes an argument of ``evaluate`` under its name,
-            except ``names`` and ``out``; measures of ``--measure`` are appended to ``measures``.
+            except ``names``, ``out`` and ``limit_to_ear``; measures of ``--measure`` are appended
+            to ``measures``.
         evaluate: Function that runs the study and returns its evaluation.
         make_page: Function from the evaluation to its page.
         notes: Sentences with which the page begins, before those of the evaluation.
@@ -373,7 +378,8 @@ def _run_study(
 
     settings = {**vars(options), "listen": _PLAYED_ITEMS}
     settings["measures"] = [*settings.get("measures", []), *settings.pop("own_measures")]
-    arguments = {name: settings[name] for name in settings.keys() - {"run", "names", "out"}}
+    used_before = {"run", "names", "out", "limit_to_ear"}
+    arguments = {name: settings[name] for name in settings.keys() - used_before}
     with ProgressLine("scores", "reading the recordings", "drawing the page") as progress:
         evaluation = evaluate(**{**arguments, **changes}, progress=progress)
         evaluation = replace(evaluation, notes=[*notes, *evaluation.notes])

@@ -189,6 +189,7 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
         sample_rate=sample_rate,
         full_scale_spl=options.full_scale_spl,
         linked=getattr(options, "linked", False),
+        limit_to_ear=getattr(options, "limit_to_ear", False),
     )
     if not read_sliders(options).keys() <= {*getattr(compensator, "SLIDERS", ())}:
         raise ValueError(

@@ -32,6 +32,7 @@ def live(parser: Parser) -> None:
     )
     parser.flag("--simulate", text, group=models)
     parser.sliders()
+    parser.limit_to_ear()
     text = (
         "level in dB SPL of samples whose RMS is 1.0, at microphone and headphones, to be measured"
     )
@@ -55,6 +56,8 @@ def _live(options: argparse.Namespace) -> None:
         raise ValueError(
             "--noise-reduction and --amplification have no effect with --simulate; leave them out"
         )
+    if options.simulate and options.limit_to_ear:
+        raise ValueError("--limit-to-ear has no effect with --simulate; leave it out")
     ears: Any = parse_ear(options)
     import torch
 

@@ -244,6 +244,14 @@ class Parser(argparse.ArgumentParser):
         text = f"link the gains of both ears ({condition}hearing aids and wdrc only)"
         self.flag("--linked", text)
 
+    def limit_to_ear(self) -> None:
+        """Declare ``--limit-to-ear``, with which no band exceeds the ear's uncomfortable level."""
+        text = (
+            "limit each band of the output to the ear's uncomfortable level, as measured or "
+            "predicted (hearing aids, wdrc and camfit only)"
+        )
+        self.flag("--limit-to-ear", text)
+
     def enhancers(self, waveforms: str) -> None:
         """Declare ``--enhancer``, functions of the user that reduce noise.
 

@@ -58,6 +58,7 @@ def compensate(parser: Parser) -> None:
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
     parser.linked("stereo files; ")
+    parser.limit_to_ear()
 
 
 def _declare_files(

@@ -32,8 +32,10 @@ from hlsim.evaluation.conditions import (
     AtLevelOf,
     Enhanced,
     EqualiserLike,
+    PrescriptionForEar,
     Rival,
     Unaided,
+    is_profound,
     load_enhancers,
     load_rival,
 )
@@ -69,7 +71,7 @@ def evaluate_compensators(
     srt: bool = False,
     seed: int = 0,
     listen: int = 0,
-    rival: Rival = "nal-r",
+    rival: Rival = "nalr",
     loudness: Loudness = 0.0,
     **running: Any,
 ) -> Evaluation:
@@ -109,7 +111,7 @@ def evaluate_compensators(
             threshold per ear and aid. Each takes about five seconds, without the time of the aid.
         seed: Seed of all random draws.
         listen: Number of items with sounds for the players of a page, as the ear perceives them.
-        rival: Prescription for the planned comparison: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or
+        rival: Prescription for the planned comparison: ``"nalr"``, ``"nalrp"``, ``"camfit"``, or
             ``"for-ear"``, which is NAL-RP for ears with a profound loss at 2 kHz, and otherwise
             NAL-R. One that is not NAL-R is a further condition, which takes time.
         loudness: Loudness at which an output has no loudness error, in dB relative to a normal ear:
@@ -139,10 +141,7 @@ def evaluate_compensators(
     >>> evaluation.names[:3], evaluation.names[3:]
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
-    rival_name, rival_aid = load_rival(rival)
     loudness = check_loudness(loudness)
-    for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION, rival_name}:
-        raise ValueError(f"{name} is always evaluated; give the compensator another name")
     for name, aid in compensators.items():
         check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
@@ -156,6 +155,9 @@ def evaluate_compensators(
         ear = as_audiogram(audiogram)
         ears_of_aids = {ear_name(ear): ear}
         ears = list(ears_of_aids.items())
+    rival_name, rival_aid = load_rival(rival, [*ears_of_aids.values(), *dict(ears).values()])
+    for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION, rival_name}:
+        raise ValueError(f"{name} is always evaluated; give the compensator another name")
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
     utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     enhancer_plugins = load_enhancers(enhancers)
@@ -176,14 +178,20 @@ def evaluate_compensators(
         "steady_tones": measure_aids(with_unaided, ears_of_aids, measure_steady_tones, levels),
         "wearing": measure_aids(wearable, ears_of_aids, measure_wearability, utterances[0]),
     }
-    targets = loudness_at(loudness, torch.tensor(levels, dtype=torch.float64)).tolist()
-    for row in details["steady_tones"]:
-        errors = zip(row["loudness_error_db"], targets, strict=True)
-        row["loudness_error_db"] = [[tone - target for tone in tones] for tones, target in errors]
     if srt:
         details["reception_thresholds"] = measure_reception_thresholds(
             with_unaided, ears_of_aids, UNAIDED, DigitTest.draw(seed=seed)
         )
+    if isinstance(rival_aid, PrescriptionForEar):
+        usual_ears = {name for name, ear in ears_of_aids.items() if not is_profound(ear)}
+        for kind, rows in details.items():  # NAL-R's rows of these ears say the same
+            details[kind] = [
+                row for row in rows if row["aid"] != rival_name or row["ear"] not in usual_ears
+            ]
+    targets = loudness_at(loudness, torch.tensor(levels, dtype=torch.float64)).tolist()
+    for row in details["steady_tones"]:
+        errors = zip(row["loudness_error_db"], targets, strict=True)
+        row["loudness_error_db"] = [[tone - target for tone in tones] for tones, target in errors]
     settings: dict[str, Any] = {
         "items": items,
         "seconds": seconds,

@@ -9,7 +9,7 @@ function or module ``(waveform, ear) -> waveform``.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -36,8 +36,11 @@ UNAIDED = "unaided"
 NAL_R = "NAL-R"
 """Name of the linear prescription NAL-R."""
 
-Rival = Literal["nal-r", "nal-rp", "camfit", "for-ear"]
+Rival = Literal["nalr", "nalrp", "camfit", "for-ear"]
 """Prescription with which a compensator is compared at its level, see ``load_rival``."""
+
+_RIVAL_NAMES = {"nalr": "NAL-R", "nalrp": "NAL-RP", "camfit": "CAMFIT"}
+"""Names of prescriptions in tables."""
 
 COMPRESSION = "WDRC"
 """Name of the prescription ``WDRC`` with its default settings."""
@@ -90,28 +93,39 @@ class PrescriptionForEar(nn.Module):
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         """Return the waveform amplified by the prescription for the ear, (time,) -> (time,)."""
-        at_2_khz = audiogram.thresholds[FREQUENCIES.index(2000.0)]
-        aid = self.profound if at_2_khz > PROFOUND_FROM else self.usual
+        aid = self.profound if is_profound(audiogram) else self.usual
         return aid(waveform, audiogram)
 
 
-def load_rival(rival: Rival) -> tuple[str, nn.Module]:
+def is_profound(audiogram: Audiogram) -> bool:
+    """Return whether the loss of an ear at 2 kHz is profound, above 90 dB HL.
+
+    >>> is_profound(Audiogram.standard("N3"))
+    False
+    """
+    return audiogram.thresholds[FREQUENCIES.index(2000.0)] > PROFOUND_FROM
+
+
+def load_rival(rival: Rival, ears: Iterable[Audiogram]) -> tuple[str, nn.Module]:
     """Return the name in tables and the aid of a rival, with which compensators are compared.
 
     Args:
-        rival: ``"nal-r"``, ``"nal-rp"``, ``"camfit"``, or ``"for-ear"`` for the prescription that
-            ``PrescriptionForEar`` chooses for each ear.
+        rival: ``"nalr"``, ``"nalrp"``, ``"camfit"``, or ``"for-ear"`` for the prescription that
+            ``PrescriptionForEar`` chooses for each ear. If it chooses NAL-R for all of them, NAL-R
+            is returned, which is in the tables anyway.
+        ears: All ears of the comparison.
 
     Raises:
         ValueError: There is no such rival.
 
-    >>> load_rival("nal-rp")[0]
+    >>> load_rival("nalrp", [])[0]
     'NAL-RP'
     """
     check_choice("rival", rival, Rival)
-    if rival == "for-ear":
+    if rival == "for-ear" and any(is_profound(ear) for ear in ears):
         return "prescription for the ear", PrescriptionForEar()
-    return rival.upper(), load_compensator(rival.replace("-", ""), sample_rate=NEURO_RATE)
+    name = "nalr" if rival == "for-ear" else rival
+    return _RIVAL_NAMES[name], load_compensator(name, sample_rate=NEURO_RATE)
 
 
 class AtLevelOf(nn.Module):

@@ -195,7 +195,7 @@ def apply_treatments(
     Args:
         items: Items at 16 kHz, in pascals. They are not changed.
         treatments: Names of ways to process the input: ``"as-is"``, ``"louder"`` (by 20 dB),
-            ``"nal-r"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
+            ``"nalr"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
         compensator: Aid of the treatment ``"compensated"``, which is called with a waveform and an
             ear.
@@ -216,7 +216,7 @@ def apply_treatments(
     functions: dict[str, Callable[[Tensor, Any], Tensor]] = {
         "as-is": lambda signal, ear: signal,
         "louder": lambda signal, ear: 10.0 * signal,
-        "nal-r": NALR(sample_rate=NEURO_RATE),
+        "nalr": NALR(sample_rate=NEURO_RATE),
         "compressed": lambda signal, ear: compress(signal[None], three_to_one, NEURO_RATE)[0],
     }
     if compensator is not None:

@@ -70,7 +70,7 @@ def evaluate_simulators(
         seconds: Length of an item in seconds; PESQ and STOI need 2 or more.
         levels: Levels of the input in dB SPL, through which the items cycle.
         inputs: Names of ways to process the input before the simulator: ``"as-is"``, ``"louder"``
-            (by 20 dB), ``"nal-r"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
+            (by 20 dB), ``"nalr"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
         compensator: Aid of the treatment ``"compensated"``, which is called with a waveform and an
             ear.

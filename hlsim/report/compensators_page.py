@@ -7,7 +7,7 @@ from typing import Any
 
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
 from hlsim.evaluation.compensators import UTTERANCES
-from hlsim.evaluation.conditions import COMPRESSION
+from hlsim.evaluation.conditions import COMPRESSION, NAL_R
 from hlsim.evaluation.digits import Estimate
 from hlsim.evaluation.result import Evaluation
 from hlsim.report.page import Page, Picture, Section, Table
@@ -203,8 +203,11 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
     rival = evaluation.settings["rival"]
     pictures = []
     for ear in dict.fromkeys(row["ear"] for row in curves):
+        of_ear = [row for row in curves if row["ear"] == ear]
+        has_rival = any(row["aid"] == rival for row in of_ear)
+        baseline = rival if has_rival else NAL_R  # the rule chose NAL-R for this ear
         for aid in [COMPRESSION, *evaluation.aids]:
-            rows = [row for row in curves if row["ear"] == ear and row["aid"] in (rival, aid)]
+            rows = [row for row in of_ear if row["aid"] in (baseline, aid)]
             pictures.append(gain_picture(f"{aid}, ear {ear}", rows, colours))
     return pictures
 

@@ -53,7 +53,7 @@ COLUMNS: Columns = {
 _TREATMENTS = {
     "as-is": "Speech as it is",
     "louder": "20 dB louder",
-    "nal-r": "Amplified by NAL-R for the ear",
+    "nalr": "Amplified by NAL-R for the ear",
     "compressed": "Compressed 3:1",
     "compensated": "The output of a compensator",
 }

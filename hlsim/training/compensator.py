@@ -57,6 +57,8 @@ class CompensatorTraining(TrainingModule):
         if isinstance(config, BeamformerConfig):
             load = partial(_load_beamforming_aid, config)
         network = initial_network(recipe, partial(build_compensator, config), load)
+        if isinstance(network, HearingAid):
+            network.limit_to_ear = recipe.limit_to_ear
         super().__init__(network, recipe)
         weights = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.denoising = weights.pop("denoising", 0.0)

@@ -165,6 +165,9 @@ class CompensatorRecipe(TrainingRecipe):
         unreduced: Share of items for which a hearing aid's noise reduction is off.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.
+        limit_to_ear: Whether the output of a hearing aid is limited to the uncomfortable levels of
+            the ear in training, see ``HearingAid``. The saved aid is limited only if it is loaded
+            with ``limit_to_ear``.
 
     >>> CompensatorRecipe(kind="hearing-aid", weights={"denoising": 1.0}).steps
     3000
@@ -183,6 +186,7 @@ class CompensatorRecipe(TrainingRecipe):
     mismatch: float = 0.0
     unreduced: float = 0.0
     loudness: float | dict[float, float] = 0.0
+    limit_to_ear: bool = False
     validate_every: int = 50
     validation_items: int = 8
 
@@ -201,6 +205,10 @@ class CompensatorRecipe(TrainingRecipe):
         self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"
+            self._require("kind", self.kind == "hearing-aid", expected)
+        self._require("limit_to_ear", isinstance(self.limit_to_ear, bool), "true or false")
+        if self.limit_to_ear:
+            expected = "hearing-aid, because only a hearing aid limits its output to the ear"
             self._require("kind", self.kind == "hearing-aid", expected)
 
     def trains_noise_reduction(self) -> bool:

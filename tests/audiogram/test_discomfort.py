@@ -44,6 +44,13 @@ def test_a_level_that_was_not_reached_is_a_lower_bound(measured: float, expected
     assert deaf.uncomfortable_levels([1000.0]) == (max(measured, 116.9) if measured > 114 else 114,)
 
 
+@pytest.mark.parametrize("frequencies", [1000, 1000.0, "low", [0.0], [None], [float("nan")]])
+def test_bad_frequencies_are_rejected(frequencies: Any) -> None:
+    with pytest.raises(ValueError, match=r"list of frequencies in Hz, such as \[500, 1000\]"):
+        EAR.uncomfortable_levels(frequencies)
+    assert EAR.uncomfortable_levels([500]) == (85.0,)
+
+
 def test_an_ear_keeps_its_levels_wherever_it_goes() -> None:
     assert EAR.ucl == ((500.0, 85.0), (4000.0, 110.0)) and EAR.to("cpu") is EAR
     copies = [
@@ -77,6 +84,9 @@ def test_tables_may_have_uncomfortable_levels(tmp_path: Path) -> None:
     table.write_text("hl_500,ucl_500\n30,9\n")
     with pytest.raises(ValueError, match=r"column ucl_500 is '9'; expected a level from 20 to 140"):
         read_audiograms(table)
+    table.write_text("hl_500,ucl_500\n30,NR\n")
+    with pytest.raises(ValueError, match=r"'NR'.* If no level was uncomfortable write 115; for"):
+        read_audiograms(table)
 
 
 def test_a_series_may_have_uncomfortable_levels() -> None:
@@ -92,6 +102,7 @@ def test_a_series_may_have_uncomfortable_levels() -> None:
         ({50: 100}, "100 to 20000 Hz"),
         ({"low": 100}, "dictionary of frequencies"),
         ([100.0] * 8, "dictionary of frequencies"),
+        (100, "dictionary of frequencies"),
         ([[500, 95], [500, 100]], "one uncomfortable level per frequency"),
     ],
 )

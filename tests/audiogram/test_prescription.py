@@ -133,7 +133,7 @@ def test_the_aids_have_the_prescribed_gains() -> None:
     assert torch.equal(CAMFIT().gains(ears), WDRC(prescription="camfit").gains(ears))
     at_1_khz = camfit_gains(ears, torch.tensor([53.7 - 5.0 + 1.0]), (1000.0,)).at_speech_level
     assert (CAMFIT().gains(ears)[:, 2] - at_1_khz[:, 0]).abs().max() < 3.0
-    compressed = WDRC(prescription="nal-rp").gains(ears)[:, 2]
+    compressed = WDRC(prescription="nalrp").gains(ears)[:, 2]
     assert (compressed - NALR().gains(ears)[:, 2]).abs().max() < 3.0
 
 

@@ -21,8 +21,9 @@ CALLS = {
         f"--inputs as-is compensated --compensator nalr {STUDY}"
     ),
     "hlsim.evaluation.compensators:evaluate_compensators": (
-        f"evaluate-compensator nalr --audiograms standard --audiogram N3 {ITEMS} --enhancer my:e "
-        f"--simulator neuro-msbg --gain-ears n1 --srt --rival for-ear --loudness 50:0,80:-9 {STUDY}"
+        f"evaluate-compensator wdrc --audiograms standard --audiogram N3 {ITEMS} --enhancer my:e "
+        f"--simulator neuro-msbg --gain-ears n1 --srt --rival for-ear --loudness 50:0,80:-9 "
+        f"--limit-to-ear {STUDY}"
     ),
     "hlsim.evaluation.recordings:haspi_report": (
         "haspi-report --clean {a} --before {b} --after {c} --manifest {d} --root {e} --audiogram "
@@ -80,6 +81,8 @@ def test_every_option_reaches_its_parameter(
     named_measures = ["stoi", "haspi"] if name == "haspi_report" else []
     assert arguments["measures"] == [*named_measures, "my:measure"]
     assert isinstance(arguments["progress"], ProgressLine)
+    if name == "evaluate_compensators":
+        assert arguments["compensators"]["wdrc"].limit_to_ear
     if name == "evaluate_scenes":
         assert arguments["out"] == tmp_path / "out" and arguments["full_scale_spl"] == 110.0
     else:

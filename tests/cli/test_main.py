@@ -20,7 +20,7 @@ from compensators import NALR, MappingCompensator, MappingConfig, load_compensat
 from hlsim import MSBG, Audiogram, Listener
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import set_level
+from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.evaluation import _read_labels
 from hlsim.cli.main import main, make_parser
@@ -111,6 +111,9 @@ listen {speech} --listener {ears}:a --out {out} | in.flac: expected two channels
 simulate {speech} {out} --audiogram 10,20 | such as 500:20,4000:50 on the command line
 simulate {speech} {out} --audiogram 500:30,500:60 | one level for each frequency
 evaluate-compensator nalr --speech {speech} --out {out} --loudness 50:0,50:1 | one number for
+evaluate-compensator nalr --speech {folder} --out {out} --limit-to-ear | leave out limit_to_ear
+compensate {speech} {out} --audiogram N3 --compensator nalr --limit-to-ear | leave out limit_to_ear
+evaluate-compensator nalr --speech {folder} --out {out} --rival nal-r | invalid choice: 'nal-r'
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
@@ -246,6 +249,13 @@ def test_both_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:
     options = ("--compensator", "wdrc", "--linked", "--listener")
     assert run("compensate", *files, *options, f"{tmp_path / 'listeners.json'}:L2") == 0
     check_output(out, load_compensator("wdrc", sample_rate=rate, linked=True)(scene, listener))
+    (tmp_path / "two.csv").write_text("listener,left_500,right_500,ucl_right_500\na,60,40,75\n")
+    listener = Listener({500: 60}, Audiogram({500: 40}, ucl={500: 75}))
+    options = ("--compensator", "wdrc", "--limit-to-ear", "--spl", 80, "--listener")
+    assert run("compensate", *files, *options, tmp_path / "two.csv") == 0
+    gain = 10.0 ** ((80.0 - float(level_spl(scene.flatten()))) / 20.0)
+    aid = load_compensator("wdrc", sample_rate=rate, limit_to_ear=True)
+    check_output(out, aid(gain * scene, listener) / gain)
 
 
 @pytest.mark.parametrize(("ear", "warnings"), [("N4", 0), ("N3", 1)])

@@ -1,12 +1,16 @@
 """An aid may limit the output of each band to the uncomfortable level of the ear."""
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from compensators import WDRC, load_compensator
+from compensators import WDRC, HearingAid, load_compensator
 from hlsim import Audiogram
+from hlsim.audiogram.discomfort import PREDICTION_MARGIN_DB
 from hlsim.calibration import level_spl
 from tests.compensators.aids import build_wearable, tone
 
@@ -90,6 +94,26 @@ def test_linked_ears_have_limits_of_their_own(utterance: Tensor) -> None:
     aid = WDRC(linked=True, limit_to_ear=True)
     left, right = aid(loud, [SENSITIVE, N3])
     assert float(level_spl(left)) < float(level_spl(right)) - 1.0
+
+
+@pytest.mark.parametrize("name", ["limit_to_ear", "linked"])
+def test_a_switch_is_true_or_false(name: str) -> None:
+    wrong: dict[str, Any] = {name: "no"}
+    for build in (WDRC, HearingAid, partial(load_compensator, "nalr")):
+        with pytest.raises(ValueError, match=f"expected {name} to be True or False, got"):
+            build(**wrong)
+
+
+@each_aid
+def test_without_measured_levels_the_limit_is_safer_than_the_prediction(name: str) -> None:
+    sound = tone(1000.0, 110.0)
+    aid = build_wearable(name, limit_to_ear=True)
+    predicted = N3.uncomfortable_levels([1000.0])[0]
+    measured = Audiogram(N3.levels, ucl={1000: predicted - PREDICTION_MARGIN_DB})
+    torch.testing.assert_close(aid(sound, N3), aid(sound, measured), rtol=1e-3, atol=1e-4)
+    as_predicted = Audiogram(N3.levels, ucl={1000: predicted})
+    safe, loud = (level_spl(aid(sound, ear)[8000:]) for ear in (N3, as_predicted))
+    assert float(loud - safe) == pytest.approx(PREDICTION_MARGIN_DB, abs=1.0)
 
 
 def test_an_aid_without_bands_rejects_the_limit() -> None:

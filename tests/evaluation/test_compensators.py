@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from compensators import NALR, MappingCompensator
+from compensators import NALR, NALRP, MappingCompensator
 from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
@@ -15,7 +15,7 @@ from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
 from hlsim.evaluation import Item
 from hlsim.evaluation.compensators import evaluate_compensators
-from hlsim.evaluation.conditions import Unaided, load_enhancers
+from hlsim.evaluation.conditions import Unaided, load_enhancers, load_rival
 from hlsim.evaluation.digits import DigitTest, reception_threshold
 from hlsim.evaluation.measures import NORMAL, PERCEPTION, _band_error_db, network_loss
 from hlsim.report.compensators_page import compensators_page
@@ -133,17 +133,34 @@ def test_another_prescription_may_be_the_rival(
     torch.testing.assert_close(tones, usual_tones + 4.0)
     relative = study.wide("level_over_nal_r")
     assert not relative["NAL-R"].any() and abs(relative["mine"]).min() > 0.1
-    rival = "prescription for the ear"
-    assert study.names[1:5] == ["NAL-R", rival, "WDRC", f"{rival} at mine's level"]
-    scores = study.wide("hasqi")
-    assert scores[rival].tolist() == scores["NAL-R"].tolist()  # which N3 gets by the rule
+    assert study.names == usual.names  # N3 gets NAL-R by the rule
     planned = [c.before for group in study.groups.values() for c in group.comparisons if c.planned]
-    assert planned == [f"{rival} at mine's level"] * 2
-    assert f"{rival} at the same level" in compensators_page(study).verdict
+    assert planned == ["NAL-R at mine's level"] * 2
     with pytest.raises(ValueError, match="NAL-R is always evaluated"):
         evaluate_compensators({"NAL-R": Gain()}, **options, rival="camfit")
     with pytest.raises(ValueError, match="expected rival to be"):
         evaluate_compensators({"mine": Gain()}, **{**options, "rival": "nal-nl2"})
+
+
+def test_a_profound_ear_has_another_rival_than_the_others(
+    options: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("hlsim.report.plots._draw_svg", lambda *_: b"<svg></svg>")
+    ears = tmp_path / "ears.csv"
+    ears.write_text("hl_500,hl_2000\n80,95\n")
+    study = evaluate_compensators(
+        {"mine": Gain()}, **options, audiograms=ears, items=2, rival="for-ear"
+    )
+    rival = "prescription for the ear"
+    assert study.names[1:5] == ["NAL-R", rival, "WDRC", f"{rival} at mine's level"]
+    for kind in ("gain_curves", "steady_tones", "wearing"):
+        aids = [row["aid"] for row in study.details[kind]]  # for N3, which gets NAL-R
+        assert "NAL-R" in aids and rival not in aids
+    assert f"{rival} at the same level" in compensators_page(study).verdict
+    _, chosen = load_rival("for-ear", [N3, Audiogram([95.0] * 8)])
+    sound = torch.randn(1000)
+    for ear, prescription in ((N3, NALR()), (Audiogram([95.0] * 8), NALRP())):
+        assert torch.equal(chosen(sound, ear), prescription(sound, ear))
 
 
 @pytest.mark.slow

@@ -93,7 +93,7 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     drawn = draw_simulator_items(speech_dir / "valid", None, ears_file, **settings)
     halving = torch.nn.Module()
     halving.forward = lambda waveform, ear: 0.5 * waveform  # type: ignore[method-assign]
-    treatments = ["as-is", "louder", "nal-r", "compressed", "compensated"]
+    treatments = ["as-is", "louder", "nalr", "compressed", "compensated"]
     treated = apply_treatments(drawn, treatments, halving)
     assert [item.facts["treatment"] for item in treated] == treatments
     as_is, louder, amplified, compressed, compensated = (item.signal for item in treated)

@@ -10,7 +10,8 @@ import torch
 pytest.importorskip("lightning")
 
 from compensators import load_compensator
-from hlsim import MSBG, Audiogram
+from hlsim import MSBG, Audiogram, HearingLossLoss
+from hlsim.calibration import set_level
 from hlsim.checkpoint import read_record, save_checkpoint
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.simulators import BUILT_IN
@@ -254,3 +255,18 @@ def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: Training
 def test_noise_is_not_learned_without_noise(data: TrainingData, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="noise"):
         make_data(data, replace(SMALL_AID, **settings), None)
+
+
+@pytest.mark.parametrize("limit_to_ear", [False, True])
+def test_a_recipe_may_limit_the_output_to_the_ear(limit_to_ear: bool) -> None:
+    recipe = replace(SMALL_AID, start="hearing-aid", model={}, limit_to_ear=limit_to_ear)
+    module = CompensatorTraining(recipe, simulator="msbg")
+    tone = set_level(torch.sin(0.4 * torch.arange(4000.0)), 105.0).unsqueeze(0)
+    ear = torch.full((1, 8), 40.0)
+    batch = {"signal": tone, "clean": tone, "thresholds": ear}
+    batch["noise_reduction"] = torch.zeros(1)
+    expected = load_compensator("hearing-aid", limit_to_ear=limit_to_ear)
+    loss = HearingLossLoss(simulator="msbg")(expected(tone, ear, 0.0), tone, ear)
+    torch.testing.assert_close(module.compute_loss(batch), loss, check_dtype=False)
+    other = load_compensator("hearing-aid", limit_to_ear=not limit_to_ear)
+    assert (other(tone, ear) - expected(tone, ear)).abs().max() > 0.01

@@ -76,6 +76,8 @@ def test_the_help_describes_every_setting() -> None:
         (CompensatorRecipe, {"weights": {"denoising": 1.0}}),  # There is no noise reduction.
         (CompensatorRecipe, {"unreduced": 0.5}),
         (CompensatorRecipe, {"babble": 0.5, "batch": 1}),
+        (CompensatorRecipe, {"limit_to_ear": True}),  # There are no bands to limit.
+        (CompensatorRecipe, {"kind": "hearing-aid", "limit_to_ear": "yes"}),
     ],
 )
 def test_invalid_settings_are_rejected(recipe: Any, settings: dict[str, Any]) -> None:
