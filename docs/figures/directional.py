@@ -1,12 +1,13 @@
 """Benefit of directional microphones in the digit test, behind a simulated ear.
 
-    python docs/figures/directional.py [TRIPLETS]
+    python docs/figures/directional.py [TRIPLETS [CHECKPOINT]]
 
 Digits come from the front, and noise with their spectrum at 65 dB SPL from one direction on the
 left or from all directions (64), to a rigid sphere with two microphones a side. The left ear is
 tested with `hearing-aid` without noise reduction, behind each front end. A signal-to-noise ratio is
 that at the centre of the head without the head. The table has the speech reception threshold with
-the front microphone alone, and how far each front end lowers it, in dB with 95 % intervals.
+the front microphone alone, and how far each front end lowers it, in dB with 95 % intervals. The
+front end of a trained checkpoint is one of them, if there is one.
 """
 
 import sys
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from compensators import load_compensator
+from compensators.beamformer import AdaptiveBeamformer, BeamformingAid
 from compensators.directional import (
     AdaptiveDifferentialMicrophone,
     BinauralMVDR,
@@ -44,6 +46,7 @@ FRONT_ENDS: dict[str, nn.Module] = {
     "hypercardioid": DifferentialMicrophone("hypercardioid"),
     "adaptive": AdaptiveDifferentialMicrophone(),
     "binaural MVDR": BinauralMVDR(),
+    "untrained beamformer": AdaptiveBeamformer().requires_grad_(False),
 }
 
 
@@ -63,7 +66,10 @@ def place(triplets: Triplets, azimuth: float | None) -> Triplets:
     return triplets._replace(speech=speech, noise=torch.stack(noises))
 
 
-def main(triplets: str = "120") -> None:
+def main(triplets: str = "120", checkpoint: str | None = None) -> None:
+    front_ends = dict(FRONT_ENDS)
+    if checkpoint is not None:
+        front_ends["trained beamformer"] = BeamformingAid.from_pretrained(checkpoint).front_end
     test = DigitTest.draw(int(triplets))
     aid = load_compensator("hearing-aid")
 
@@ -71,8 +77,8 @@ def main(triplets: str = "120") -> None:
         output: Tensor = aid(front_end(signals)[..., 0, :], ear, noise_reduction=0.0)
         return output
 
-    print(f"| ear, noise from (degrees) | {' | '.join(FRONT_ENDS)} |")
-    print("|---" * (1 + len(FRONT_ENDS)) + "|")
+    print(f"| ear, noise from (degrees) | {' | '.join(front_ends)} |")
+    print("|---" * (1 + len(front_ends)) + "|")
     for name, azimuth in AZIMUTHS.items():
         placed = DigitTest(
             place(test.material, azimuth), test.simulator, test.listener, test.noise_spl
@@ -80,7 +86,7 @@ def main(triplets: str = "120") -> None:
         for label in EARS:
             ear = torch.tensor(Audiogram.standard(label).thresholds)
             front, *directional = [
-                placed.measure(ear, partial(aided, front_end)) for front_end in FRONT_ENDS.values()
+                placed.measure(ear, partial(aided, front_end)) for front_end in front_ends.values()
             ]
             cells = [f"{front.value:.1f} [{front.low:.1f}, {front.high:.1f}]"]
             for threshold in directional:
