@@ -12,7 +12,7 @@ import sys
 import numpy as np
 
 from examples.people_recruitment import NOT_REACHED, fit_censored, read_uncomfortable_levels
-from hlsim.audiogram.discomfort import predict_uncomfortable_levels
+from hlsim.audiogram.discomfort import predict_limits, predict_uncomfortable_levels
 
 
 def main(path: str) -> None:
@@ -26,6 +26,9 @@ def main(path: str) -> None:
     print(
         f"{people} people: UCL = {constant:.1f} + {slope:.2f} threshold, SD {fit.deviation:.1f} dB"
     )
+    for name, group in (("the fit", fitted), ("the others", tested)):
+        is_above = group["ucl"] >= predict_limits(group["threshold"].to_numpy())
+        print(f"{is_above.mean():.1%} of the levels of {name} are above the predicted limit")
     reached = tested[tested["ucl"] < NOT_REACHED]
     errors = predict_uncomfortable_levels(reached["threshold"].to_numpy()) - reached["ucl"]
     print(

@@ -106,8 +106,8 @@ def evaluate_compensator(parser: Parser) -> None:
     )
     option("--rival", str, text, "nalr", choices=["nalr", "nalrp", "camfit", "for-ear"])
     text = (
-        "loudness in dB relative to a normal ear at which the loudness error is 0, a number or "
-        "numbers by level, such as 50:0,65:-5,80:-9"
+        "target of the loudness error: loudness in dB relative to a normal ear, a number or "
+        "numbers by level, such as 50:0,65:-5,80:-9; the tables name it"
     )
     option("--loudness", loudness, text, 0.0)
     parser.limit_to_ear()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from hlsim.calibration import Loudness
 from hlsim.evaluation.aid_properties import QUIET_LEVELS
 from hlsim.evaluation.compensators import UTTERANCES
 from hlsim.evaluation.conditions import COMPRESSION, NAL_R
@@ -41,11 +43,14 @@ _GROUPS = {"clean": "Clean speech", "noisy": "Speech in noise"}
 _COLUMNS: Columns = {
     "Output level minus NAL-R's (dB)": (statistic("level_over_nal_r"), "+.1f"),
     "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
-    "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
-    "Mean absolute loudness error (dB)": (statistic("loudness_error", "mean absolute"), ".1f"),
+    "Loudness error from {target} (dB)": (statistic("loudness_error"), "+.1f"),
+    "Mean absolute loudness error from {target} (dB)": (
+        statistic("loudness_error", "mean absolute"),
+        ".1f",
+    ),
     "Band error (dB)": (statistic("band_error"), ".1f"),
 }
-"""Columns beside the scores, by title."""
+"""Columns beside the scores, by title, in which ``{target}`` is the target of loudness."""
 
 _GAP_COLUMNS: Columns = {
     "Neuro-MSBG (dB)": (statistic("loss_neuro"), ".2f"),
@@ -167,7 +172,20 @@ def _about(evaluation: Evaluation) -> str:
 
 def _columns(group: Evaluation) -> Columns:
     """Return the columns of a table of scores: those of all pages, and ``_COLUMNS``."""
-    return {**score_columns(group), **_COLUMNS}
+    target = _describe_loudness(group.settings["loudness"])
+    columns = {title.format(target=target): column for title, column in _COLUMNS.items()}
+    return {**score_columns(group), **columns}
+
+
+def _describe_loudness(loudness: Loudness) -> str:
+    """Describe a target of loudness for the title of a column.
+
+    >>> _describe_loudness(0.0), _describe_loudness(-5.0), _describe_loudness({50.0: 0.0, 80.0: -9})
+    ('normal', '-5 dB', '0 dB at 50, -9 dB at 80')
+    """
+    if not isinstance(loudness, Mapping):
+        return f"{loudness:g} dB" if loudness else "normal"
+    return ", ".join(f"{value:g} dB at {level:g}" for level, value in loudness.items())
 
 
 def _details(evaluation: Evaluation) -> Section:

@@ -149,14 +149,16 @@ def test_a_profound_ear_has_another_rival_than_the_others(
     ears = tmp_path / "ears.csv"
     ears.write_text("hl_500,hl_2000\n80,95\n")
     study = evaluate_compensators(
-        {"mine": Gain()}, **options, audiograms=ears, items=2, rival="for-ear"
+        {"mine": Gain()}, **options, audiograms=ears, items=2, rival="for-ear", loudness={65: -4}
     )
     rival = "prescription for the ear"
     assert study.names[1:5] == ["NAL-R", rival, "WDRC", f"{rival} at mine's level"]
     for kind in ("gain_curves", "steady_tones", "wearing"):
         aids = [row["aid"] for row in study.details[kind]]  # for N3, which gets NAL-R
         assert "NAL-R" in aids and rival not in aids
-    assert f"{rival} at the same level" in compensators_page(study).verdict
+    page = compensators_page(study)
+    assert f"{rival} at the same level" in page.verdict
+    assert "Loudness error from -4 dB at 65 (dB)" in page.markdown()
     _, chosen = load_rival("for-ear", [N3, Audiogram([95.0] * 8)])
     sound = torch.randn(1000)
     for ear, prescription in ((N3, NALR()), (Audiogram([95.0] * 8), NALRP())):
