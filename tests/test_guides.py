@@ -56,7 +56,7 @@ SHORTER = {
     "hlsim clarity": "--jobs 1",
     "examples.training.dead_region_aid": "S2 2",
 }
-"""Options that are added to the commands that contain a text."""
+"""Options that commands that contain a text have instead of their own, or in addition."""
 
 
 def _read_steps(page: Path) -> list[tuple[str, str]]:
@@ -167,6 +167,16 @@ def _write_listeners(folder: Path, clean: torch.Tensor) -> None:
                 table.writerow(["L0001", "left", condition, *paths, 10])
 
 
+def _with_options(words: list[str], options: list[str]) -> list[str]:
+    """Return the words of a command with options in place of those of the same names."""
+    shorter = list(words)
+    for option in options:
+        if option.startswith("--") and option in shorter:
+            place = shorter.index(option)
+            del shorter[place : place + 2]
+    return shorter + options
+
+
 def _cases() -> Iterator[Any]:
     for page in PAGES:
         kinds = {kind for kind, _ in _read_steps(page)}
@@ -195,7 +205,7 @@ def test_commands_and_programs_of_a_page_run(
             continue
         words = shlex.split(text.replace("network.pt N3 200", "network.pt N3 2"), comments=True)
         for part, options in SHORTER.items():
-            words += shlex.split(options) if part in text else []
+            words = _with_options(words, shlex.split(options)) if part in text else words
         if words[0] == "hlsim":
             assert main(words[1:]) == 0, text
         else:
