@@ -1,7 +1,16 @@
-"""Limiter of the output of a compensator, which protects the ear."""
+"""Two limiters that protect the ear: of the peaks of an output, and of its bands.
 
+The limit of the peaks is the same for every ear. The limit of a band is the uncomfortable level of
+the ear, and aids have it only with ``limit_to_ear``.
+"""
+
+import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from compensators.filter_bank import filter_centres, filter_powers, level_db
+from compensators.smoothing import follow_peaks
+from hlsim.audiogram.prescription import highest_band_levels
 from hlsim.calibration import PASCAL_SPL
 
 EXPONENT = 8.0
@@ -12,6 +21,15 @@ HIGHEST_RATIO = 1e4
 
 Its eighth power fits into float32.
 """
+
+MARGIN_DB = 4.0
+"""Distance in dB of the highest level of a band from the uncomfortable level of the ear.
+
+A third of an octave, and a tone between two bands, may have the power of two bands.
+"""
+
+RELEASE = 0.1
+"""Time constant in seconds with which a band's gain recovers after it was limited to the ear."""
 
 
 def soft_limit(waveform: Tensor, limit_spl: float) -> Tensor:
@@ -24,10 +42,57 @@ def soft_limit(waveform: Tensor, limit_spl: float) -> Tensor:
         limit_spl: Limit of the magnitude of each sample of the result, in dB relative to 20
             micropascals.
 
-    >>> import torch
     >>> soft_limit(torch.tensor([0.1, 2.0, 100.0]), limit_spl=100.0)  # 2 pascals
     tensor([0.1000, 1.8318, 1.9953])
     """
     peak = 10.0 ** ((limit_spl - PASCAL_SPL) / 20.0)
     bounded = waveform.clamp(-HIGHEST_RATIO * peak, HIGHEST_RATIO * peak)
     return bounded * (1.0 + (bounded / peak).abs() ** EXPONENT) ** (-1.0 / EXPONENT)
+
+
+def find_highest_levels(limits: Tensor, bands: int) -> Tensor:
+    """Compute the level that each band of the output stays below.
+
+    Args:
+        limits: Levels of tones in dB HL that bands stay below.
+        bands: Number of bands.
+
+    Returns:
+        Highest level of each band in dB SPL.
+
+    Shape: (items, 8) -> (items, bands).
+
+    >>> find_highest_levels(torch.full((1, 8), 100.0), bands=4).shape
+    torch.Size([1, 4])
+    """
+    levels = highest_band_levels(limits, filter_centres(bands)) - MARGIN_DB
+    # A tone is in two bands, so each band has the lowest limit of itself and its neighbours.
+    return pad(levels, (1, 1), value=float("inf")).unfold(-1, 3, 1).amin(-1)
+
+
+def limit_gains(
+    gains_db: Tensor, powers: Tensor, highest_levels: Tensor, memory: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Limit the gain of each band so that the output stays below its highest level.
+
+    Args:
+        gains_db: Gains in dB.
+        powers: Power spectrum in Pa^2 of each frame of the input.
+        highest_levels: Highest level of each band in dB SPL, from ``find_highest_levels``.
+        memory: Memory of the levels of earlier frames, as ``follow_peaks`` returns it.
+
+    Returns:
+        The limited gains in dB, and the memory after the last frame.
+
+    Shape: (items, frames, bands), (items, frames, FRAME / 2 + 1), (items, bands), (items, 3, bands)
+        -> (items, frames, bands), (items, 3, bands).
+
+    >>> loud, none = torch.ones(1, 1, 129), torch.zeros(1, 3, 4)
+    >>> limit_gains(torch.zeros(1, 1, 4), loud, torch.full((1, 4), 200.0), none)[0].tolist()
+    [[[0.0, 0.0, 0.0, 0.0]]]
+    """
+    band_powers = filter_powers(powers, gains_db.shape[-1])
+    neighbours = pad(band_powers, (1, 1)).unfold(-1, 3, 1).sum(-1)
+    # The window of a frame spreads a tone over its band and the next ones.
+    levels, memory = follow_peaks(level_db(0.5 * (band_powers + neighbours)), memory, 0.0, RELEASE)
+    return torch.minimum(gains_db, highest_levels.unsqueeze(1) - levels), memory

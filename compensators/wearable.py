@@ -30,16 +30,13 @@ from compensators.filter_bank import (
     RATE,
     apply_gains,
     filter_centres,
-    filter_powers,
     frame_power,
     gain_at_rate,
-    level_db,
 )
-from compensators.limiter import soft_limit
-from compensators.smoothing import follow_peaks
+from compensators.limiter import find_highest_levels, limit_gains, soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.discomfort import predict_limits
-from hlsim.audiogram.prescription import highest_band_levels, nalr_gains_db
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     check_two_channels,
@@ -63,15 +60,6 @@ Slider = float | Tensor
 
 State = Mapping[str, Tensor]
 """Tensors that an aid remembers from one hop to the next, by name, (items, ...) each."""
-
-MARGIN_DB = 4.0
-"""Distance in dB of the highest level of a band from the uncomfortable level of the ear.
-
-A third of an octave, and a tone between two bands, may have the power of two bands.
-"""
-
-RELEASE = 0.1
-"""Time constant in seconds with which a band's gain recovers after it was limited to the ear."""
 
 SLIDER_STEP = 0.04
 """Largest change of a slider per hop, so that a change from 0 to 1 takes 0.1 s."""
@@ -195,11 +183,7 @@ class Wearable(Aid):
             return fitted
         if limits is None:
             limits = predict_limits(thresholds)
-        centres = filter_centres(self.bands)
-        highest_levels = highest_band_levels(limits, centres) - MARGIN_DB
-        # A tone is in two bands, so each band has the lowest limit of itself and its neighbours.
-        padded = nn.functional.pad(highest_levels, (1, 1), value=torch.inf)
-        return torch.cat((fitted, padded.unfold(-1, 3, 1).amin(-1)), -1)
+        return torch.cat((fitted, find_highest_levels(limits, self.bands)), -1)
 
     def compute_gains(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
@@ -264,13 +248,9 @@ class Wearable(Aid):
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
         gains_db, changed_state = self.compute_gains(powers, fitted, gliding, state)
         if limits is not None:
-            band_powers = filter_powers(own_powers, self.bands)
-            neighbours = nn.functional.pad(band_powers, (1, 1)).unfold(-1, 3, 1).sum(-1)
-            # The window of a frame spreads a tone over its band and the next ones.
-            levels, changed_state["loudest"] = follow_peaks(
-                level_db(0.5 * (band_powers + neighbours)), state["loudest"], 0.0, RELEASE
+            gains_db, changed_state["loudest"] = limit_gains(
+                gains_db, own_powers, limits, state["loudest"]
             )
-            gains_db = torch.minimum(gains_db, limits.unsqueeze(1) - levels)
         # While the first of these hops comes in, the preceding one goes out, because the filters
         # delay by one hop: its two gains are in the state.
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)

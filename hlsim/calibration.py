@@ -82,6 +82,27 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     return level.to(waveform.dtype)
 
 
+def full_scale_at(spl: float, waveform: Tensor) -> float:
+    """Compute the level of full scale at which a recording has a level in dB SPL.
+
+    All channels have one scale, because the difference between their levels counts.
+
+    Args:
+        spl: Level of the recording in dB SPL.
+        waveform: Samples of all channels. Any shape.
+
+    Returns:
+        Level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: The result is not a possible full scale; the recording may be silent.
+
+    >>> round(full_scale_at(65.0, torch.tensor([[0.1, -0.1]])))
+    85
+    """
+    return check_full_scale(spl - float(dbfs(waveform.double().flatten())))
+
+
 def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     """Scale waveforms to an RMS level in dB SPL. Silence stays silent.
 

@@ -6,6 +6,7 @@ Modules that need torch are imported in the functions, so that ``--help`` is fas
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Mapping
@@ -62,6 +63,23 @@ def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
     if getattr(options, "listener", None):
         return _read_listener(options.listener)
     return as_audiogram(options.audiogram) if options.audiogram else None
+
+
+def level_and_gain(power: float, options: argparse.Namespace) -> tuple[float, float]:
+    """Compute the level of a recording and its gain for ``--spl``, both in dB.
+
+    Args:
+        power: Mean square of the samples of all channels.
+        options: Options ``full_scale_spl`` and ``spl``, which is None if it is not set.
+
+    Returns:
+        The level in dB SPL before the gain, and the gain, 0 if ``spl`` is None.
+
+    >>> level_and_gain(0.01, argparse.Namespace(full_scale_spl=94.0, spl=65.0))
+    (74.0, -9.0)
+    """
+    level = 10.0 * math.log10(power) + options.full_scale_spl
+    return level, 0.0 if options.spl is None else options.spl - level
 
 
 def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:

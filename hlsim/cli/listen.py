@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from hlsim.cli.inputs import (
     build_compensator,
     build_simulator,
     check_extras,
+    level_and_gain,
     parse_ears,
     read_sliders,
     use_one_thread,
@@ -115,16 +115,15 @@ def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> 
 
     recording = scan_audio(file)
     rate = recording.sample_rate
-    level = 10.0 * math.log10(recording.power) + options.full_scale_spl
-    target_level = level if options.spl is None else options.spl
+    level, gain_db = level_and_gain(recording.power, options)
     stop = min(recording.samples, max(1, round(options.seconds * rate)))
     (waveform,) = read_parts(recording, [(0, stop)])
     with torch.no_grad():
-        scaled = waveform * 10.0 ** ((target_level - level) / 20.0)
+        scaled = waveform * 10.0 ** (gain_db / 20.0)
         sounds = convert_at(str(file), make_sounds, scaled, rate)
     gain = gain_to_pascals(options.full_scale_spl)
     player = make_player({"": {label: gain * sound for label, sound in sounds.items()}}, rate)
-    text = f"{file}, {target_level:.0f} dB SPL, {stop / rate:.1f} s"
+    text = f"{file}, {level + gain_db:.0f} dB SPL, {stop / rate:.1f} s"
     if stop < recording.samples:
         text += f" of {recording.samples / rate:.1f} s"
     return Section(file.name, [f"{text}."], player=player)

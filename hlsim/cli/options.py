@@ -153,11 +153,11 @@ class Parser(argparse.ArgumentParser):
             text: Beginning of the help text.
         """
         help_ = (
-            f"{text}: msbg (exact), or your own simulator as package.module:name or "
-            "path/to/file.py:name, a function (waveform, audiogram) -> waveform or a class that is "
-            "constructed without arguments and whose objects are such functions; waveforms "
-            "(items, time) are in pascals, audiograms (items, 8) in dB HL, and the sample rate is "
-            "its attribute sample_rate or else 16000 Hz"
+            f"{text}: msbg (exact), a checkpoint by name or folder, or your own simulator as "
+            "package.module:name or path/to/file.py:name, a function (waveform, audiogram) -> "
+            "waveform or a class that is constructed without arguments and whose objects are such "
+            "functions; waveforms (items, time) are in pascals, audiograms (items, 8) in dB HL, "
+            "and the sample rate is its attribute sample_rate or else 16000 Hz"
         )
         self.option("--teacher", str, help_, "msbg")
 

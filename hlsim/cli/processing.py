@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from hlsim.cli.inputs import (
     build_compensator,
     build_simulator,
+    level_and_gain,
     parse_ears,
     read_sliders,
     use_one_thread,
@@ -168,8 +169,7 @@ def _process_file(
     from hlsim.cli.long_recordings import Meter, process_recording, read_all
 
     recording = scan_audio(source)
-    level = 10.0 * math.log10(recording.power) + options.full_scale_spl
-    gain_db = 0.0 if options.spl is None else options.spl - level
+    level, gain_db = level_and_gain(recording.power, options)
     model = build(recording.sample_rate)
     gain = 10.0 ** (gain_db / 20.0)
     size = recording.channels, recording.samples, recording.sample_rate

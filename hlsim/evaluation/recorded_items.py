@@ -32,7 +32,7 @@ from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, EARS
 from hlsim.audiogram.table import read_audiograms, read_listeners
 from hlsim.audiogram.value import ears_in_row
-from hlsim.calibration import check_full_scale, dbfs
+from hlsim.calibration import full_scale_at
 from hlsim.evaluation.running.fingerprint import value_hash
 from hlsim.evaluation.study import Item
 from hlsim.files import convert_at, path_below, read_table, sha256, warn_of_unused
@@ -141,9 +141,7 @@ class RecordedItem:
         clean = self._select_channel(self.clean, waveform)
         full_scale = self.full_scale_spl
         if self.spl is not None:
-            # Both ears have one gain, because the difference of their levels counts.
-            level = float(dbfs(waveform.double().flatten()))
-            full_scale = check_full_scale(self.spl - level)
+            full_scale = full_scale_at(self.spl, waveform)
         return Item(
             self.name,
             clean,

@@ -192,9 +192,9 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float]:
     scores = rows.reindex(columns=columns).astype(float)
     difference = scores[columns[0]] - scores[columns[1]]
     return {
-        "lcc": scores.corr().iloc[0, 1],
-        "srcc": scores.corr(method="spearman").iloc[0, 1],
-        "mse": (difference**2).mean(),
+        "lcc": float(scores.corr().iloc[0, 1]),
+        "srcc": float(scores.corr(method="spearman").iloc[0, 1]),
+        "mse": float((difference**2).mean()),
     }
 
 

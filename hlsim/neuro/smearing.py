@@ -1,4 +1,4 @@
-"""Smearing as in MSBG, but with bounded derivatives.
+"""Smearing as in MSBG, but with bounded derivatives, for networks of the structure ``bands``.
 
 Where smearing changes the sign of a power or fills an empty frequency, the derivatives of MSBG have
 no bound. Here the output itself is a smooth function of the input, so that first and second

@@ -41,7 +41,7 @@ def _verify(options: argparse.Namespace) -> None:
     if options.plot:
         check_extras("eval")
     from hlsim.audio import read_audio
-    from hlsim.calibration import level_spl
+    from hlsim.calibration import full_scale_at
     from hlsim.evaluation.fitting.verification import verify as verify_aid
     from hlsim.files import write_atomically
 
@@ -54,7 +54,7 @@ def _verify(options: argparse.Namespace) -> None:
         )
     full_scale_spl = options.full_scale_spl
     if options.spl is not None:
-        full_scale_spl = options.spl - float(level_spl(input_.flatten(), 0.0))
+        full_scale_spl = full_scale_at(options.spl, input_)
     result = verify_aid(
         input_.squeeze(0),
         output.squeeze(0),

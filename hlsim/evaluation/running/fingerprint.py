@@ -1,4 +1,6 @@
-"""Fingerprints: hashes that show whether a stored score is still valid.
+"""Fingerprints: hashes of which the key of a stored score consists.
+
+A score is computed again if its key is not in the store (``run_measures`` of ``study.py``).
 
 The fingerprint of a module covers everything on which its outputs depend: class names, settings and
 tensors and, for a class outside hlsim and torch, the file with its source code. The code of hlsim
