@@ -96,7 +96,8 @@ class FilterAndSum(nn.Module):
         Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The waveform has another number of microphones or ears.
+            ValueError: The samples are not floating-point numbers with time last, there are none,
+                or there is another number of microphones or ears.
         """
         signals = as_samples(waveform)
         self.check_microphones(signals)
@@ -238,12 +239,12 @@ class DifferentialMicrophone(FilterAndSum):
 
     Args:
         pattern: "cardioid", "supercardioid", "hypercardioid" or "dipole".
-        spacing: Distance between the two microphones of a side in m.
-        lowest: Frequency in Hz at which the output is 3 dB softer.
+        spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
+        lowest: Frequency in Hz, 20 to 2000, at which sound from the front is 3 dB softer.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: The pattern is unknown, or a value is out of range.
 
     >>> front_end = DifferentialMicrophone("cardioid")
     >>> front_end(torch.zeros(2, 2, 16000)).shape
@@ -280,8 +281,8 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
 
     Args:
         seconds: Time constant of the averages in seconds.
-        spacing: Distance between the two microphones of a side in m.
-        lowest: Frequency in Hz at which the output is 3 dB softer.
+        spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
+        lowest: Frequency in Hz, 20 to 2000, at which sound from the front is 3 dB softer.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:

@@ -5,7 +5,7 @@ Every 4 ms (a *hop*), an aid computes the gains of its bands from the last 16 ms
 
 - An *item* is one signal for one ear. Methods with ``samples`` take all items of a call as rows,
   (items, time), in pascals at 16 kHz.
-- ``fitted`` (items, n) holds the parameters that ``fit`` computes once from the audiogram.
+- ``fitted`` (items, n) holds the parameters that ``fit_with_limits`` computes once for the ear.
 - A *slider* is a setting from 0 to 1, such as ``noise_reduction``, which a user may change while a
   stream runs.
 - The *state* is all that an aid remembers from one hop to the next: tensors (items, ...) by name,
@@ -225,7 +225,8 @@ class Wearable(Aid):
 
         Args:
             samples: Input in pascals at 16 kHz.
-            fitted: Parameters of the aid for the ear of each item, from ``fit``.
+            fitted: Parameters of the aid for the ear of each item, from ``fit_with_limits``. If the
+                aid is ``linked``, items are pairs: the left and the right ear of a listener.
             sliders: New values of the sliders, such as noise reduction. A slider changes gradually
                 from its previous value to the new one.
             state: Memory of earlier hops: ``initial_state``, or the state that the call for the
@@ -361,7 +362,7 @@ class Wearable(Aid):
 
         Returns:
             The common leading dimensions of waveform and ears, whose product is the number of
-            items, and the parameters from ``fit``, (items, n).
+            items, and the parameters from ``fit_with_limits``, (items, n).
 
         Raises:
             ValueError: An ear is not valid, or shapes do not fit.

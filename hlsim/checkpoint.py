@@ -330,6 +330,9 @@ class HubModel:
     ``huggingface_hub.PyTorchModelHubMixin``, which is no base class here because hlsim works
     without this package.
 
+    Subclasses define ``kind``, ``config_class`` and ``config``, and may define ``build_options``,
+    arguments of the class that ``from_pretrained`` passes to it.
+
     >>> import hlsim
     >>> with TemporaryDirectory() as folder:
     ...     hlsim.HearingAid().save_pretrained(folder, license="mit")
@@ -382,8 +385,9 @@ class HubModel:
         """Load a model in evaluation mode, whose weights do not require a gradient.
 
         Args:
-            name: Folder of a checkpoint, name of one that ships with hlsim, or ``user/name`` of a
-                repository of the Hub, which is downloaded unless it is in the cache.
+            name: Folder of a checkpoint or of a training, name of a checkpoint that ships with
+                hlsim, or ``user/name`` of a repository of the Hub, which is downloaded unless it is
+                in the cache.
             revision: Branch, tag or commit of the repository.
             cache_dir: Folder of downloads instead of that of huggingface_hub.
             token: Token of a private repository.
@@ -392,6 +396,7 @@ class HubModel:
         Raises:
             ValueError: There is no such checkpoint, it is damaged or of another kind, or a setting
                 is out of range.
+            OSError: The repository does not exist or cannot be downloaded.
             MissingExtraError: A repository is to be downloaded, and the extra ``hub`` is missing.
         """
         try:
@@ -436,6 +441,8 @@ class HubModel:
             Address of the commit.
 
         Raises:
+            ValueError: A weight is NaN or infinite.
+            OSError: The Hub cannot be reached, or refuses the upload.
             MissingExtraError: The extra ``hub`` is not installed.
         """
         api = require("huggingface_hub", "hub").HfApi(token=token)

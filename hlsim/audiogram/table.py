@@ -31,7 +31,8 @@ def read_audiograms(
     A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``.25k``, or ``L250`` and
     ``R250`` if each row has both ears. A long table has the columns ``frequency`` and
     ``threshold``, and ``listener`` and ``ear`` if it has several ears. Other columns may have any
-    name. A file may have commas, semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
+    name, in a long table only if it has ``listener`` and ``ear``. A file may have commas,
+    semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
         path: A CSV file, a pandas ``DataFrame``, or ``"standard"`` for Bisgaard's audiograms N1 to
@@ -40,14 +41,16 @@ def read_audiograms(
             rejected, and N7, which has them, is left out of the standard audiograms.
 
     Returns:
-        A list with two members per ear: the texts of its row by column, and its audiogram. The
-        names of the columns ``listener`` and ``ear`` are in lower case. For a row with both ears,
-        the text in the column ``ear`` is ``left`` or ``right``.
+        A list of pairs, one per ear: the texts of its row by column, and its audiogram. The names
+        of the columns ``listener`` and ``ear`` are in lower case. For a row with both ears, the
+        text in the column ``ear`` is ``left`` or ``right``. For a long table, the row has
+        ``listener``, ``ear`` and a column per frequency, such as ``500 Hz``.
 
     Raises:
-        ValueError: The file cannot be read, has no rows, a row is not an audiogram, or a column
-            looks like thresholds and is not understood. The message names the file, the line and
-            the column.
+        ValueError: The file cannot be read, has no rows, a row is not an audiogram, columns
+            contradict each other, an ear has two thresholds at one frequency, or a column looks
+            like thresholds and is not understood. The message names the file, and the line or row
+            and the column where there is one.
 
     Example:
         >>> import hlsim
@@ -62,7 +65,7 @@ def read_audiograms(
     audiograms = []
     for place, row in _read_rows(path):
         for name, ear in convert_at(place, _read_ears, row, highest).items():
-            is_named = name is None or row.get("ear")
+            is_named = name is None or row.get("ear", "").lower() in EAR_NAMES
             audiograms.append((row if is_named else {**row, "ear": str(name)}, ear))
     return audiograms
 

@@ -38,6 +38,8 @@ class Meter:
         power: Mean square of all samples of all channels.
         peak: Largest magnitude of a sample.
 
+    Both hold once all parts have passed. A meter measures one signal.
+
     >>> import torch
     >>> meter = Meter()
     >>> parts = list(meter.measure([torch.ones(1, 2), -torch.ones(1, 2)], 4, print))

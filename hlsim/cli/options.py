@@ -147,7 +147,7 @@ class Parser(argparse.ArgumentParser):
         (group or self).add_argument(name, action="store_true", help=text)
 
     def teacher(self, text: str) -> None:
-        """Declare ``--teacher``, the simulator whose output others should match.
+        """Declare ``--teacher``, the simulator whose output others match, by default ``msbg``.
 
         Args:
             text: Beginning of the help text.

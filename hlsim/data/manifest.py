@@ -47,8 +47,9 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
 
     Args:
         path: CSV file with a column ``path`` and optional columns ``noisy`` (path of the noisy
-            version), ``speaker`` and ``split``, in upper or lower case. Without the column
-            ``split``, all utterances are in the split ``train``.
+            version), ``speaker`` and ``split``; their names may be in upper or lower case. A split
+            is ``train``, ``valid`` or ``test``. Without the column ``split``, all utterances are in
+            the split ``train``. Other columns cause a warning.
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
@@ -128,8 +129,8 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
 
     Raises:
         ValueError: There are no rows, a file is both clean and noisy, a noisy file or a clean file
-            without a noisy one is listed twice, noise is listed as speech, or a file or a speaker
-            is in two splits.
+            without a noisy one is listed twice, a clean file is in a folder of noises, mixtures or
+            impulse responses by its name, or a file or a speaker is in two splits.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):

@@ -318,7 +318,7 @@ def _describe_unused_outputs(
         all_pairs: These pairs, and those that a stride leaves out.
 
     Raises:
-        ValueError: No pair has an output.
+        ValueError: The folder does not exist or has no audio, or no pair has an output.
     """
     names = {path.relative_to(folder).as_posix() for path in find_audio(folder, by_name=True)}
     if not names & {pair.output_name for pair in pairs}:

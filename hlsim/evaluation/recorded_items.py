@@ -390,7 +390,7 @@ def _merge(earlier: RecordedItem, recording: RecordedItem) -> RecordedItem:
     """Return a recording with its own outputs and those of an earlier one of the same item.
 
     Raises:
-        ValueError: Both have an output under one condition, or their ears differ.
+        ValueError: Both have an output under one condition, or their audiograms differ.
     """
     for condition in earlier.outputs.keys() & recording.outputs.keys():
         raise ValueError(

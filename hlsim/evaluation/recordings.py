@@ -348,7 +348,10 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
 
 
 def _describe_unrelated(table: DataFrame) -> list[str]:
-    """Return a list with a note about outputs unlike their clean speech, or an empty list."""
+    """Return a list with a note about outputs unlike their clean speech, or an empty list.
+
+    These are the rows of the table that have a ``level`` but no ``lag_ms``.
+    """
     values = table.reindex(columns=["level", "lag_ms"])
     unrelated = table[values["level"].notna() & values["lag_ms"].isna()]
     if unrelated.empty:

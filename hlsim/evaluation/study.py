@@ -486,8 +486,8 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     """Process an item, and cut its signals and the output to the length of the shorter one.
 
     Raises:
-        ValueError: The output has another shape, differs in length by more than 0.1 s, or is not
-            finite.
+        ValueError: The output has another type or shape, differs in length by more than 0.1 s, or
+            is not finite.
     """
     output = cut_output(condition.output(item), item.clean, item.sample_rate)
     samples = output.shape[-1]

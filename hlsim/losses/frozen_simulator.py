@@ -202,12 +202,15 @@ def _normal_ear() -> Tensor:
 
 
 def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
-    """Return an output, or raise ValueError unless it is a real tensor of the expected shape.
+    """Return what a module returned, if it is a floating-point tensor of the expected shape.
 
     Args:
         output: Value to validate.
         source: Name of the module or function that returned it, for the message.
         shape: Expected shape.
+
+    Raises:
+        ValueError: It is anything else.
 
     >>> check_shape(torch.zeros(2), "criterion", (2,))
     tensor([0., 0.])

@@ -34,7 +34,10 @@ _Metric: Any = require("torchmetrics", "train").Metric
 
 
 class _MeanScore(_Metric):
-    """Mean of a score over all items since the last ``reset``, the base class of the metrics.
+    """Mean of a score over the items that were scored since the last ``reset``.
+
+    Items that cannot be scored do not count, and neither do those beyond ``limit``. This is the
+    base class of the metrics, whose arguments ``HASPI`` describes.
 
     Subclasses set ``score`` to the function that computes scores, and ``ears_per_score`` to 2 if
     both ears of a listener have one score in common.
@@ -231,7 +234,7 @@ class _MeanScore(_Metric):
             self.count += 1
 
     def compute(self) -> Tensor:
-        """Return the mean score of all items since the last reset, NaN if none was scored.
+        """Return the mean score of the items that were scored since the last reset, NaN if none.
 
         Shape: (), float32.
         """

@@ -272,12 +272,13 @@ class MSBG(nn.Module):
     def _simulate_group(
         self, signals: Tensor, ears: Tensor, is_last: bool, group: _Group
     ) -> Tensor:
-        """Compute the perceived signals of items whose ears belong to one group.
+        """Compute the perceived signals, in pascals, of items whose ears belong to one group.
 
         Args:
             signals: Signals in pascals.
             ears: Thresholds at the frequencies of the group in dB HL.
-            is_last: Whether the signals end here, and are not cut from longer ones.
+            is_last: Whether the signals end here, and are not cut from longer ones. It has an
+                effect with ``aligned=False`` only.
             group: Properties that the ears share.
 
         Shape: (items, time), (items, frequencies) -> (items, time), or longer with
@@ -343,7 +344,8 @@ def estimate_delay(
     the time from the impulse to the largest magnitude of the output. The delay depends on the ear
     and on the level, because MSBG delays low frequencies more than high ones: at 44.1 kHz it is
     1078 samples without a hearing loss and 1237 to 1271 samples with one. To align signals, use
-    ``MSBG.delay``, which depends on the severity of the loss only.
+    ``MSBG.delay``, in samples at 44.1 kHz, which depends only on the severity of the loss and on
+    the argument ``smearing``.
 
     Source: the Neuro-MSBG paper, Section III-A.
 
@@ -358,7 +360,7 @@ def estimate_delay(
         The delay in samples at the simulator's sample rate.
 
     Raises:
-        ValueError: There is no audiogram, or it has more than one ear.
+        ValueError: There is no audiogram, it has more than one ear, or the simulator rejects it.
 
     >>> estimate_delay(MSBG("NH", sample_rate=44100, aligned=False))
     1078

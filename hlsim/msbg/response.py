@@ -119,13 +119,14 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
 
 @constant
 def _taps(rate: int, kind: str) -> NDArray[np.float64]:
-    """Compute one impulse response for each severity, from the response of its filter bank.
+    """Compute one impulse response for each severity, from ``fixed_response`` of its filter bank.
 
     Args:
         rate: Sample rate in Hz.
-        kind: ``"phase"`` for the phase of the filter bank; ``"difference"`` for this phase minus
-            that of the filter bank for normal ears; ``"normal ear"`` for the phase of the filter
-            bank with the magnitude of that for normal ears.
+        kind: ``"phase"`` for the phase of this response, at a magnitude of 1 that falls where the
+            response is below a tenth of its maximum; ``"difference"`` for this phase minus that for
+            normal ears; ``"normal ear"`` for this phase with the magnitude of the response for
+            normal ears.
 
     Returns:
         Coefficients, (severities, 2 * half_length(rate)).

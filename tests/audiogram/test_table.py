@@ -162,6 +162,7 @@ def test_the_example_table_has_the_standard_ears_that_simulators_take() -> None:
 def test_both_ears_in_one_row_and_one_row_per_threshold(tmp_path: Path) -> None:
     tables = {
         "wide.csv": "Listener,L250,L1k,right_250,R 1000 Hz\nA,10,20,30,40\nB,,15,,\n",
+        "both.csv": "Listener,Ear,L250,L1k,R250,R1k\nA,both,10,20,30,40\nB,both,,15,,\n",
         "long.csv": "listener,ear,frequency,threshold\nA,L,250,10\nA,L,1k,20\nA,re,250,30\n"
         "A,re,1000 Hz,40\nB,left,1000,15\n",
     }

@@ -16,7 +16,7 @@ from compensators.filter_bank import (
     frame_power,
     level_db,
 )
-from compensators.smoothing import _weight_of_past, follow_peaks
+from compensators.smoothing import follow_peaks, weight_of_past
 from hlsim.calibration import set_level
 from tests.compensators.aids import tone
 
@@ -64,7 +64,7 @@ def test_the_peak_follower_equals_the_recursion_of_giannoulis(
     values = 60.0 * torch.rand(2, 700, 3)
     values[:, 200:400] = 0.0
     values.requires_grad_()
-    up, down = _weight_of_past(attack), _weight_of_past(release)
+    up, down = weight_of_past(attack), weight_of_past(release)
     levels, state = follow_peaks(values, torch.zeros(2, 3, 3), attack, release)
     peak = smooth = torch.zeros(2, 3)
     for frame in range(700):

@@ -118,7 +118,8 @@ def run_parallel(
 def _run_in_one_process(calls: Sequence[Any]) -> Iterator[Any]:
     """Yield the results of joblib's delayed calls, which another process computes one by one.
 
-    joblib would use two processes, because its only one would be this process.
+    joblib cannot do this: with one job, it computes in this process. An error of a call is raised,
+    and ``BrokenProcessPool`` if the other process ends.
     """
     from joblib.externals.loky import ProcessPoolExecutor
 

@@ -269,10 +269,11 @@ def _bandwidths(control: Tensor, cells: HairCells, channels: slice, extent: Exte
     """Compute the bandwidths of the filters relative to normal hearing; they grow with the level.
 
     Up to a mean level of 50 dB SPL in the control filter, the bandwidth is that of the hair cells,
-    and from 100 dB SPL on that of the control filter.
+    and from 100 dB SPL on that of the control filter. In between it is linear in dB.
 
     Args:
-        control: Power of the control filters' envelopes. Shape: (items, channels, padded).
+        control: Power of the control filters' envelopes, 1 at 0 dB SPL. Shape: (items, channels,
+            padded).
         cells: Hair cells of these channels.
         channels: Range of these channels among the 32 of the ear.
         extent: Number of samples of each item before padding.
@@ -330,7 +331,7 @@ def simulate_cochlea(
             are empty otherwise.
 
     Returns:
-        Response of the channels, see ``CochlearOutput``. Shape: (items, channels, padded).
+        Response of the channels, with the shapes that ``CochlearOutput`` describes.
 
     >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
     >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)
