@@ -361,7 +361,7 @@ class DirectionalAid(nn.Module):
         aid: Aid of two ears, such as those of ``load_compensator``, at the same sample rate.
 
     Raises:
-        ValueError: The aid is not a module, or was built for another sample rate.
+        ValueError: One of them is not a module, or the aid was built for another sample rate.
 
     >>> from compensators import NALR
     >>> aid = DirectionalAid(DifferentialMicrophone(), NALR())
@@ -376,6 +376,8 @@ class DirectionalAid(nn.Module):
 
     def __init__(self, front_end: FilterAndSum, aid: nn.Module) -> None:
         super().__init__()
+        if not isinstance(front_end, nn.Module):
+            raise ValueError(f"expected a front end, got {front_end!r}; write BinauralMVDR()")
         if not isinstance(aid, nn.Module):
             raise ValueError(f"expected an aid, got {aid!r}; load it by hlsim.load_compensator")
         check_attributes(aid, "an aid", sample_rate=front_end.sample_rate)

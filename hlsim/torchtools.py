@@ -284,12 +284,12 @@ def as_type_of(signal: Audio, result: Tensor) -> Audio:
 
     Args:
         signal: Signal from which the result was computed.
-        result: Tensor, on the CPU and without a gradient if the signal is an array.
+        result: Tensor, on the CPU if the signal is an array, which has no gradient.
 
     >>> as_type_of(np.ones(2), torch.tensor(0.5))
     np.float32(0.5)
     """
-    return result if isinstance(signal, Tensor) else result.numpy()[()]
+    return result if isinstance(signal, Tensor) else result.detach().numpy()[()]
 
 
 def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tensor:

@@ -130,7 +130,7 @@ class Audiogram:
         for (hz, level), threshold in zip(self.ucl, thresholds, strict=True):
             if level < min(threshold, UCL_NOT_REACHED):
                 raise ValueError(
-                    f"expected uncomfortable levels above the thresholds, got {level:g} dB HL at "
+                    f"expected no uncomfortable level below the threshold, got {level:g} dB HL at "
                     f"{hz:g} Hz, where the threshold is {threshold:g} dB HL; correct one of them"
                 )
 
@@ -474,8 +474,8 @@ def ears_in_row(
 
     Raises:
         ValueError: There is no measured threshold, a column is not understood, a text is not a
-            level from -10 to ``highest``, some columns name an ear and others do not, or a remark
-            is a number.
+            level from -10 to ``highest``, some columns name an ear and others do not, an ear has
+            uncomfortable levels but no thresholds, or a remark is a number.
 
     >>> ears_in_row({"L500": "20", "R500": "30"})
     {'left': Audiogram({500: 20}), 'right': Audiogram({500: 30})}
@@ -498,10 +498,16 @@ def ears_in_row(
             "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got the "
             f"columns {', '.join(row)}; add columns or thresholds"
         )
-    if None in points and len(points | ucl) > 1:
+    if None in points | ucl and len(points | ucl) > 1:
         raise ValueError(
-            "expected all columns of thresholds to name the ear, such as L500 and R500, or none of "
-            f"them, got {', '.join(threshold_columns(row))}; rename the columns"
+            "expected all columns of thresholds and uncomfortable levels to name the ear, such as "
+            f"L500 and ucl_L500, or none of them, got {', '.join(threshold_columns(row))}; rename "
+            "the columns"
+        )
+    for ear in ucl.keys() - points.keys():
+        raise ValueError(
+            f"expected thresholds of the {ear} ear, of which there are uncomfortable levels, got "
+            "none; add thresholds, or remove its uncomfortable levels"
         )
     return {
         ear: replace(_from_mapping(points[ear]), ucl=read_points(ucl.get(ear)))
@@ -544,7 +550,8 @@ def _check_remark(text: str, column: str) -> None:
         return
     raise ValueError(
         f"column {column!r} is {text!r}; expected a remark in words, because another column has "
-        "this frequency; rename the column if it holds no thresholds, or remove one of the two"
+        "this frequency; rename the column if it holds no thresholds (ucl_500 is an uncomfortable "
+        "level), or remove one of the two"
     )
 
 

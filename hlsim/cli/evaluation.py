@@ -122,11 +122,14 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
 
     checkpoints = _read_labels(options.names)
     ear: Any = parse_ear(options)
+    notes = warn_of_other_ears(checkpoints, ear)
+    if options.limit_to_ear:
+        notes = [*notes, "The compensators are limited to the ear (--limit-to-ear)."]
     _run_study(
         options,
         evaluate_compensators,
         compensators_page,
-        notes=warn_of_other_ears(checkpoints, ear),
+        notes=notes,
         compensators={
             label: load_compensator(name, limit_to_ear=options.limit_to_ear)
             for label, name in checkpoints.items()

@@ -208,7 +208,7 @@ class CompensatorRecipe(TrainingRecipe):
             self._require("kind", self.kind == "hearing-aid", expected)
         self._require("limit_to_ear", isinstance(self.limit_to_ear, bool), "true or false")
         if self.limit_to_ear:
-            expected = "hearing-aid, because only a hearing aid limits its output to the ear"
+            expected = "hearing-aid, the only kind that is trained with limit_to_ear"
             self._require("kind", self.kind == "hearing-aid", expected)
 
     def trains_noise_reduction(self) -> bool:

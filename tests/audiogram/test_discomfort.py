@@ -84,6 +84,10 @@ def test_tables_may_have_uncomfortable_levels(tmp_path: Path) -> None:
     table.write_text("hl_500,ucl_500\n30,9\n")
     with pytest.raises(ValueError, match=r"column ucl_500 is '9'; expected a level from 20 to 140"):
         read_audiograms(table)
+    for columns, message in [("R500,ucl_500", "to name the ear"), ("x,ucl_R500", "the right ear")]:
+        table.write_text(f"L500,{columns}\n30,30,95\n")
+        with pytest.raises(ValueError, match=message):
+            read_audiograms(table)
     table.write_text("hl_500,ucl_500\n30,NR\n")
     with pytest.raises(ValueError, match=r"'NR'.* If no level was uncomfortable write 115; for"):
         read_audiograms(table)

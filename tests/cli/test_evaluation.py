@@ -89,6 +89,18 @@ def test_every_option_reaches_its_parameter(
         assert arguments["store"] == tmp_path / "out" / "scores.jsonl"
 
 
+@pytest.mark.parametrize("words", ["", " --limit-to-ear"])
+def test_a_page_says_that_aids_were_limited_to_the_ear(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Mock()
+    monkeypatch.setattr("hlsim.cli.evaluation._run_study", run)
+    command = f"evaluate-compensator wdrc --speech {tmp_path} --out {tmp_path}{words}"
+    assert main(command.split()) == 0
+    notes = " ".join(run.call_args.kwargs["notes"])
+    assert ("limited to the ear" in notes) == bool(words)
+
+
 def _letter(value: Any) -> Any:
     """Return the name of a path of one letter, and any other value unchanged."""
     return value.name if isinstance(value, Path) and len(value.name) == 1 else value

@@ -209,9 +209,12 @@ def test_beamforming_aid_is_a_checkpoint_of_both_parts(tmp_path: Path, speech: T
     assert sum(weights.numel() for weights in AdaptiveBeamformer().parameters()) <= 100_000
     save_compensator(aid, tmp_path / "mine")
     loaded = load_compensator(tmp_path / "mine", full_scale_spl=114.0, limit_to_ear=True)
-    assert loaded.aid.limit_to_ear
-    loaded.aid.limit_to_ear = False
+    assert loaded.aid.limit_to_ear and loaded.limit_to_ear
+    loaded.limit_to_ear = False
+    assert not loaded.aid.limit_to_ear
     signals, ears = speech.expand(2, 2, -1), ["N2", "N4"]
+    array = AdaptiveBeamformer(config)(signals.numpy())  # its network requires a gradient
+    assert isinstance(array, np.ndarray)
     torch.testing.assert_close(loaded(0.1 * signals, ears), 0.1 * aid(signals, ears))
     with pytest.raises(ValueError, match="an aid with sample_rate=16000, got 44100"):
         load_compensator(tmp_path / "mine", sample_rate=44100)
@@ -245,6 +248,8 @@ def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
         DirectionalAid(front_end, NALR(sample_rate=44100))
     with pytest.raises(ValueError, match="load it by"):
         DirectionalAid(front_end, "nalr")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"write BinauralMVDR\(\)"):
+        DirectionalAid(BinauralMVDR, NALR())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected a pattern out of dipole"):
         DifferentialMicrophone("omni")
     with pytest.raises(ValueError, match="spacing"):
