@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from compensators.config import BeamformerConfig, HearingAidConfig
 from compensators.directional import (
+    POWER_FLOOR,
     DirectionalAid,
     FilterAndSum,
     front_blocking_taps,
@@ -42,9 +43,6 @@ BLOCKED = 2
 SIGNALS = 1 + BLOCKED
 """Number of signals per ear: the beam to the front, and those without sound from the front."""
 
-POWER_FLOOR = 1e-12
-"""Power in Pa^2, about -26 dB SPL, that is added to the power of each band."""
-
 INITIAL_LOADING = 1e-2
 """Power that is added to that of each blocked signal before training, relative to this power."""
 
@@ -59,12 +57,12 @@ term, speech in quiet would be cancelled.
 class AdaptiveBeamformer(FilterAndSum):
     """A trained adaptive beamformer to the front, with at most 1 ms of look-ahead.
 
-    Fixed filters compute a beam to the front for each ear, that of ``BinauralMVDR``, and three
+    For each ear, fixed filters compute a beam to the front, that of ``BinauralMVDR``, and two
     signals from which sound from the front is removed. Every 4 ms and in each band of the hearing
-    aid, weights are computed with which the three signals, subtracted from a beam, leave the least
+    aid, weights are computed with which the two signals, subtracted from the beam, leave the least
     power (generalised sidelobe canceller, Griffiths and Jim 1982). They come from averages over the
     recent past. A small network decides in each band how much a frame counts in the averages, and
-    how large a power is added to those of the three signals (loading), which makes the weights
+    how large a power is added to those of the two signals (loading), which makes the weights
     smaller. Before training, all frames count alike.
 
     Args:

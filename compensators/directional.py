@@ -49,8 +49,8 @@ _DISTORTION_WEIGHT = 1e3
 _LOWEST_BLOCKED = 100.0
 """Frequency in Hz at which the cardioids of ``front_blocking_taps`` are 3 dB softer."""
 
-_POWER_FLOOR = 1e-12
-"""Power in Pa^2, about -26 dB SPL, that is added to denominators."""
+POWER_FLOOR = 1e-12
+"""Power in Pa^2, about -26 dB SPL, that is added to powers by which others are divided."""
 
 
 class FilterAndSum(nn.Module):
@@ -316,7 +316,7 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
         flat = products.flatten(0, -2).T.unsqueeze(0)
         averages = exponential_average(flat, state["powers"].reshape(1, -1), self.past_weight)
         common, rear = averages[0].T.reshape(products.shape).unbind(-3)
-        share = (common / (rear + _POWER_FLOOR)).clamp(0.0, 1.0)
+        share = (common / (rear + POWER_FLOOR)).clamp(0.0, 1.0)
         powers = torch.stack((common, rear), -3)[..., -1]
         past = samples[..., waveform.shape[-1] :]
         return to_front - share * to_rear, {"past": past, "powers": powers}

@@ -135,6 +135,7 @@ def draw_scenes(
     generator: torch.Generator,
     *,
     mismatch: float = 0.0,
+    spacing: float = 0.01,
 ) -> Scene:
     """Draw random scenes at 16 kHz for training, see ``make_scene``.
 
@@ -149,6 +150,7 @@ def draw_scenes(
         snr: Signal-to-noise ratio of each scene in dB, (items,).
         generator: Source of the random numbers.
         mismatch: Standard deviation in dB of the gains of the microphones.
+        spacing: Distance between the two microphones of a side in m.
 
     Returns:
         Scenes with leading dimension (items,). The gains of the microphones are those of ``input``
@@ -183,6 +185,7 @@ def draw_scenes(
             diffuse=diffuse,
             snr=float(snr[item]),
             target_azimuth=draw(-10.0, 10.0),
+            spacing=spacing,
             seed=int(draw(0.0, 2.0**31)),
         )
         normal = np.random.default_rng(int(draw(0.0, 2.0**31))).normal(

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from compensators.config import BeamformerConfig
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
@@ -276,8 +277,9 @@ class _CompensatorBatches(_RandomBatches):
         snr = draw_uniform(*recipe.snr, (count,), generator)
         is_noisy = torch.rand(count, generator=generator) < recipe.noisy
         snr = torch.where(is_noisy, snr, _QUIET_SNR)
-        mismatch = recipe.mismatch
-        scenes = draw_scenes(clean, voices, noise, snr, generator, mismatch=mismatch)
+        spacing = BeamformerConfig.from_dict(recipe.model).spacing
+        microphones = {"mismatch": recipe.mismatch, "spacing": spacing}
+        scenes = draw_scenes(clean, voices, noise, snr, generator, **microphones)
         ears = self.draw_ears(count, generator).unsqueeze(1).expand(-1, 2, -1)
         return {"clean": scenes.reference, "signal": scenes.input, "thresholds": ears}
 

@@ -59,6 +59,11 @@ class CompensatorTraining(TrainingModule):
         network = initial_network(recipe, partial(build_compensator, config), load)
         if isinstance(network, HearingAid):
             network.limit_to_ear = recipe.limit_to_ear
+        elif isinstance(config, BeamformerConfig) and network.config.spacing != config.spacing:
+            raise ValueError(
+                f"expected scenes for the microphones of the start, {network.config.spacing:g} m "
+                "apart; copy the settings 'model' of its recipe"
+            )
         super().__init__(network, recipe)
         weights = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.denoising = weights.pop("denoising", 0.0)

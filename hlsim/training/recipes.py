@@ -158,7 +158,8 @@ class CompensatorRecipe(TrainingRecipe):
             dB. A few voices have few spectra, and the gains for other voices would be up to 20 dB
             wrong.
         noisy: Share of noisy clips among those of speech, if there is noise.
-        babble: Share of noisy clips whose noise consists of up to four other voices.
+        babble: Share of noisy clips whose noise consists of up to four other voices; 0 for a
+            ``beamforming-aid``, whose scenes have other voices in any case.
         snr: Lowest and highest signal-to-noise ratio in dB. The level of the speech is its active
             level, without pauses.
         mismatch: Standard deviation in dB of the gains of the microphones of a ``beamforming-aid``.
@@ -203,6 +204,12 @@ class CompensatorRecipe(TrainingRecipe):
         expected = "beamforming-aid, because interaural compares two ears"
         has_two_ears = self.kind == "beamforming-aid"
         self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
+        expected = "beamforming-aid, the only kind for which mismatch has an effect"
+        self._require("kind", has_two_ears or not self.mismatch, expected)
+        expected = "2 or more, because the voices of a scene are those of other items"
+        self._require("batch", self.batch > 1 or not has_two_ears, expected)
+        expected = "0 for a beamforming-aid, whose scenes have other voices in any case"
+        self._require("babble", not self.babble or not has_two_ears, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"
             self._require("kind", self.kind == "hearing-aid", expected)

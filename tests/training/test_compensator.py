@@ -9,7 +9,9 @@ import torch
 
 pytest.importorskip("lightning")
 
-from compensators import load_compensator
+from compensators import load_compensator, save_compensator
+from compensators.beamformer import BeamformingAid
+from compensators.config import BeamformerConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
 from hlsim.checkpoint import read_record, save_checkpoint
@@ -219,7 +221,10 @@ def test_a_front_end_is_trained_in_scenes_before_an_aid(
         start="hearing-aid",
         weights={"coherent-bands": 1.0, "interaural": 0.1},
     )
-    assert draw(recipe, noisy, 2)["signal"].shape == (2, 2, 2, 3200)
+    batch = draw(recipe, noisy, 2)
+    assert batch["signal"].shape == (2, 2, 2, 3200)
+    wide = draw(replace(recipe, model={"spacing": 0.012}), noisy, 2)
+    assert not torch.allclose(wide["clean"], batch["clean"], rtol=1e-3)
     trained = load_compensator(
         train_compensator(noisy, recipe, out=tmp_path, simulator="msbg", accelerator="cpu")
     )
@@ -233,6 +238,10 @@ def test_a_front_end_is_trained_in_scenes_before_an_aid(
     ]
     assert moved
     assert all(name.startswith("front_end.decide") for name in moved)
+    start = tmp_path / "wide"
+    save_compensator(BeamformingAid(config=BeamformerConfig(spacing=0.012)), start)
+    with pytest.raises(ValueError, match=r"0\.012 m apart; copy the settings"):
+        CompensatorTraining(replace(recipe, start=str(start), model={}), simulator="msbg")
     with pytest.raises(ValueError, match="interaural compares two ears"):
         replace(recipe, kind="hearing-aid")
 
