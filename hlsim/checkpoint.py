@@ -21,9 +21,9 @@ import safetensors.torch
 import torch
 from torch import nn
 
+from hlsim.checks import suggest
 from hlsim.extras import require
 from hlsim.files import atomic_path, read_json, write_atomically
-from hlsim.suggestions import suggest
 from hlsim.version import __version__
 
 Model = TypeVar("Model", bound=nn.Module)

@@ -6,6 +6,7 @@ fix. Functions that return something return the validated value.
 
 from __future__ import annotations
 
+import difflib
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -33,6 +34,22 @@ Lengths = Tensor | Sequence[int]
 """Number of samples of each item of a padded batch, in the shape of the leading dimensions."""
 
 
+def suggest(name: str, names: Iterable[str]) -> str:
+    """Return a question for an error message about a name, or "" if no name is similar.
+
+    Args:
+        name: Name that does not exist.
+        names: Names that exist.
+
+    >>> suggest("nal-r", ["nalr", "wdrc"])
+    ' (did you mean nalr?)'
+    >>> suggest("loud", ["nalr", "wdrc"])
+    ''
+    """
+    similar = difflib.get_close_matches(name.lower(), names, n=1)
+    return f" (did you mean {similar[0]}?)" if similar else ""
+
+
 def check_names(names: Iterable[Any], known: Iterable[str], description: str) -> None:
     """Raise ValueError unless all names of settings or options are known.
 
@@ -46,8 +63,9 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
     known = list(known)
     unknown = sorted({str(name) for name in names} - set(known))
     if unknown:
+        texts = [name + suggest(name, known) for name in unknown]
         raise ValueError(
-            f"unknown {description}: {', '.join(unknown)}; expected some of "
+            f"unknown {description}: {', '.join(texts)}; expected some of "
             f"{', '.join(known) or 'none'}"
         )
 
@@ -85,7 +103,10 @@ def check_choice(name: str, value: Any, choice: Any) -> None:
     """
     choices = get_args(choice)
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"expected {name} to be one of {', '.join(choices)}, got {value!r}")
+        raise ValueError(
+            f"expected {name} to be one of {', '.join(choices)}, got {value!r}"
+            f"{suggest(str(value), choices)}"
+        )
 
 
 def check_number(

@@ -153,3 +153,10 @@ def test_error_about_an_array_names_the_fix() -> None:
 def test_bad_lengths_raise_value_error(lengths: Any) -> None:
     with pytest.raises(ValueError, match=r"expected lengths to be whole numbers from 1 to 10"):
         check_lengths(lengths, torch.Size((2, 10)))
+
+
+def test_a_name_that_resembles_a_known_one_has_a_suggestion() -> None:
+    with pytest.raises(ValueError, match=r"got 'NAL-R' \(did you mean nalr\?\)"):
+        WDRC(prescription="NAL-R")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"criteria: Bands \(did you mean bands\?\), x; expected"):
+        checks.check_names(["Bands", "x"], ["bands", "paper"], "criteria")

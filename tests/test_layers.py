@@ -19,7 +19,7 @@ FLOORS = [
     "neuro",
     "data metrics msbg",
     "audiogram dsp calibration audio checkpoint",
-    "checks files extras progress suggestions torchtools plugins version",
+    "checks files extras progress torchtools plugins version",
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
 

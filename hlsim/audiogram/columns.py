@@ -23,8 +23,8 @@ _KNOWN_WORDS = {
 }
 """Words that the name of a column of thresholds may contain besides the frequency."""
 
-_UCL_WORDS = {"ucl", "ldl"}
-"""Words of columns of uncomfortable levels, which are also called loudness discomfort levels."""
+UCL_WORDS = {"ucl", "ldl", "ull", "uncomfortable", "discomfort"}
+"""Words for uncomfortable levels, of which one is in the name of a column of them."""
 
 _OTHER_LEVELS = {"bc", "bone", "extrapolated"}
 """Words in the names of columns with other levels than measured thresholds of air conduction."""
@@ -140,14 +140,15 @@ def _read_name(column: str, name: str) -> ThresholdColumn | None:
     if match is None:
         return None
     before, after = (re.findall(r"[a-z]+|\d+", match[part]) for part in ("before", "after"))
-    is_ucl = not _UCL_WORDS.isdisjoint(before)
-    before = [word for word in before if word not in _UCL_WORDS]
     words = {*before, *after}
+    is_ucl = not words.isdisjoint(UCL_WORDS)
     has_hz = bool(words & {"hz", "khz"})
-    is_explicit = has_hz or before[:1] == ["hl"]
+    is_explicit = has_hz or is_ucl or before[:1] == ["hl"]
     # "500 dB" is no frequency, but "dB HL 500" is one
-    may_have_unit = has_hz or not after
+    may_have_unit = has_hz or is_ucl or not after
     known = _KNOWN_WORDS | {"db", "dbhl"} if may_have_unit else _KNOWN_WORDS
+    if is_ucl:
+        known = known | UCL_WORDS | {"loudness", "level", "levels"}
     is_known = words <= known
     hz = _read_hz(match["number"], match["kilo"])
     if words & _OTHER_LEVELS:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hlsim.audiogram.columns import threshold_columns
+from hlsim.audiogram.columns import UCL_WORDS, threshold_columns
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, EarName
 from hlsim.audiogram.standard import STANDARD
@@ -234,7 +234,10 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
             f"{rows[0][0]}: expected thresholds in the column {columns['threshold']} alone, got "
             f"some in {', '.join(wide_columns)} as well; remove one of both"
         )
-    return _widen(rows, columns["frequency"], columns["threshold"]) if is_long else rows
+    if not is_long:
+        return rows
+    ucl = [name for words, name in columns.items() if not UCL_WORDS.isdisjoint(words.split())]
+    return _widen(rows, columns["frequency"], columns["threshold"], ucl)
 
 
 def _without_units(column: str) -> str:
@@ -243,23 +246,24 @@ def _without_units(column: str) -> str:
     return " ".join(word for word in words if word not in ("hz", "db", "hl"))
 
 
-def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
+def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[str]) -> list[_Row]:
     """Join the rows of each ear of a table with one threshold per row.
 
     Args:
         rows: Rows of the table.
         frequency: Name of the column of frequencies in Hz.
         threshold: Name of the column of thresholds in dB HL.
+        ucl: Name of the column of uncomfortable levels in dB HL, if there is one.
 
     Returns:
         One row per ear, with the place of the first row of this ear. Its columns are the listener,
-        the ear and one column per frequency.
+        the ear and, per frequency, one column of thresholds and perhaps of uncomfortable levels.
 
     Raises:
         ValueError: A column is missing, a frequency is not understood, an ear has two thresholds at
             one frequency, or a row lacks the listener or the ear that other rows have.
     """
-    names = [column for column in rows[0][1] if column not in (frequency, threshold)]
+    names = [column for column in rows[0][1] if column not in (frequency, threshold, *ucl)]
     has_ears = {"listener", "ear"} <= set(names)
     if names and not has_ears:
         raise ValueError(
@@ -298,6 +302,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str) -> list[_Row]:
                 "remove one of them"
             )
         wide[column] = row[threshold]
+        wide |= {f"{name} {column}": row[name] for name in ucl}
     if differing_names:
         warnings.warn(
             f"{rows[0][0]}: not read, although they differ between the thresholds of one ear: the "

@@ -135,7 +135,7 @@ class Audiogram:
                 )
 
     @classmethod
-    def standard(cls, name: str) -> Audiogram:
+    def standard(cls, name: str, *, ucl: UclLike | None = ()) -> Audiogram:
         """Return a standard audiogram.
 
         N1 to N7 are flat or moderately sloping losses from very mild to profound, S1 to S3 are
@@ -146,9 +146,10 @@ class Audiogram:
         Args:
             name: ``"N1"`` to ``"N7"``, ``"S1"`` to ``"S3"``, or ``"NH"`` for 0 dB HL at all
                 frequencies, in upper or lower case.
+            ucl: Measured uncomfortable levels, as in the constructor.
 
         Raises:
-            ValueError: There is no standard audiogram of this name.
+            ValueError: There is no standard audiogram of this name, or the levels are not valid.
 
         Example:
             >>> from hlsim import Audiogram
@@ -162,7 +163,7 @@ class Audiogram:
                 f"unknown standard audiogram {name!r}; expected one of {names} (simulators accept "
                 "all but N7)"
             )
-        return cls(STANDARD[key])
+        return cls(STANDARD[key], ucl=ucl)
 
     def __repr__(self) -> str:
         text = _describe_points(zip(self.frequencies, self.levels, strict=True))

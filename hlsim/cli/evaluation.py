@@ -51,7 +51,7 @@ def evaluate_simulator(parser: Parser) -> None:
     parser.teacher("simulator to compare with")
     _declare_items(parser, "items", 240, [50, 60, 65, 70, 80])
     text = "input of the simulators: as-is, louder (20 dB), nalr, compressed (3:1), compensated"
-    option("--inputs", str, text, ["as-is"], nargs="+")
+    parser.series("--inputs", str, text, ["as-is"])
     option("--compensator", str, "compensator of the input compensated, by name or folder")
     _declare_study(parser)
 
@@ -96,15 +96,15 @@ def evaluate_compensator(parser: Parser) -> None:
     parser.enhancers("time-aligned waveforms with shape (..., time) in pascals")
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
     text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
-    option("--gain-ears", str.upper, text, ["N3", "S2"], nargs="+")
+    parser.series("--gain-ears", str.upper, text, ["N3", "S2"])
     _declare_precision(parser)
     text = "measure thresholds for digits in noise as well, for the ears of the gain curves"
     parser.flag("--srt", text)
     text = (
-        "prescription with which each compensator is compared at its level; for-ear is nalrp if "
-        "the threshold at 2 kHz is above 90 dB HL, and otherwise nalr"
+        "prescription with which each compensator is compared at its level: nalr, nalrp, camfit, "
+        "or for-ear, which is nalrp if the threshold at 2 kHz is above 90 dB HL, and else nalr"
     )
-    option("--rival", str, text, "nalr", choices=["nalr", "nalrp", "camfit", "for-ear"])
+    option("--rival", str, text, "nalr")
     text = (
         "target of the loudness error: loudness in dB relative to a normal ear, a number or "
         "numbers by level, such as 50:0,65:-5,80:-9; the tables name it"
@@ -172,8 +172,8 @@ def haspi_report(parser: Parser) -> None:
         "them; with a manifest, they are its listeners', with the columns listener and ear, too"
     )
     option("--audiograms", input_path, text)
-    text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
-    option("--measures", lambda text: [name.strip() for name in text.split(",")], text, ["haspi"])
+    text = "measures, the most important first: haspi, hasqi, haaqi, stoi, pesq"
+    parser.series("--measures", str, text, ["haspi"])
     _declare_precision(parser)
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     parser.flag("--better-ear", "use the better ear's scores; needs a manifest with both ears")
@@ -229,7 +229,7 @@ def clarity(parser: Parser) -> None:
         "numbers of the microphones whose mean is the input of the aids: 1 is the front one; "
         "the baseline of the third challenge uses 1 2 3"
     )
-    option("--microphones", count, text, [1], nargs="+")
+    parser.series("--microphones", count, text, [1])
     text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1, dest="stride")
     _declare_precision(parser)
@@ -325,9 +325,7 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
     option("--speech", input_path, text, required=True)
     text = "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB"
     option("--noise", input_path, text)
-    option(
-        "--levels", sound_level, f"levels of the {levelled} in dB SPL, in turn", levels, nargs="+"
-    )
+    parser.series("--levels", sound_level, f"levels of the {levelled} in dB SPL, in turn", levels)
     option("--items", count, "number of items", items)
     option("--seconds", positive_number, "length of an item in seconds", 3.0)
 
@@ -370,8 +368,8 @@ def _run_study(
 
     Args:
         options: Options of the command. Each becomes an argument of ``evaluate`` under its name,
-            except ``names``, ``out`` and ``limit_to_ear``; measures of ``--measure`` are appended
-            to ``measures``.
+            except ``names``, ``out``, ``limit_to_ear`` and ``ucl``; measures of ``--measure`` are
+            appended to ``measures``.
         evaluate: Function that runs the study and returns its evaluation.
         make_page: Function from the evaluation to its page.
         notes: Sentences with which the page begins, before those of the evaluation.
@@ -381,7 +379,7 @@ def _run_study(
 
     settings = {**vars(options), "listen": _PLAYED_ITEMS}
     settings["measures"] = [*settings.get("measures", []), *settings.pop("own_measures")]
-    used_before = {"run", "names", "out", "limit_to_ear"}
+    used_before = {"run", "names", "out", "limit_to_ear", "ucl"}
     arguments = {name: settings[name] for name in settings.keys() - used_before}
     with ProgressLine("scores", "reading the recordings", "drawing the page") as progress:
         evaluation = evaluate(**{**arguments, **changes}, progress=progress)

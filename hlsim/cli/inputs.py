@@ -10,6 +10,7 @@ import math
 import os
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from hlsim.extras import is_installed, require
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
+    from hlsim.audiogram.discomfort import Points
     from hlsim.audiogram.listener import Listener
 
 PACKAGES = {
@@ -60,9 +62,33 @@ def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
     """
     from hlsim.audiogram import as_audiogram
 
+    ucl = _uncomfortable_levels(options, ears=int(options.audiogram is not None))
     if getattr(options, "listener", None):
         return _read_listener(options.listener)
-    return as_audiogram(options.audiogram) if options.audiogram else None
+    return replace(as_audiogram(options.audiogram), ucl=ucl) if options.audiogram else None
+
+
+def _uncomfortable_levels(options: argparse.Namespace, ears: int) -> Points:
+    """Return the frequencies in Hz and levels in dB HL of ``--ucl``, none without the option.
+
+    Args:
+        options: Parsed options of a command, which need not have the option.
+        ears: Number of ears of ``--audiogram``.
+
+    Raises:
+        ValueError: The levels are not valid or have no effect, or there is not one ear.
+    """
+    from hlsim.audiogram.discomfort import read_points
+
+    ucl = read_points(getattr(options, "ucl", None))
+    if ucl and not getattr(options, "limit_to_ear", True):
+        raise ValueError("--ucl has no effect without --limit-to-ear; add it, or leave --ucl out")
+    if ucl and ears != 1:
+        raise ValueError(
+            f"--ucl has the levels of one ear of --audiogram, got {ears} ears; process each alone, "
+            "or write the levels into the file of --listener, in columns such as ucl_left_500"
+        )
+    return ucl
 
 
 def level_and_gain(power: float, options: argparse.Namespace) -> tuple[float, float]:
@@ -102,6 +128,7 @@ def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
     from hlsim.audiogram import as_audiogram
 
     ears: dict[str, Audiogram | Listener] = {}
+    ucl = _uncomfortable_levels(options, ears=len(options.audiogram or ()))
     if options.listener:
         ears["listener"] = _read_listener(options.listener)
     for value in options.audiogram or ():
@@ -113,7 +140,7 @@ def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
             name = "-".join(f"{level:g}" for level in value)
         if name in ears:
             raise ValueError(f"--audiogram {name} appears twice; leave one out")
-        ears[name] = as_audiogram(value)
+        ears[name] = replace(as_audiogram(value), ucl=ucl)
     if compensator := getattr(options, "compensator", ""):
         for ear in ears.values():
             warn_of_other_ears({compensator: compensator}, ear)

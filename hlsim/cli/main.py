@@ -9,10 +9,10 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 
 from hlsim.cli.options import Parser
-from hlsim.suggestions import suggest
 from hlsim.version import __version__
 
 GROUPS = {
@@ -142,7 +142,8 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("-V", "--version", action="version", version=f"hlsim {__version__}")
     parser.add_argument("command", metavar="COMMAND", help="one of the commands below")
     command = parser.parse_args(words).command
-    suggestion = suggest(command, COMMANDS)
+    similar = get_close_matches(command.lower(), COMMANDS, n=1)
+    suggestion = f" (did you mean {similar[0]}?)" if similar else ""
     parser.error(f"there is no command {command!r}{suggestion}")
 
 

@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -53,6 +54,19 @@ class _StoreOnce(argparse.Action):
             raise argparse.ArgumentError(self, f"appears twice; {fix}")
         self.namespace = namespace
         setattr(namespace, self.dest, values)
+
+
+class _StoreSeries(_StoreOnce):
+    """Action that stores one list of values from lists of values."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        super().__call__(parser, namespace, [*chain.from_iterable(values)], option_string)
 
 
 class Parser(argparse.ArgumentParser):
@@ -135,6 +149,25 @@ class Parser(argparse.ArgumentParser):
         if name.startswith("-"):
             settings = {"action": _StoreOnce, "default": default, **settings}
         (group or self).add_argument(name, type=kind, help=text, **settings)
+
+    def series(
+        self, name: str, kind: Callable[[str], Any], text: str, default: Any = None, **settings: Any
+    ) -> None:
+        """Declare an option that takes several values, separated by blanks or commas.
+
+        Args:
+            name: Name, such as ``--levels``.
+            kind: Function that converts the text of one value.
+            text: Description for the help, which adds the default.
+            default: Values if the option is missing.
+            settings: Further arguments of ``argparse.ArgumentParser.add_argument``.
+        """
+
+        def read_values(text: str) -> list[Any]:
+            return [kind(value) for value in text.split(",")]
+
+        action = {"nargs": "+", "action": _StoreSeries}
+        self.option(name, read_values, text, default, **action, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
         """Declare an option without a value, which is True if a user passes it, else False.
@@ -251,6 +284,20 @@ class Parser(argparse.ArgumentParser):
             "predicted (hearing aids, wdrc and camfit only)"
         )
         self.flag("--limit-to-ear", text)
+        self.uncomfortable_levels("--limit-to-ear")
+
+    def uncomfortable_levels(self, user: str) -> None:
+        """Declare ``--ucl``, the measured uncomfortable levels of the ear of ``--audiogram``.
+
+        Args:
+            user: Option or output that uses the levels, for the help text.
+        """
+        text = (
+            f"measured uncomfortable levels for {user} by frequency in Hz, in dB HL, such as "
+            "500:100,1000:95, of the single ear of --audiogram; a file of --listener has columns "
+            "such as ucl_left_500 instead"
+        )
+        self.option("--ucl", ucl, text)
 
     def enhancers(self, waveforms: str) -> None:
         """Declare ``--enhancer``, functions of the user that reduce noise.
@@ -369,6 +416,9 @@ def _limited(
     return _checked_type(read, lambda value: lowest <= value <= highest, expected)
 
 
+ucl = _checked_type(
+    _read_points, bool, "one level in dB HL for each frequency in Hz, such as 500:100,1000:95"
+)
 positive_number = _checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
 minutes = _checked_type(float, lambda value: 0 < value <= 1e6, "above 0 and at most 1,000,000")
 count = _checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")

@@ -20,6 +20,8 @@ from hlsim.training.recipes import TrainingRecipe
 
 Recipe = TypeVar("Recipe", bound=TrainingRecipe)
 
+_NUMBERS_BY_NAME = re.compile(r"[\w.-]+:-?[\d.]+(,[\w.-]+:-?[\d.]+)*")
+
 
 def add_recipe(parser: Parser, recipe: type[TrainingRecipe], example: str) -> None:
     """Declare ``--recipe`` and one option per setting of a recipe.
@@ -47,12 +49,21 @@ def add_recipe(parser: Parser, recipe: type[TrainingRecipe], example: str) -> No
             *names,
             dest="settings",
             action="append",
-            # The value becomes a text such as --recipe.steps=100, which jsonargparse reads.
-            type=partial("{}={}".format, name),
+            type=partial(_write_setting, name),
             default=[],
             metavar="VALUE",
             help=text.replace("%", "%%"),
         )
+
+
+def _write_setting(name: str, value: str) -> str:
+    """Return a text such as ``--recipe.steps=100``, which jsonargparse reads as YAML.
+
+    Numbers by name or level, such as 50:0,65:-5, become a mapping of YAML.
+    """
+    if _NUMBERS_BY_NAME.fullmatch(value):
+        value = f"{{{value.replace(':', ': ')}}}"
+    return f"{name}={value}"
 
 
 def describe_settings(recipe: type[TrainingRecipe]) -> dict[str, str]:
@@ -108,7 +119,7 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
     if file is not None:
         texts.append(file.read_text(encoding="utf-8", errors="replace"))
     for text in texts:
-        _reject_repeated_keys(text)
+        _check_yaml(text)
     parser = jsonargparse.ArgumentParser(exit_on_error=False)
     parser.add_class_arguments(recipe, "recipe")
     try:
@@ -121,8 +132,10 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
     return result
 
 
-def _reject_repeated_keys(text: str) -> None:
-    """Raise ValueError if a mapping in a YAML text has a key twice, of which the last would count.
+def _check_yaml(text: str) -> None:
+    """Raise ValueError if YAML reads a text in another way than a user expects.
+
+    If a mapping has a key twice, the last one would count, and 1:30 would be the number 90.
 
     A text that is not valid YAML passes, because jsonargparse rejects it. Without PyYAML, the error
     is MissingExtraError.
@@ -132,6 +145,14 @@ def _reject_repeated_keys(text: str) -> None:
     class Loader(yaml.SafeLoader):
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             return reject_duplicates(self.construct_pairs(node, deep=True))
+
+        def construct_object(self, node: Any, deep: bool = False) -> Any:
+            if node.tag.endswith(("int", "float")) and ":" in node.value:
+                raise ValueError(
+                    f"recipe: got {node.value}; write a blank behind the colon of a mapping, such "
+                    "as {50: 0, 65: -5}, and a number without a colon"
+                )
+            return super().construct_object(node, deep)
 
     with suppress(yaml.YAMLError, TypeError):  # TypeError: a key is a list
         yaml.load(text, Loader=Loader)

@@ -81,6 +81,12 @@ def test_tables_may_have_uncomfortable_levels(tmp_path: Path) -> None:
     table.write_text("hl_500,ldl_500\n30,95\n")
     ((_, ear),) = read_audiograms(table)
     assert ear == Audiogram({500: 30}, ucl={500: 95})
+    for column in ("UCL_500 (dB HL)", "loudness discomfort level 500", "hl_500_ucl", "500 ULL"):
+        table.write_text(f"hl_500,{column}\n30,95\n")
+        assert read_audiograms(table)[0][1] == ear
+    table.write_text("frequency,threshold,UCL (dB HL)\n500,30,95\n1000,40,\n")
+    ((_, ear),) = read_audiograms(table)
+    assert ear == Audiogram({500: 30, 1000: 40}, ucl={500: 95})
     table.write_text("hl_500,ucl_500\n30,9\n")
     with pytest.raises(ValueError, match=r"column ucl_500 is '9'; expected a level from 20 to 140"):
         read_audiograms(table)
@@ -91,6 +97,11 @@ def test_tables_may_have_uncomfortable_levels(tmp_path: Path) -> None:
     table.write_text("hl_500,ucl_500\n30,NR\n")
     with pytest.raises(ValueError, match=r"'NR'.* If no level was uncomfortable write 115; for"):
         read_audiograms(table)
+
+
+def test_standard_ears_may_have_uncomfortable_levels() -> None:
+    ear = Audiogram.standard("n3", ucl={500: 95})
+    assert ear.levels == Audiogram.standard("N3").levels and ear.ucl == ((500.0, 95.0),)
 
 
 def test_a_series_may_have_uncomfortable_levels() -> None:

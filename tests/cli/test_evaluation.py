@@ -23,7 +23,7 @@ CALLS = {
     "hlsim.evaluation.compensators:evaluate_compensators": (
         f"evaluate-compensator wdrc --audiograms standard --audiogram N3 {ITEMS} --enhancer my:e "
         f"--simulator neuro-msbg --gain-ears n1 --srt --rival for-ear --loudness 50:0,80:-9 "
-        f"--limit-to-ear {STUDY}"
+        f"--limit-to-ear --ucl 500:90 {STUDY}"
     ),
     "hlsim.evaluation.recordings:haspi_report": (
         "haspi-report --clean {a} --before {b} --after {c} --manifest {d} --root {e} --audiogram "
@@ -48,7 +48,7 @@ EXPECTED: dict[str, Any] = {
     "conditions": {"A": "a", "B": "b"}, "outputs": {"A": "a", "B": "b"},
     "microphones": [1, 3], "scenes": "a", "listeners": "b", "scenes_listeners": "c",
     "stride": 3, "linked": True, "aids": {"mine": "nalr"}, "seed": 7, "jobs": 3,
-    "dask": "tcp://host:8786", "audiogram": Audiogram.standard("N3"),
+    "dask": "tcp://host:8786",
 }  # fmt: skip
 """Expected argument by parameter; single letters are paths."""
 
@@ -83,6 +83,9 @@ def test_every_option_reaches_its_parameter(
     assert isinstance(arguments["progress"], ProgressLine)
     if name == "evaluate_compensators":
         assert arguments["compensators"]["wdrc"].limit_to_ear
+        assert arguments["audiogram"].ucl == ((500.0, 90.0),)
+    if "audiogram" in arguments:
+        assert arguments["audiogram"].levels == Audiogram.standard("N3").levels
     if name == "evaluate_scenes":
         assert arguments["out"] == tmp_path / "out" and arguments["full_scale_spl"] == 110.0
     else:

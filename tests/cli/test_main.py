@@ -113,7 +113,14 @@ simulate {speech} {out} --audiogram 500:30,500:60 | one level for each frequency
 evaluate-compensator nalr --speech {speech} --out {out} --loudness 50:0,50:1 | one number for
 evaluate-compensator nalr --speech {folder} --out {out} --limit-to-ear | leave out limit_to_ear
 compensate {speech} {out} --audiogram N3 --compensator nalr --limit-to-ear | leave out limit_to_ear
-evaluate-compensator nalr --speech {folder} --out {out} --rival nal-r | invalid choice: 'nal-r'
+evaluate-compensator nalr --speech {folder} --out {out} --rival NAL-R | (did you mean nalr?)
+export-gains --audiogram N3 --to CamillaDSP | no format 'CamillaDSP' (did you mean camilladsp?)
+evaluate-compensator nalr --speech {folder} --out {out} --levels 65,x | got 'x'
+compensate {speech} {out} --audiogram N3 --ucl 500:90 | without --limit-to-ear
+compensate {speech} {out} --listener {ears}:a --limit-to-ear --ucl 500:90 | such as ucl_left_500
+compensate {speech} {out} --audiogram N3 --audiogram N4 --limit-to-ear --ucl 500:90 | got 2 ears
+compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500 | such as 500:100,1000:95
+compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500:900 | got 900 at 500 Hz
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
@@ -256,6 +263,18 @@ def test_both_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:
     gain = 10.0 ** ((80.0 - float(level_spl(scene.flatten()))) / 20.0)
     aid = load_compensator("wdrc", sample_rate=rate, limit_to_ear=True)
     check_output(out, aid(gain * scene, listener) / gain)
+
+
+def test_measured_uncomfortable_levels_of_one_ear(tmp_path: Path, utterance: Path) -> None:
+    waveform, rate = read_audio(utterance)
+    scene, out = waveform[:, :rate], tmp_path / "out.wav"
+    write_audio(tmp_path / "in.wav", scene, rate)
+    options = ("--compensator", "wdrc", "--limit-to-ear", "--spl", 80, "--ucl", "500:60,1000:65")
+    assert run("compensate", tmp_path / "in.wav", out, *options, "--audiogram", "n3") == 0
+    gain = 10.0 ** ((80.0 - float(level_spl(scene[0]))) / 20.0)
+    aid = load_compensator("wdrc", sample_rate=rate, limit_to_ear=True)
+    ear = Audiogram.standard("N3", ucl={500: 60, 1000: 65})
+    check_output(out, aid(gain * scene, ear) / gain)
 
 
 @pytest.mark.parametrize(("ear", "warnings"), [("N4", 0), ("N3", 1)])

@@ -103,6 +103,13 @@ def test_lists_that_begin_with_a_minus_are_values() -> None:
     assert parsed.levels == [-5.0, -10.0] and parsed.names == ["msbg"]
 
 
+@pytest.mark.parametrize("words", ["65,80", "65 80"])
+def test_values_are_separated_by_commas_or_blanks(words: str) -> None:
+    command = f"msbg --speech . --out o --gain-ears n3,s2 --levels {words}"
+    parsed = make_parser("evaluate-compensator").parse_args(command.split())
+    assert parsed.levels == [65.0, 80.0] and parsed.gain_ears == ["N3", "S2"]
+
+
 def test_aids_of_clarity_may_follow_options_or_be_left_out(tmp_path: Path) -> None:
     options = [str(tmp_path), "--listeners", str(tmp_path), "--out", "judged"]
     parser = make_parser("clarity")

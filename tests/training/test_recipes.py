@@ -101,6 +101,19 @@ def test_invalid_files_and_arguments_are_rejected(tmp_path: Path, text: str) -> 
         make_recipe(CompensatorRecipe, None, [f"--recipe.{text.replace(': ', '=') or '='}"])
 
 
+def test_numbers_by_level_have_the_form_of_the_other_commands() -> None:
+    assert from_options("--recipe.loudness 50:0,65:-5").loudness == {50.0: 0.0, 65.0: -5.0}
+    assert from_options("--recipe.loudness 65:-5").loudness == {65.0: -5.0}
+
+
+@pytest.mark.parametrize("text", ["loudness: 1:30", "loudness: {50:0, 65: 5}", "steps: 1:30"])
+def test_numbers_that_yaml_reads_in_base_60_are_errors(tmp_path: Path, text: str) -> None:
+    pytest.importorskip("jsonargparse")
+    (tmp_path / "recipe.yaml").write_text(text)
+    with pytest.raises(ValueError, match="blank behind the colon"):
+        make_recipe(CompensatorRecipe, tmp_path / "recipe.yaml", [])
+
+
 def test_a_setting_that_is_given_twice_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "recipe.yaml"
     file.write_text("batch: 4\nsteps: 10\nbatch: 8\n")

@@ -19,8 +19,8 @@ def export_gains(parser: Parser) -> None:
     )
     option = parser.option
     parser.audiogram(ears=SIMULATED_EARS, required=True)
-    programs = ("camilladsp", "equalizer-apo", "openmha", "csv")
-    option("--to", str, "program that reads the file", required=True, choices=programs)
+    text = "program that reads the file: camilladsp, equalizer-apo, openmha, or csv for a table"
+    option("--to", str, text, required=True)
     text = (
         "aid whose gains are exported: nalr, nalrp, wdrc, camfit, or a checkpoint's name or folder"
     )

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from compensators.aid import Aid, thirds_of_octave
 from compensators.filter_bank import RATE, speech_density
 from hlsim.audiogram import FREQUENCIES
-from hlsim.checks import check_number
+from hlsim.checks import check_number, suggest
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,10 @@ def export_gains(
     GraphicEQ: 250 -0.29; 500 8.96; 1
     """
     if program not in PROGRAMS:
-        raise ValueError(f"no format {program!r}; expected one of {', '.join(PROGRAMS)}")
+        raise ValueError(
+            f"no format {program!r}{suggest(program, PROGRAMS)}; expected one of "
+            f"{', '.join(PROGRAMS)}"
+        )
     for name, value in {"level": level, "sample_rate": sample_rate}.items():
         if value is not None and name not in _SETTINGS[program]:
             option = "--" + name.replace("_", "-")
