@@ -18,6 +18,7 @@ from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checkpoint import HubModel
+from hlsim.checks import check_number
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.torchtools import built_in_float32
 
@@ -40,6 +41,9 @@ The bands are wider than MSBG's, and louder than each part of them: of 95, 100, 
 100 came closest to normal hearing of speech.
 """
 
+LOUDNESS_RANGE = (-40.0, 0.0)
+"""Lowest and highest loudness of the output in dB relative to a normal ear."""
+
 SOFTEST_SPL = 20.0
 """Level of a band in dB SPL below which the restoring gain does not rise."""
 
@@ -55,7 +59,7 @@ class HearingAid(Wearable, HubModel):
     both are 0, nothing but the peaks of the input changes. The terms are:
 
     - The restoring gain makes the band about as loud for the impaired ear as for a normal one. It
-      inverts the formula by which MSBG simulates the growth of loudness.
+      inverts the formula by which MSBG simulates the growth of loudness. ``loudness`` lowers it.
     - The correction comes from a network that gets the audiogram and the level of each band. It is
       0 before training, and where there is no loss.
     - The attenuation comes from a recurrent network that gets levels, but no audiogram.
@@ -75,6 +79,8 @@ class HearingAid(Wearable, HubModel):
             level of the ear if one was measured, and otherwise to 4 dB below a predicted level with
             a margin (``hlsim.audiogram.discomfort.predict_limits``). A tensor of thresholds has
             predicted levels. The limit of the peaks stays.
+        loudness: Loudness of the output for the impaired ear, in dB relative to a normal ear, -40
+            to 0. Most people prefer less than 0 (docs/guide/levels.md). No gain becomes negative.
 
     Raises:
         ValueError: A rate or level is out of range.
@@ -101,8 +107,11 @@ class HearingAid(Wearable, HubModel):
         full_scale_spl: float = PASCAL_SPL,
         linked: bool = False,
         limit_to_ear: bool = False,
+        loudness: float = 0.0,
     ) -> None:
         super().__init__(audiogram, sample_rate, full_scale_spl, linked, limit_to_ear)
+        check_number("loudness", loudness, *LOUDNESS_RANGE)
+        self.loudness = loudness
         self.config = config = config or HearingAidConfig()
         self.bands = config.bands
         self.limit_spl = config.limit_spl
@@ -239,7 +248,9 @@ class HearingAid(Wearable, HubModel):
         # The inverse of MSBG's recruitment: at a level of 105 dB SPL - loss, the ear perceives 0 dB
         # SPL, and at 105 dB SPL it perceives the same as a normal ear.
         below_no_gain = (NO_GAIN_SPL - level.clamp_min(SOFTEST_SPL)).clamp_min(0.0)
-        restoring_gain = (positive_loss / CATCH_UP_SPL).unsqueeze(1) * below_no_gain
+        share = (positive_loss / CATCH_UP_SPL).unsqueeze(1)
+        # With recruitment, 1 dB less of output lowers the perceived level by 1 / (1 - share) dB.
+        restoring_gain = share * below_no_gain + self.loudness * (1.0 - share).clamp_min(0.0)
         gain = (restoring_gain + correction).clamp(0.0, config.cap_db)
         fade = ((total - config.quiet_spl) / QUIET_FADE_DB + 1.0).clamp(0.0, 1.0)
         return fade * gain, {"levels": memory}

@@ -6,7 +6,7 @@ from typing import Any
 
 from compensators.beamformer import BeamformingAid
 from compensators.config import BeamformerConfig, HearingAidConfig, MappingConfig
-from compensators.hearing_aid import HearingAid
+from compensators.hearing_aid import LOUDNESS_RANGE, HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR, NALRP
 from compensators.wdrc import CAMFIT, WDRC
@@ -14,7 +14,7 @@ from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record
-from hlsim.checks import check_flag
+from hlsim.checks import check_flag, check_number
 
 Trained = MappingCompensator | HearingAid | BeamformingAid
 
@@ -58,6 +58,7 @@ def load_compensator(
     full_scale_spl: float = PASCAL_SPL,
     linked: bool = False,
     limit_to_ear: bool = False,
+    loudness: float = 0.0,
 ) -> Trained | NALR | WDRC:
     """Load a hearing aid by name, in evaluation mode and without gradients of its weights.
 
@@ -74,11 +75,13 @@ def load_compensator(
             in level between them stay. ``WDRC`` and ``HearingAid`` support this.
         limit_to_ear: Limit the level of the output in each band to the uncomfortable level of the
             ear, see ``HearingAid``, in the same aids.
+        loudness: Loudness of the output of a ``HearingAid`` for the ear, in dB relative to a normal
+            ear, -40 to 0.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind or has changed since it was
-            saved, the rate or the level is out of range, or ``linked`` or ``limit_to_ear`` is
-            neither True nor False, or True for an aid that does not support it.
+            saved, the rate or a level is out of range, ``linked`` or ``limit_to_ear`` is neither
+            True nor False, or a setting is given for an aid that does not support it.
 
     >>> import hlsim
     >>> aid = load_compensator("hearing-aid")
@@ -86,6 +89,7 @@ def load_compensator(
     """
     check_flag("linked", linked)
     check_flag("limit_to_ear", limit_to_ear)
+    check_number("loudness", loudness, *LOUDNESS_RANGE)
     levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     compensator: Trained | NALR | WDRC
     if str(name) in UNTRAINED:
@@ -108,6 +112,12 @@ def load_compensator(
         raise ValueError(
             f"{name} cannot limit its bands to the ear; load wdrc, camfit or hearing-aid, or leave "
             "out limit_to_ear"
+        )
+    if isinstance(amplifier, HearingAid):
+        amplifier.loudness = loudness
+    elif loudness:
+        raise ValueError(
+            f"{name} has no loudness to choose; load hearing-aid, or leave out loudness"
         )
     return compensator
 

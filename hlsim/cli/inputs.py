@@ -235,6 +235,7 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
         full_scale_spl=options.full_scale_spl,
         linked=getattr(options, "linked", False),
         limit_to_ear=getattr(options, "limit_to_ear", False),
+        loudness=getattr(options, "loudness", 0.0),
     )
     if not read_sliders(options).keys() <= {*getattr(compensator, "SLIDERS", ())}:
         raise ValueError(

@@ -50,10 +50,10 @@ def listen(parser: Parser) -> None:
 
 def _listen(options: argparse.Namespace) -> None:
     sliders = read_sliders(options)
-    if sliders and not options.compensator:
+    if (sliders or options.loudness) and not options.compensator:
         raise ValueError(
-            "--noise-reduction and --amplification have no effect without --compensator; add it, "
-            "or leave them out"
+            "--noise-reduction, --amplification and --loudness have no effect without "
+            "--compensator; add it, or leave them out"
         )
     use_one_thread()
     check_extras("eval")

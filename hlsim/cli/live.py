@@ -52,9 +52,10 @@ def _read_device(text: str) -> int | str:
 
 def _live(options: argparse.Namespace) -> None:
     sliders = read_sliders(options)
-    if options.simulate and sliders:
+    if options.simulate and (sliders or options.loudness):
         raise ValueError(
-            "--noise-reduction and --amplification have no effect with --simulate; leave them out"
+            "--noise-reduction, --amplification and --loudness have no effect with --simulate; "
+            "leave them out"
         )
     if options.simulate and options.limit_to_ear:
         raise ValueError("--limit-to-ear has no effect with --simulate; leave it out")

@@ -313,11 +313,16 @@ class Parser(argparse.ArgumentParser):
         self.option("--enhancer", str, text, [], nargs="+", dest="enhancers")
 
     def sliders(self) -> None:
-        """Declare ``--noise-reduction`` and ``--amplification``, the sliders of a hearing aid."""
+        """Declare the sliders of a hearing aid and ``--loudness``."""
         text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 0.5)"
         self.option("--noise-reduction", share, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
         self.option("--amplification", share, text)
+        text = (
+            "loudness of a hearing aid's output for the ear in dB relative to a normal ear, -40 to "
+            "0; most people prefer less than 0"
+        )
+        self.option("--loudness", _limited(float, "a number", -40, 0), text, 0.0)
 
 
 def _checked_type(

@@ -43,6 +43,8 @@ def _srt(options: argparse.Namespace) -> None:
         else:
             ears.update(ear.ears().items())
     aid = None
+    if options.loudness and not options.compensator:
+        raise ValueError("--loudness has no effect without --compensator; add it, or leave it out")
     if options.compensator:
         aid = build_compensator(options, NEURO_RATE)
     sliders: dict[str, Any] = {**read_sliders(options)}

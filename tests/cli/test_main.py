@@ -121,6 +121,10 @@ compensate {speech} {out} --listener {ears}:a --limit-to-ear --ucl 500:90 | such
 compensate {speech} {out} --audiogram N3 --audiogram N4 --limit-to-ear --ucl 500:90 | got 2 ears
 compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500 | such as 500:100,1000:95
 compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500:900 | got 900 at 500 Hz
+compensate {speech} {out} --audiogram N3 --compensator nalr --loudness -5 | leave out loudness
+compensate {speech} {out} --audiogram N3 --loudness 5 | expected a number from -40 to 0
+listen {speech} --audiogram N3 --loudness -5 --out {out} | no effect without --compensator
+srt --audiogram N3 --loudness -5 | no effect without --compensator
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect

@@ -1,5 +1,6 @@
-"""The hearing aid's sliders, gains and gradients."""
+"""The hearing aid's sliders, loudness, gains and gradients."""
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -7,10 +8,10 @@ import torch
 from torch import Tensor
 
 from compensators import WDRC, HearingAid, load_compensator
-from hlsim import Audiogram
+from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.ears import draw_thresholds
-from tests.compensators.aids import EAR, tone, varied_hearing_aid
+from tests.compensators.aids import EAR, assert_close, tone, varied_hearing_aid
 
 
 def test_a_frozen_aid_passes_gradients_on_a_gpu(utterance: Tensor) -> None:
@@ -105,3 +106,30 @@ def test_noise_reduction_attenuates_noise_and_spares_tones() -> None:
     changes = [float(level_spl(aid(sound, "NH", 1.0)[16000:]) - 65.0) for sound in sounds]
     assert -12.0 < changes[0] < -6.0
     assert max(map(abs, changes[1:])) < 1.0
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["N3", "N4"])
+def test_the_ear_perceives_as_many_db_less_as_loudness_says(name: str) -> None:
+    sound, ear = tone(1000.0, 65.0, 0.5), Audiogram.standard(name)
+    simulator = MSBG(ear, sample_rate=16000)
+    quiet = HearingAid(ear, loudness=-10.0).eval()
+    perceived = [
+        float(level_spl(simulator(aid(sound))[2000:-2000]))
+        for aid in (HearingAid(ear).eval(), quiet)
+    ]
+    assert perceived[1] - perceived[0] == pytest.approx(-10.0, abs=0.5)
+    stream = quiet.stream(ear)
+    assert_close(torch.cat((stream(sound), stream.flush()))[64:], quiet(sound))
+    assert torch.equal(quiet(sound, "NH", 0.0), sound)
+
+
+def test_loudness_is_loaded_and_out_of_range_or_without_effect_an_error() -> None:
+    assert load_compensator("hearing-aid", loudness=-5.0).loudness == -5.0
+    for loudness in (1.0, -41.0, float("nan")):
+        for build in (HearingAid, partial(load_compensator, "hearing-aid")):
+            with pytest.raises(ValueError, match="expected loudness"):
+                build(loudness=loudness)
+    for name in ("wdrc", "nalr"):
+        with pytest.raises(ValueError, match="leave out loudness"):
+            load_compensator(name, loudness=-5.0)
