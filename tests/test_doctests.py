@@ -43,6 +43,7 @@ SLOW_MODULES = {
     "hlsim.metrics.haaqi_score",
     "hlsim.metrics.torchmetric",
     "hlsim.report.recordings_page",
+    "hlsim.report.tables",
 }
 
 

@@ -192,6 +192,7 @@ def test_benchmark_prints_a_table_of_each_kind(
     assert "1.0 (1.0 to 1.0)" in next(line for line in lines if line.startswith("| pyclarity"))
 
 
+@pytest.mark.slow
 def test_alignment_by_structure_and_by_an_impulse_agree(speech_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     source, target = speech_dir / "valid" / "flite-rms-01.flac", tmp_path / "alignment.png"

@@ -117,6 +117,7 @@ def test_a_batch_has_the_levels_and_ratios_of_training(batches: Iterator[Any]) -
     assert batch.ears.shape == (4, 8) and batch.tokens.shape[0] == 4
 
 
+@pytest.mark.slow
 def test_terms_know_gain_and_noise(
     example: ModuleType, likelihood: Any, batches: Iterator[Any]
 ) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers import EXAMPLES, ROOT, load_example, load_figure
+from tests.helpers import EXAMPLES, ROOT, load_example, load_figure, mostly_slow
 
 TRAINING = EXAMPLES / "training"
 
@@ -89,7 +89,7 @@ def test_a_criterion_of_ones_own_trains(capsys: pytest.CaptureFixture[str]) -> N
     assert values[-1] < values[0]
 
 
-@pytest.mark.parametrize("package", ["auraloss", "torch-stoi"])
+@pytest.mark.parametrize("package", mostly_slow(["auraloss", "torch-stoi"], ["torch-stoi"]))
 def test_criteria_of_other_packages_on_what_is_heard(
     package: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -93,7 +93,7 @@ def test_the_better_ear_counts_more_and_both_have_a_gradient(scene: Tensor) -> N
         HearingLossLoss(LEFT, ears="better")(outputs[:, :1], scenes[:, :1])
 
 
-@pytest.mark.parametrize("score", [haspi, hasqi])
+@pytest.mark.parametrize("score", mostly_slow([haspi, hasqi], [haspi]))
 def test_scores_have_one_value_per_ear(score: Any, scene: Tensor) -> None:
     output = scene + 0.02 * torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
     scores = score(output, scene, BOTH)

@@ -95,6 +95,7 @@ assert callable(hlsim.evaluation.haspi_report) and callable(hlsim.export.export_
 """
 
 
+@pytest.mark.slow
 def test_imports_are_few_and_a_command_runs_in_one_thread_unless_a_user_chooses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

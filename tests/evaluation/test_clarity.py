@@ -162,6 +162,7 @@ class Halving:
         return 0.5 * waveform
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_scores")
 def test_the_command_writes_page_scores_and_signals_and_continues(
     clarity: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

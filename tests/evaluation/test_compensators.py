@@ -142,6 +142,7 @@ def test_another_prescription_may_be_the_rival(
         evaluate_compensators({"mine": Gain()}, **{**options, "rival": "nal-nl2"})
 
 
+@pytest.mark.slow
 def test_a_profound_ear_has_another_rival_than_the_others(
     options: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -91,7 +91,7 @@ def test_a_seed_decides_all_random_numbers() -> None:
         assert torch.equal(same, again) and not torch.equal(same, other)
 
 
-@pytest.mark.parametrize("threshold", [-12.0, 3.0])
+@pytest.mark.parametrize("threshold", [-12.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_known_thresholds_are_found_within_their_interval(threshold: float) -> None:
     rng = np.random.default_rng(0)
     snr = threshold + np.linspace(-8.0, 8.0, 200)
@@ -120,6 +120,7 @@ def test_shipped_listener_is_small_and_hears_what_was_measured() -> None:
     assert share_right("N4", 15.0) >= 0.8
 
 
+@pytest.mark.slow
 def test_louder_noise_and_a_worse_ear_leave_fewer_digits() -> None:
     louder = share_right("N2", -25.0, noise_spl=80.0), share_right("N2", -5.0, noise_spl=60.0)
     assert louder[0] < louder[1]
@@ -149,6 +150,7 @@ def test_the_same_call_has_the_same_bits_and_ears_are_independent() -> None:
     assert reception_threshold("N4", seed=1, **QUICK).unaided.value != alone.unaided.value
 
 
+@pytest.mark.slow
 def test_threads_share_the_triplets_and_do_not_change_the_threshold() -> None:
     calls: set[tuple[bool, int]] = set()
 

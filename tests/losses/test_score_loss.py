@@ -9,6 +9,7 @@ from torch import Tensor
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.losses.score_loss import SCORES, score_loss
+from tests.helpers import mostly_slow
 
 N3 = torch.tensor(Audiogram.standard("N3").thresholds)
 TIME = 12000
@@ -20,7 +21,7 @@ def clean(speech_dir: Path) -> Tensor:
     return read_audio(speech_dir / "valid" / "flite-rms-01.flac")[0][:, 8000 : 8000 + TIME]
 
 
-@pytest.mark.parametrize("name", SCORES)
+@pytest.mark.parametrize("name", mostly_slow(SCORES, ["haspi"]))
 def test_inaudible_clean_signals_have_neither_loss_nor_gradient(clean: Tensor, name: str) -> None:
     """The items are speech, silence, soft speech, a click, and a rumble below the threshold."""
     click = torch.zeros_like(clean)

@@ -32,6 +32,7 @@ def test_calls_run_alone_in_other_threads_in_the_same_mode(mode: type) -> None:
     assert torch.get_num_threads() == 2
 
 
+@pytest.mark.slow
 def test_scores_do_not_depend_on_the_cores() -> None:
     clean = hlsim.example_speech()[8000:42560].unflatten(0, (3, -1))
     output: Tensor = clean + 0.01 * torch.randn(clean.shape)

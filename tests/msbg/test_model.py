@@ -348,6 +348,7 @@ def test_bad_calls_and_settings_raise_value_error() -> None:
         fast_model().delay("Severe")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("rate", [16000, 44100])
 @pytest.mark.parametrize("items", [1, 2])

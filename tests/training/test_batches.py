@@ -114,7 +114,10 @@ def test_paths_of_a_manifest_stay_below_its_root_behind_links(manifest: Path) ->
     assert TrainingData.from_manifest(manifest).speech == [manifest.parent / "clean" / "1.wav"]
 
 
-@pytest.mark.parametrize(("treated", "low", "high"), [(True, 50.0, 80.0), (False, 85.0, 90.0)])
+@pytest.mark.parametrize(
+    ("treated", "low", "high"),
+    [(True, 50.0, 80.0), pytest.param(False, 85.0, 90.0, marks=pytest.mark.slow)],
+)
 def test_validation_is_fixed_and_has_the_levels_of_speech_before_treatment(
     manifest: Path, treated: bool, low: float, high: float
 ) -> None:

@@ -79,6 +79,7 @@ def test_one_ear_excludes_tables_of_ears(noisy: TrainingData, tmp_path: Path) ->
             train(replace(noisy, **{name: "standard"}), SMALL, tmp_path, audiogram=N3)
 
 
+@pytest.mark.slow
 def test_another_simulator_needs_another_folder(data: TrainingData, tmp_path: Path) -> None:
     config = NeuroConfig(channels=4, blocks=1)
     simulator = tmp_path / "simulator"
@@ -211,6 +212,7 @@ def test_parts_of_a_hearing_aid_without_a_criterion_are_frozen(
     assert len(trained) == 4
 
 
+@pytest.mark.slow
 def test_a_front_end_is_trained_in_scenes_before_an_aid(
     noisy: TrainingData, tmp_path: Path
 ) -> None:

@@ -121,6 +121,7 @@ def test_a_teacher_without_a_gradient_needs_a_recipe_without_the_criterion(
         SimulatorTraining(recipe, Fixed()).compute_loss(training_batch(data, recipe))
 
 
+@pytest.mark.slow
 def test_another_teacher_is_recorded_and_needs_another_folder(
     data: TrainingData, tmp_path: Path
 ) -> None:
