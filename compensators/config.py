@@ -22,6 +22,10 @@ class MappingConfig(NetworkConfig):
             are evenly spaced on the ERB-number scale, on which the ear's bandwidth is constant.
         reach_db: Largest correction up or down in dB.
         limit_spl: Peak of the output in dB SPL that no sample exceeds.
+        microphones: Number of microphones per ear, 1 to 16. With more than 1, the network filters
+            and adds their signals before it amplifies them.
+        ears: Number of ears with several microphones each, 1 or 2. With one microphone it is 1, and
+            the compensator takes any number of ears.
 
     Raises:
         ValueError: A value is out of range.
@@ -35,9 +39,13 @@ class MappingConfig(NetworkConfig):
     bands: int = 20
     reach_db: float = 40.0
     limit_spl: float = 110.0
+    microphones: int = 1
+    ears: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_number("microphones", self.microphones, 1, 16, whole=True)
+        check_number("ears", self.ears, 1, min(2, self.microphones), whole=True)
         check_number("bands", self.bands, 4, 40, whole=True)
         check_number("limit_spl", self.limit_spl, 60.0, 140.0)
         check_number("reach_db", self.reach_db, 0.1, 60.0)

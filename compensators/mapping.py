@@ -16,6 +16,7 @@ from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, check_two_channels
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import HubModel
+from hlsim.checks import check_waveform
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
 from hlsim.dsp.interpolation import interpolate, interpolation_weights
@@ -27,6 +28,9 @@ from hlsim.torchtools import built_in_float32, constant
 
 NEPER_DB = 20.0 / math.log(10.0)
 """One neper in dB."""
+
+POWER_FLOOR = 1e-9
+"""Power that is added to those of microphones, so that phases fade in silence."""
 
 LOWEST_CENTRE = 100.0
 """Centre of the lowest band of the correction in Hz."""
@@ -45,6 +49,12 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
     ``config.phase`` is "predicted". Gains depend on the level of the input, because nothing is
     normalised. The output is softly limited at ``config.limit_spl``.
 
+    With several microphones per ear, the input has the shape (..., microphones, time) for one ear,
+    or (..., microphones, 2, time) for two. The first microphone is the reference. A third decoder
+    computes a complex weight for each other microphone, time and frequency, with which its signal
+    is added to that of the reference (filter and sum). Its inputs are the levels and phases of
+    these signals relative to the reference. Before training, the weights are 0.
+
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
         config: Sizes and choices, by default ``MappingConfig()``.
@@ -54,6 +64,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 
     Attributes:
         highest_frequency: Highest frequency of outputs in Hz.
+        takes_microphones: Whether there are several microphones.
 
     Raises:
         ValueError: A rate or level is out of range.
@@ -85,7 +96,10 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         self.stft = config.stft
         sizes = config.channels, config.dense_depth, config.stride
         is_predicted = config.phase == "predicted"
-        inputs = 4 if is_predicted else 3
+        self.microphones = config.microphones
+        self.takes_microphones = config.microphones > 1
+        further_microphones = config.microphones - 1
+        inputs = (4 if is_predicted else 3) + 3 * further_microphones
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
         self.encoder = DenseEncoder(inputs, *sizes, normalise=False)
         self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
@@ -93,30 +107,66 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         self.phase_decoder = None
         if is_predicted:
             self.phase_decoder = Decoder(*sizes, outputs=2, normalise=False)
+        self.weight_decoder = None
+        if self.takes_microphones:
+            self.weight_decoder = Decoder(*sizes, outputs=2 * further_microphones, normalise=False)
         # The gains are averaged over one point of the feature maps.
         self._additional_field = config.step - config.hop
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """Return the output for whole signals, see ``Aid.forward``."""
-        if audiogram is None and self._two_ears:
+        """Return the output for whole signals, see ``Aid.forward``.
+
+        Raises:
+            ValueError: See ``Aid.forward``; or there is another number of microphones or ears.
+
+        Shape: (..., time) -> (..., time); with several microphones, (..., microphones, time) ->
+            (..., time), or (..., microphones, 2, time) -> (..., 2, time).
+        """
+        if self.takes_microphones:
+            waveform = self._arrange_microphones(waveform)
+        elif audiogram is None and self._two_ears:
             check_two_channels(waveform)
         ears = self.thresholds if audiogram is None else audiogram
         return EarNetwork.forward(self, waveform, ears)
+
+    def _arrange_microphones(self, waveform: Tensor) -> Tensor:
+        """Return the signals with the microphones next to time, (..., [2,] microphones, time).
+
+        Raises:
+            ValueError: There is another number of microphones or ears.
+        """
+        check_waveform(waveform)
+        expected = (self.microphones, 2)[: self.config.ears]
+        if waveform.shape[-1 - len(expected) : -1] != expected:
+            numbers = ", ".join(map(str, expected))
+            raise ValueError(
+                f"expected signals of {self.microphones} microphones per ear, (..., {numbers}, "
+                f"time), got shape {tuple(waveform.shape)}; pass the microphones that the "
+                "compensator was trained with, the reference first"
+            )
+        return waveform.transpose(-3, -2) if len(expected) == 2 else waveform
 
     def _finish(self, result: Tensor) -> Tensor:
         # The limit is the last step, because resampling can overshoot.
         return soft_limit(result, self.config.limit_spl)
 
     def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
-        spectrum = self.stft.analyse(signals)
+        spectra = self.stft.analyse(signals.reshape(-1, signals.shape[-1]))
+        spectra = spectra.unflatten(0, (-1, self.microphones))
+        spectrum, other_spectra = spectra[:, 0], spectra[:, 1:]
         start = interpolate(nalr_gains_db(ears), FREQUENCIES, self.config.hz) / NEPER_DB
         features = self._features(spectrum, ears, start)
+        if self.takes_microphones:
+            features = torch.cat((features, _relative_features(spectrum, other_spectra)), 1)
         features = features.contiguous(memory_format=torch.channels_last)
         features = self.encoder(features).permute(0, 2, 3, 1)
         for block in self.blocks:
             features = block(features)
         features = features.permute(0, 3, 1, 2)
         size = (spectrum.shape[-2], spectrum.shape[-1])
+        if self.weight_decoder is not None:
+            real, imaginary = self.weight_decoder(features, size).chunk(2, 1)
+            spectrum = spectrum + (torch.complex(real, imaginary) * other_spectra).sum(1)
         # The output is the input times a gain, so that silence stays silent and needs no logarithm.
         gain = start.unsqueeze(1) + self._correction(features, size)
         if self.phase_decoder is None:
@@ -125,7 +175,10 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
             factor = phase_factor(self.phase_decoder(features, size), gain)
         return self.stft.synthesise(spectrum * factor, signals.shape[-1])
 
-    _amplify = process_items
+    def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
+        if self.takes_microphones:
+            signals = signals.unsqueeze(1).expand(-1, self.microphones, -1)
+        return self.process_items(signals, ears)
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
         """Return the correction of NAL-R's gain in nepers, smooth over time and frequency.
@@ -166,6 +219,19 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
             channels.append(sine_of_phase(spectrum, squared))
         channels += [self.audiogram_encoder(ears).unsqueeze(1), start.unsqueeze(1)]
         return torch.stack([channel.expand(squared.shape) for channel in channels], 1)
+
+
+def _relative_features(reference: Tensor, signals: Tensor) -> Tensor:
+    """Return the log level ratio, and cosine and sine of the phase, of signals to the reference.
+
+    Shape: complex (items, frames, frequencies), complex (items, signals, frames, frequencies)
+        -> (items, 3 * signals, frames, frequencies).
+    """
+    first, squared = power(reference).unsqueeze(1), power(signals)
+    cross = signals * reference.unsqueeze(1).conj()
+    phase = cross * (first * squared + POWER_FLOOR**2).rsqrt()
+    ratio = log_magnitude(squared) - log_magnitude(first)
+    return torch.cat((ratio, phase.real, phase.imag), 1)
 
 
 def _average_over_stride(levels: Tensor, stride: int) -> Tensor:

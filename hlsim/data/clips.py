@@ -105,7 +105,7 @@ class Clips:
             index: Index of the file in ``files``.
 
         Returns:
-            Samples with shape (time,).
+            Samples with shape (time,), or (channels, time) in a subclass.
         """
         if index not in self._recordings:
             try:
@@ -115,7 +115,7 @@ class Clips:
                 waveform = torch.zeros(1)
             peak = max(float(waveform.abs().max()), _LOWEST_PEAK)
             self._recordings[index] = (waveform / peak * 32767.0).round().to(torch.int16)
-            sizes = [len(samples) for samples in self._recordings.values()]
+            sizes = [samples.numel() for samples in self._recordings.values()]
             while len(sizes) > 1 and sum(sizes) > MAX_SAMPLES_IN_MEMORY:
                 oldest = next(iter(self._recordings))
                 del self._recordings[oldest], sizes[0]
@@ -132,14 +132,15 @@ class Clips:
             position: Position of the clip, from 0 at the start of the recording to 1 at its end.
 
         Returns:
-            The clip, (samples,).
+            The clip, (samples,), or (channels, samples) in a subclass.
         """
         recording = self.read_recording(index)
-        if self.repeat and len(recording) < self.samples:
-            recording = recording.repeat(math.ceil(self.samples / len(recording)))
-        start = int(position * max(0, len(recording) - self.samples))
-        clip = recording[start : start + self.samples]
-        return torch.nn.functional.pad(clip, (0, self.samples - len(clip)))
+        time = recording.shape[-1]
+        if self.repeat and time < self.samples:
+            recording = recording.repeat(math.ceil(self.samples / time))
+        start = int(position * max(0, recording.shape[-1] - self.samples))
+        clip = recording[..., start : start + self.samples]
+        return torch.nn.functional.pad(clip, (0, self.samples - clip.shape[-1]))
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw clips at random positions of random recordings, and redraw silent clips.
@@ -162,7 +163,7 @@ class Clips:
             index = int(torch.randint(len(self), (), generator=generator))
             position = float(torch.rand((), generator=generator))
             clip = self.cut_clip(index, position)
-            if float(clip.square().mean()) > _SILENT_POWER:
+            if float(self.judged_part(clip).square().mean()) > _SILENT_POWER:
                 clips.append(clip)
                 failures = 0
                 continue
@@ -173,6 +174,10 @@ class Clips:
                     "remove broken and silent recordings, or draw longer clips"
                 )
         return torch.stack(clips)
+
+    def judged_part(self, clip: Tensor) -> Tensor:
+        """Return the part of a clip by which it counts as silent or not, here all of it."""
+        return clip
 
     def _decode(self, index: int) -> Tensor:
         """Decode the first channel of a file, or of the noise of a pair, at the clips' sample rate.

@@ -15,8 +15,11 @@ from hlsim.files import convert_at, path_below, read_table, warn_of_unused, writ
 SPLITS = ("train", "valid", "test")
 """Names of the splits: parts of a corpus for training, validation and test."""
 
-COLUMNS = ("path", "noisy", "speaker", "split")
-"""Columns of a manifest."""
+COLUMNS = ("path", "noisy", "speaker", "split", "reference")
+"""Columns of a manifest. The last one is written only if an utterance has a reference."""
+
+FILE_SEPARATOR = "|"
+"""Text between the files of several microphones in the column ``noisy``."""
 
 _NON_SPEECH_WORDS = {"noise", "noises", "noisy", "mix", "mixture", "mixtures", "rir", "rirs"}
 """Words in the names of folders that contain no clean speech."""
@@ -29,8 +32,13 @@ class Utterance:
     Attributes:
         path: Path of the clean speech, relative to the folder of the corpus, with forward slashes.
         noisy: Path of the noisy version, time-aligned and equally long; empty if there is none.
+            With ``reference``, also the paths of several files, separated by ``|``, whose channels
+            count from the first file to the last.
         speaker: Name of the speaker; empty if unknown.
         split: ``train``, ``valid`` or ``test``.
+        reference: Number of the channel of ``noisy``, from 1, whose microphone receives the speech
+            as ``path`` has it, if the channels are several microphones; two numbers, such as
+            ``1 2``, for the left and the right ear. Then the channels are left and right in turn.
 
     >>> Utterance("clean/p226_001.wav", speaker="p226").split
     'train'
@@ -40,6 +48,29 @@ class Utterance:
     noisy: str = ""
     speaker: str = ""
     split: str = "train"
+    reference: str = ""
+
+    @property
+    def noisy_files(self) -> list[str]:
+        """Paths of the noisy version, of which there are several only with ``reference``."""
+        return self.noisy.split(FILE_SEPARATOR) if self.noisy else []
+
+    @property
+    def references(self) -> tuple[int, ...]:
+        """Numbers in ``reference``.
+
+        Raises:
+            ValueError: The text is not empty, one number, or two as in ``1 2``.
+        """
+        texts = self.reference.split()
+        numbers = tuple(int(text) for text in texts if text.isdecimal())
+        is_pair = len(numbers) == 2 and numbers[0] % 2 == 1 and numbers[1] == numbers[0] + 1
+        if len(numbers) < len(texts) or 0 in numbers or not (len(numbers) < 2 or is_pair):
+            raise ValueError(
+                f"{self.noisy}: expected the number of a channel in the column 'reference', or two "
+                f"as in 1 2 or 3 4 for the left and the right ear, got {self.reference!r}"
+            )
+        return numbers
 
 
 def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utterance]:
@@ -47,9 +78,9 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
 
     Args:
         path: CSV file with a column ``path`` and optional columns ``noisy`` (path of the noisy
-            version), ``speaker`` and ``split``; their names may be in upper or lower case. A split
-            is ``train``, ``valid`` or ``test``. Without the column ``split``, all utterances are in
-            the split ``train``. Other columns cause a warning.
+            version), ``speaker``, ``split`` and ``reference``, see ``Utterance``; their names may
+            be in upper or lower case. Without the column ``split``, all utterances are in the split
+            ``train``. Other columns cause a warning.
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
@@ -75,9 +106,14 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
                 f"test in the column 'split', got {values}; correct the row"
             )
         for column in ("path", "noisy"):
-            if values.get(column):
-                file = convert_at(place, path_below, folder, values[column])
-                values[column] = Path(os.path.relpath(file, folder)).as_posix()
+            if not values.get(column):
+                continue
+            texts = [values[column]]
+            if column == "noisy" and values.get("reference"):
+                texts = values[column].split(FILE_SEPARATOR)
+            files = [convert_at(place, path_below, folder, text.strip()) for text in texts]
+            names = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
+            values[column] = FILE_SEPARATOR.join(names)
         utterances.append(Utterance(**values))
     try:
         check_utterances(utterances)
@@ -112,12 +148,13 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     target = Path(path)
     if target.suffix != ".csv":
         raise ValueError(f"{path}: expected the name of a manifest, which ends in .csv")
-    if target.is_file() and not target.read_bytes().startswith(",".join(COLUMNS).encode()):
+    columns = COLUMNS if any(row.reference for row in utterances) else COLUMNS[:-1]
+    if target.is_file() and not target.read_bytes().startswith(",".join(COLUMNS[:-1]).encode()):
         raise ValueError(f"{path}: would replace a file that is no manifest; choose another name")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(astuple(utterance) for utterance in utterances)
+    writer.writerow(columns)
+    writer.writerows(astuple(utterance)[: len(columns)] for utterance in utterances)
     write_atomically(path, text.getvalue())
 
 
@@ -130,7 +167,8 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
     Raises:
         ValueError: There are no rows, a file is both clean and noisy, a noisy file or a clean file
             without a noisy one is listed twice, a clean file is in a folder of noises, mixtures or
-            impulse responses by its name, or a file or a speaker is in two splits.
+            impulse responses by its name, a file or a speaker is in two splits, or a reference is
+            not valid, lacks a noisy file, or is missing in some rows only.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):
@@ -141,12 +179,18 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
     clean = {utterance.path for utterance in utterances}
     splits: dict[tuple[str, str], str] = {}
     listed = set()
+    ears = {len(utterance.references) for utterance in utterances}
+    if len(ears) > 1 or (ears != {0} and not all(utterance.noisy for utterance in utterances)):
+        raise ValueError(
+            "expected a noisy file and the same number of references (column 'reference') in every "
+            "row, or no references; correct the rows"
+        )
     for utterance in utterances:
         file = utterance.noisy or utterance.path
         if file in listed:
             raise ValueError(f"{file} is listed twice; remove one of the rows")
         listed.add(file)
-        if utterance.noisy in clean:
+        if clean.intersection(utterance.noisy_files):
             raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
         for folder in utterance.path.split("/")[:-1]:
             if _NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):

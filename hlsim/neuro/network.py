@@ -46,6 +46,8 @@ class EarNetwork(nn.Module):
     Attributes:
         checkpoint: Whether to use gradient checkpointing: activations are computed again in the
             backward pass, a few items or one part at a time, instead of stored. False by default.
+        microphones: Number of signals per item. With more than 1, inputs have the shape (...,
+            microphones, time), and the input of ``process_items`` (items, microphones, time).
 
     Raises:
         ValueError: The rate or the level is out of range.
@@ -62,6 +64,7 @@ class EarNetwork(nn.Module):
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.checkpoint = False
+        self.microphones = 1
         # receptive field in samples at 16 kHz of what a subclass adds to the layers of ``config``
         self._additional_field = 0
 
@@ -85,10 +88,14 @@ class EarNetwork(nn.Module):
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         weight = next(self.parameters())
         check_device(self, waveform.device)
-        thresholds = resolve_thresholds(None, audiogram, waveform)
+        first = waveform if self.microphones == 1 else waveform[..., 0, :]
+        thresholds = resolve_thresholds(None, audiogram, first)
         with torch.autocast(waveform.device.type, enabled=False):
-            batch, signals, ears = pair_items(waveform, thresholds, weight.dtype)
+            batch, signals, ears = pair_items(first, thresholds, weight.dtype)
             items = len(signals)
+            if self.microphones > 1:
+                all_signals = waveform.to(weight.dtype).expand(*batch, -1, -1)
+                signals = all_signals.reshape(items, self.microphones, -1)
             if self.checkpoint or signals.device.type == "cpu":
                 samples_per_item = NEURO_RATE * signals.shape[-1]
                 items = max(1, _samples_at_once(signals) * self.sample_rate // samples_per_item)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from compensators.config import BeamformerConfig
+from compensators.config import BeamformerConfig, MappingConfig
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
@@ -29,6 +29,7 @@ from hlsim.data.clips import AudioFiles, Clips, hash_source
 from hlsim.data.ears import draw_thresholds
 from hlsim.data.manifest import read_manifest
 from hlsim.data.mixing import mix
+from hlsim.data.recorded_scenes import SceneClips, SceneFiles
 from hlsim.data.scenes import draw_scenes
 from hlsim.data.tones_and_clicks import draw_sounds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
@@ -40,6 +41,10 @@ Batch = dict[str, Tensor]
 - ``thresholds``: thresholds of the ears in dB HL with shape (items, 8)
 - ``clean``: clean speech in pascals with shape (items, time)
 - ``noise_reduction`` (hearing aids): strength of noise reduction, 0 or 1, with shape (items,)
+
+For several microphones, ``signal`` has the shape (items, microphones, time). For two ears with
+several microphones, the shapes are (items, microphones, 2, time), (items, 2, 8) and (items, 2,
+time).
 """
 
 MAX_DEVICES = 64
@@ -79,6 +84,9 @@ class TrainingData:
         valid_noise: Noise for validation, like ``noise``.
         valid_audiograms: CSV file of measured ears for validation.
         workers: Number of processes that draw batches, in addition to the one that trains.
+        scenes: Recorded scenes, from which compensators are trained instead of ``speech`` and
+            ``noise``.
+        valid_scenes: Recorded scenes for validation.
 
     >>> data = TrainingData([Path("a.wav")], valid_speech=[Path("b.wav")])
     >>> [path.name for path in data.validation().speech]
@@ -92,6 +100,8 @@ class TrainingData:
     valid_noise: AudioFiles | None = None
     valid_audiograms: Path | None = None
     workers: int = 0
+    scenes: Sequence[SceneFiles] = ()
+    valid_scenes: Sequence[SceneFiles] = ()
 
     @classmethod
     def from_manifest(
@@ -99,7 +109,8 @@ class TrainingData:
     ) -> TrainingData:
         """Return the training data of a manifest: its splits ``train`` and ``valid``.
 
-        The difference between the manifest's noisy and clean speech is the noise.
+        The difference between the manifest's noisy and clean speech is the noise. Rows with
+        references are scenes instead.
 
         Args:
             manifest: CSV file, see ``read_manifest``.
@@ -108,34 +119,45 @@ class TrainingData:
                 ``audiograms``, which replace what the manifest has.
 
         Raises:
-            ValueError: The manifest is invalid.
+            ValueError: The manifest is invalid, or has scenes although there is ``noise``.
         """
         folder = Path(manifest).parent if root is None else Path(root)
         speech: dict[str, list[Path]] = defaultdict(list)
         pairs: dict[str, list[tuple[Path, Path]]] = defaultdict(list)
+        scenes: dict[str, list[SceneFiles]] = defaultdict(list)
         for row in read_manifest(manifest, root):
             clean = folder / row.path
             speech[row.split].append(clean)
-            if row.noisy:
+            if row.reference:
+                scenes[row.split].append(SceneFiles.from_utterance(row, folder))
+            elif row.noisy:
                 pairs[row.split].append((clean, folder / row.noisy))
         sources: dict[str, Any] = {
             "valid_speech": speech["valid"],
             "noise": pairs["train"],
             "valid_noise": pairs["valid"],
+            "scenes": scenes["train"],
+            "valid_scenes": scenes["valid"],
         }
         replacements = {name: value for name, value in attributes.items() if value}
+        if scenes and replacements.keys() & {"noise", "valid_noise"}:
+            raise ValueError(
+                f"{manifest}: its noisy speech at several microphones contains the noise; leave "
+                "--noise and --valid-noise out"
+            )
         return cls(speech["train"], **(sources | replacements))
 
     def validation(self) -> TrainingData:
-        """Return the data for validation as ``speech``, ``noise`` and ``audiograms``.
+        """Return the data for validation as ``speech``, ``noise``, ``audiograms`` and ``scenes``.
 
-        They are ``valid_speech``, ``valid_noise`` and ``valid_audiograms`` where these are set, and
-        otherwise the data for training.
+        They are ``valid_speech``, ``valid_noise``, ``valid_audiograms`` and ``valid_scenes`` where
+        these are set, and otherwise the data for training.
         """
         return TrainingData(
             self.valid_speech or self.speech,
             self.valid_noise or self.noise,
             self.valid_audiograms or self.audiograms,
+            scenes=self.valid_scenes or self.scenes,
         )
 
     def identity(self) -> str:
@@ -146,7 +168,9 @@ class TrainingData:
         Raises:
             ValueError: A folder does not exist or contains no audio, or a table is not valid.
         """
-        sources = (self.speech, self.noise, self.valid_speech, self.valid_noise)
+        sources = [self.speech, self.noise, self.valid_speech, self.valid_noise]
+        for scenes in filter(None, (self.scenes, self.valid_scenes)):
+            sources.append([file for scene in scenes for file in scene.microphones])
         hashes = [hash_source(source) if source else None for source in sources]
         tables = (self.audiograms, self.valid_audiograms)
         ears = [_read_ears(table) if table else None for table in tables]
@@ -238,16 +262,45 @@ class _SimulatorBatches(_RandomBatches):
 
 
 class _CompensatorBatches(_RandomBatches):
-    """Batches for a compensator: clean or noisy speech, tones and clicks."""
+    """Batches for a compensator: clean or noisy speech, tones and clicks.
+
+    Raises:
+        ValueError: The recipe's network has other microphones than the scenes, or several
+            microphones for which there are no scenes.
+    """
 
     recipe: CompensatorRecipe
 
+    def __init__(
+        self, recipe: CompensatorRecipe, data: TrainingData, ear: Audiogram | None
+    ) -> None:
+        super().__init__(recipe, data, ear)
+        self.microphones, self.ears = _microphones_and_ears(recipe)
+        self.scenes: SceneClips | None = None
+        if data.scenes:
+            settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
+            self.scenes = SceneClips(data.scenes, **settings)
+            numbers = (self.scenes.microphones, self.scenes.ears)
+            if self.microphones > 1 and numbers != (self.microphones, self.ears):
+                raise ValueError(
+                    f"expected {self.microphones} microphones for each of {self.ears} ears as in "
+                    f"the recipe's model, got {numbers[0]} for each of {numbers[1]} ears in the "
+                    "manifest; correct the model, or the column 'reference' of the manifest"
+                )
+        elif self.microphones > 1 and (self.microphones, self.ears) != (2, 2):
+            raise ValueError(
+                f"expected recorded scenes for {self.microphones} microphones, because only those "
+                "of 2 microphones for each of 2 ears are simulated; add them (--manifest)"
+            )
+
     def draw(self, count: int, generator: torch.Generator) -> Batch:
+        if self.scenes is not None:
+            return self._draw_recorded_scenes(self.scenes, count, generator)
         recipe = self.recipe
         voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)
         clips = self.replace_by_sounds(voices, generator)
         clean = set_level(clips, draw_uniform(*recipe.levels, (count,), generator))
-        if recipe.kind == "beamforming-aid":
+        if self.microphones > 1:
             return self._draw_scenes(clean, voices, generator)
         signal = clean
         if self.noise is not None:
@@ -259,12 +312,41 @@ class _CompensatorBatches(_RandomBatches):
             noisy = replace_share(clean, noisy, recipe.noisy, generator)
             is_speech = (clips == voices).all(-1, keepdim=True)
             signal = torch.where(is_speech, noisy, clean)
-        ears = self.draw_ears(count, generator)
+        return self._complete_batch(clean, signal, self.draw_ears(count, generator), generator)
+
+    def _complete_batch(
+        self, clean: Tensor, signal: Tensor, ears: Tensor, generator: torch.Generator
+    ) -> Batch:
+        """Return a batch for one microphone, with a strength of noise reduction for hearing aids.
+
+        Shape: (items, time) twice, (items, 8).
+        """
         batch = {"clean": clean, "signal": signal, "thresholds": ears}
-        if recipe.kind == "hearing-aid":
-            is_reduced = torch.rand(count, generator=generator) >= recipe.unreduced
+        if self.recipe.kind == "hearing-aid":
+            is_reduced = torch.rand(len(clean), generator=generator) >= self.recipe.unreduced
             batch["noise_reduction"] = is_reduced.to(clean.dtype)
         return batch
+
+    def _draw_recorded_scenes(
+        self, scenes: SceneClips, count: int, generator: torch.Generator
+    ) -> Batch:
+        """Draw clips of recorded scenes, in which the clean speech has the recipe's levels.
+
+        A network with one microphone gets that of the reference. Each ear is then an item.
+        """
+        clean, signal = scenes.draw_scenes(count, generator)
+        levels = draw_uniform(*self.recipe.levels, (count,), generator)
+        gains = 10.0 ** ((levels - level_spl(clean.flatten(1))) / 20.0)
+        clean, signal = clean * gains[:, None, None], signal * gains[:, None, None, None]
+        ears = self.draw_ears(count, generator)
+        if self.microphones == 1:
+            ears = ears.repeat_interleave(scenes.ears, 0)
+            reference = signal[:, 0].flatten(0, 1)
+            return self._complete_batch(clean.flatten(0, 1), reference, ears, generator)
+        if self.ears == 1:
+            return {"clean": clean[:, 0], "signal": signal[:, :, 0], "thresholds": ears}
+        ears = ears.unsqueeze(1).expand(-1, 2, -1)
+        return {"clean": clean, "signal": signal, "thresholds": ears}
 
     def _draw_scenes(self, clean: Tensor, voices: Tensor, generator: torch.Generator) -> Batch:
         """Draw the tensors of a batch for several microphones and two equal ears.
@@ -277,11 +359,20 @@ class _CompensatorBatches(_RandomBatches):
         snr = draw_uniform(*recipe.snr, (count,), generator)
         is_noisy = torch.rand(count, generator=generator) < recipe.noisy
         snr = torch.where(is_noisy, snr, _QUIET_SNR)
-        spacing = BeamformerConfig.from_dict(recipe.model).spacing
-        microphones = {"mismatch": recipe.mismatch, "spacing": spacing}
+        microphones = {"mismatch": recipe.mismatch}
+        if recipe.kind == "beamforming-aid":
+            microphones["spacing"] = BeamformerConfig.from_dict(recipe.model).spacing
         scenes = draw_scenes(clean, voices, noise, snr, generator, **microphones)
         ears = self.draw_ears(count, generator).unsqueeze(1).expand(-1, 2, -1)
         return {"clean": scenes.reference, "signal": scenes.input, "thresholds": ears}
+
+
+def _microphones_and_ears(recipe: CompensatorRecipe) -> tuple[int, int]:
+    """Return the number of microphones per ear of a recipe's network, and the number of ears."""
+    if recipe.kind == "mapping-compensator":
+        config = MappingConfig.from_dict(recipe.model)
+        return config.microphones, config.ears
+    return (2, 2) if recipe.kind == "beamforming-aid" else (1, 1)
 
 
 def _babble(voices: Tensor) -> Tensor:
@@ -371,7 +462,8 @@ def make_data(
         plain |= {"levels": levels, "treated": False}
     elif isinstance(recipe, CompensatorRecipe):
         plain["equalised"] = 0.0
-        if (recipe.trains_noise_reduction() or recipe.babble) and not data.noise:
+        has_noise = data.noise or data.scenes
+        if (recipe.trains_noise_reduction() or recipe.babble) and not has_noise:
             raise ValueError(
                 "denoising, intelligibility and babble in the recipe require noise, but the data "
                 "has none; add a folder of noise (--noise)"

@@ -142,16 +142,17 @@ class CompensatorRecipe(TrainingRecipe):
 
     Attributes:
         kind: Type of the network, ``mapping-compensator``, ``hearing-aid`` or ``beamforming-aid``.
-            The last one is trained in random scenes, see ``draw_scenes``. The recipe's ``start``
-            may be a hearing aid, before which it is placed, and whose weights stay.
+            The last one is trained in random scenes, see ``draw_scenes``, or in recorded ones. The
+            recipe's ``start`` may be a hearing aid, before which it is placed, and whose weights
+            stay. Recorded scenes are used as they are, except for their level.
         model: Settings of ``MappingConfig``, ``HearingAidConfig`` or ``BeamformerConfig``.
         weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
             ``hasqi``, ``interaural``, ``denoising`` and ``intelligibility``. The first six are
             those of ``HearingLossLoss``; ``interaural`` needs the two ears of a
-            ``beamforming-aid``. The last two train a hearing aid's noise reduction
-            alone, and the others its amplification alone: ``denoising`` is the error of the gains
-            of noise reduction, ``intelligibility`` is 1 - HASPI at equal level. ``haspi``,
-            ``hasqi`` (1 - score) and ``intelligibility`` require clips of 0.7 s or more.
+            ``beamforming-aid``, or ``ears: 2`` in ``model``. The last two train a hearing aid's
+            noise reduction alone, and the others its amplification alone: ``denoising`` is the
+            error of the gains of noise reduction, ``intelligibility`` is 1 - HASPI at equal level.
+            ``haspi``, ``hasqi`` (1 - score) and ``intelligibility`` require clips of 0.7 s or more.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
             them, a network learns that steady sounds are noise.
         equalised: Share of clips of speech, and of noise, that are equalised at random by up to 15
@@ -201,8 +202,8 @@ class CompensatorRecipe(TrainingRecipe):
         super().__post_init__()
         expected = "2 or more, because babble consists of the other items"
         self._require("batch", self.batch > 1 or not self.babble, expected)
-        expected = "beamforming-aid, because interaural compares two ears"
-        has_two_ears = self.kind == "beamforming-aid"
+        expected = "beamforming-aid, or ears: 2 in model, because interaural compares two ears"
+        has_two_ears = self.kind == "beamforming-aid" or self.model.get("ears") == 2
         self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
         expected = "beamforming-aid, the only kind for which mismatch has an effect"
         self._require("kind", has_two_ears or not self.mismatch, expected)

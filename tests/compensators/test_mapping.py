@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -68,3 +69,22 @@ def test_the_phase_is_kept_or_predicted(utterance: Tensor) -> None:
         is_loud = before.abs() > 0.1 * before.abs().max()
         turns.append(float((after * before.conj())[is_loud].angle().abs().mean()))
     assert turns[0] < 0.1 < 0.2 < turns[1]
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2)])
+def test_several_microphones_are_filtered_and_added(
+    utterance: Tensor, shape: tuple[int, ...]
+) -> None:
+    config = replace(SMALL, microphones=3, ears=len(shape))
+    model, single = MappingCompensator(config=config), MappingCompensator(config=SMALL)
+    signals = torch.stack((utterance[:8000], *torch.zeros(2, 8000)))
+    ears: list[str] | str = "N3"
+    if len(shape) == 2:
+        signals, ears = torch.stack((signals, 0.1 * signals), 1), ["N3", "N4"]
+    torch.testing.assert_close(model(signals, ears), single(signals[0], ears))
+    assert model.weight_decoder is not None
+    with torch.no_grad():
+        model.weight_decoder.leave.bias.unflatten(0, (4, -1))[0] = -1.0
+    assert float(model(signals[:1].expand(*shape, -1), ears).detach().abs().max()) < 1e-6
+    with pytest.raises(ValueError, match=r"3 microphones per ear, .* the reference first"):
+        model(signals[:2], ears)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,8 +14,10 @@ from compensators import load_compensator, save_compensator
 from compensators.beamformer import BeamformingAid
 from compensators.config import BeamformerConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss
-from hlsim.calibration import set_level
+from hlsim.audio import write_audio
+from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import read_record, save_checkpoint
+from hlsim.data.manifest import Utterance, write_manifest
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.simulators import BUILT_IN
 from hlsim.training.batches import Batch, TrainingData, make_data
@@ -246,6 +249,53 @@ def test_a_front_end_is_trained_in_scenes_before_an_aid(
         CompensatorTraining(replace(recipe, start=str(start), model={}), simulator="msbg")
     with pytest.raises(ValueError, match="interaural compares two ears"):
         replace(recipe, kind="hearing-aid")
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> TrainingData:
+    """Recorded scenes with three microphones at each of two ears."""
+    generator = np.random.default_rng(0)
+    clean = torch.from_numpy(0.1 * generator.normal(size=8000)).float()
+    noisy = torch.from_numpy(0.1 * generator.normal(size=(6, 8000))).float() + clean
+    write_audio(tmp_path / "clean.wav", clean, 16000)
+    write_audio(tmp_path / "mixture.wav", noisy, 16000)
+    row = Utterance("clean.wav", "mixture.wav", reference="1 2")
+    write_manifest(tmp_path / "manifest.csv", [row])
+    return TrainingData.from_manifest(tmp_path / "manifest.csv")
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape"),
+    [
+        ({"model": {**SMALL.model, "microphones": 3, "ears": 2}}, (2, 3, 2, 3200)),
+        ({}, (4, 3200)),  # each ear is an item
+        ({"kind": "hearing-aid", "model": SMALL_AID.model}, (4, 3200)),
+    ],
+)
+def test_compensators_are_trained_in_recorded_scenes(
+    scenes: TrainingData, settings: dict[str, Any], shape: tuple[int, ...]
+) -> None:
+    recipe = replace(SMALL, **settings, levels=(60.0, 60.0))
+    batch = draw(recipe, scenes, 2)
+    assert batch["signal"].shape == shape
+    clean = batch["clean"].reshape(2, 2, -1)
+    torch.testing.assert_close(level_spl(clean), torch.full((2, 2), 60.0))
+    module = CompensatorTraining(recipe, simulator="attenuation")
+    check_gradients(module, batch)
+
+
+def test_other_microphones_than_those_of_the_scenes_are_errors(
+    scenes: TrainingData, data: TrainingData, tmp_path: Path
+) -> None:
+    recipe = replace(SMALL, model={**SMALL.model, "microphones": 4})
+    with pytest.raises(ValueError, match=r"4 microphones .* got 3 for each of 2 ears"):
+        draw(recipe, scenes, 2)
+    with pytest.raises(ValueError, match="recorded scenes for 4 microphones"):
+        draw(recipe, data, 2)
+    with pytest.raises(ValueError, match="leave --noise"):
+        TrainingData.from_manifest(tmp_path / "manifest.csv", noise=tmp_path)
+    two_ears = replace(SMALL, model={**SMALL.model, "microphones": 2, "ears": 2})
+    assert draw(two_ears, data, 2)["signal"].shape == (2, 2, 2, 3200)
 
 
 def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: TrainingData) -> None:

@@ -1,0 +1,139 @@
+"""Recorded scenes: clean speech, and the same speech with noise at several microphones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from hlsim.audio import read_audio
+from hlsim.data.clips import Clips
+from hlsim.data.manifest import Utterance
+from hlsim.dsp.resample import resample
+
+_LARGEST_DIFFERENCE = 0.1
+"""Largest difference in length between the files of a scene in seconds, which is cut off."""
+
+
+class SceneFiles(NamedTuple):
+    """Files of a recorded scene.
+
+    Attributes:
+        clean: Clean speech, with one channel, or one for each ear.
+        microphones: Files of the noisy speech, whose channels count from the first to the last.
+        references: Number of the reference channel, from 1, for one ear or for two.
+
+    >>> SceneFiles(Path("clean.wav"), (Path("noisy.wav"),), references=(1, 2)).references
+    (1, 2)
+    """
+
+    clean: Path
+    microphones: tuple[Path, ...]
+    references: tuple[int, ...]
+
+    @classmethod
+    def from_utterance(cls, row: Utterance, folder: Path) -> SceneFiles:
+        """Return the files of a row of a manifest, whose paths are relative to a folder.
+
+        A row without references is a scene with one microphone.
+
+        Raises:
+            ValueError: The row has no noisy speech.
+        """
+        if not row.noisy:
+            raise ValueError(
+                f"{row.path}: expected a noisy version in the column 'noisy', got none; add it"
+            )
+        microphones = tuple(folder / file for file in row.noisy_files)
+        return cls(folder / row.path, microphones, row.references or (1,))
+
+    def read(self) -> tuple[Tensor, Tensor, int]:
+        """Read the signals, with the reference microphone first.
+
+        Returns:
+            The clean speech, (ears, time), the signals of the microphones, (microphones, ears,
+            time), and the sample rate in Hz.
+
+        Raises:
+            ValueError: A file cannot be read, or the files do not fit together.
+        """
+        files = [read_audio(path) for path in (self.clean, *self.microphones)]
+        waveforms, rates = zip(*files, strict=True)
+        time = min(waveform.shape[-1] for waveform in waveforms)
+        longest = max(waveform.shape[-1] for waveform in waveforms)
+        if len({*rates}) > 1 or longest - time > _LARGEST_DIFFERENCE * rates[0]:
+            raise ValueError(
+                f"{self.clean}: expected the sample rate and the length of its noisy version, "
+                f"{self.microphones[0]}; replace the files"
+            )
+        ears = len(self.references)
+        clean, *noisy = (waveform[:, :time] for waveform in waveforms)
+        channels = torch.cat(noisy)
+        if (
+            len(clean) not in (1, ears)
+            or len(channels) % ears
+            or len(channels) < self.references[-1]
+        ):
+            raise ValueError(
+                f"{self.microphones[0]}: expected the same number of microphones for each of "
+                f"{ears} ears, with channel {self.references[-1]} among them, and clean speech "
+                f"with 1 or {ears} channels, got {len(channels)} and {len(clean)}; correct the "
+                "column 'reference' of the manifest"
+            )
+        first = (self.references[0] - 1) // ears
+        microphones = channels.unflatten(0, (-1, ears))
+        later = [number for number in range(len(microphones)) if number != first]
+        return clean.expand(ears, -1), microphones[[first, *later]], rates[0]
+
+
+class SceneClips(Clips):
+    """Clips of recorded scenes, see ``Clips``: first the clean speech, then the microphones.
+
+    Args:
+        scenes: Files of the scenes.
+        settings: Arguments ``sample_rate`` and ``seconds`` of ``Clips``.
+
+    Attributes:
+        ears: Number of ears.
+        microphones: Number of microphones per ear.
+
+    Raises:
+        ValueError: There are no scenes, the first one is not valid, or another one has another
+            number of ears.
+    """
+
+    def __init__(self, scenes: Sequence[SceneFiles], **settings: Any) -> None:
+        super().__init__([scene.microphones[0] for scene in scenes], **settings)
+        self._scenes = scenes
+        clean, microphones, _ = scenes[0].read()
+        self.ears, self.microphones = len(clean), len(microphones)
+        if {len(scene.references) for scene in scenes} != {self.ears}:
+            raise ValueError("expected the same number of references for all scenes; correct them")
+
+    def draw_scenes(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw clips at random positions of random scenes in which there is clean speech.
+
+        Returns:
+            The clean speech, (count, ears, time), and the signals of the microphones, (count,
+            microphones, ears, time), without a calibrated level.
+        """
+        clips = self.draw(count, generator)
+        return clips[:, : self.ears], clips[:, self.ears :].unflatten(1, (-1, self.ears))
+
+    def judged_part(self, clip: Tensor) -> Tensor:
+        """Return the clean speech, which may be silent where there is noise."""
+        return clip[: self.ears]
+
+    def _decode(self, index: int) -> Tensor:
+        scene = self._scenes[index]
+        clean, microphones, rate = scene.read()
+        if len(microphones) != self.microphones:
+            raise ValueError(
+                f"{scene.microphones[0]}: expected {self.microphones} microphones per ear as in "
+                f"{self.files[0]}, got {len(microphones)}; leave the scene out"
+            )
+        channels = torch.cat((clean, microphones.flatten(0, 1)))
+        return resample(channels, rate, self.sample_rate)

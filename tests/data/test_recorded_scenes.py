@@ -1,0 +1,91 @@
+"""Tests of recorded scenes with several microphones, and of their manifests."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audio import write_audio
+from hlsim.data.manifest import Utterance, check_utterances, read_manifest, write_manifest
+from hlsim.data.recorded_scenes import SceneClips, SceneFiles
+
+RATE = 16000
+
+
+@pytest.fixture
+def row(tmp_path: Path) -> Utterance:
+    """Scene of 1 s whose channel n has the constant n / 10, and whose clean speech starts late."""
+    clean = torch.cat((torch.zeros(RATE // 2), 0.05 * torch.ones(RATE // 2)))
+    write_audio(tmp_path / "clean.wav", clean, RATE)
+    for number, name in enumerate(("CH1.wav", "CH2.wav")):
+        pair = torch.tensor([[0.1], [0.2]]) + 0.2 * number
+        write_audio(tmp_path / name, pair.expand(2, RATE + 10), RATE)
+    return Utterance("clean.wav", "CH1.wav|CH2.wav", reference="3 4")
+
+
+def levels(signals: Tensor) -> list[float]:
+    return [round(float(level), 2) for level in signals.mean(-1).flatten()]
+
+
+def test_a_manifest_names_the_microphones_and_their_reference(
+    tmp_path: Path, row: Utterance
+) -> None:
+    path = tmp_path / "manifest.csv"
+    write_manifest(path, [row])
+    assert path.read_text().splitlines() == [
+        "path,noisy,speaker,split,reference",
+        "clean.wav,CH1.wav|CH2.wav,,train,3 4",
+    ]
+    assert read_manifest(path) == [row]
+    write_manifest(path, [Utterance("clean.wav")])  # replaces a manifest with references
+
+
+@pytest.mark.parametrize(
+    ("reference", "expected"),
+    [
+        ("3 4", [0.3, 0.4, 0.1, 0.2]),
+        ("1 2", [0.1, 0.2, 0.3, 0.4]),
+        ("2", [0.2, 0.1, 0.3, 0.4]),
+    ],
+)
+def test_the_reference_is_the_first_microphone(
+    tmp_path: Path, row: Utterance, reference: str, expected: list[float]
+) -> None:
+    files = SceneFiles.from_utterance(Utterance(row.path, row.noisy, reference=reference), tmp_path)
+    clean, microphones, rate = files.read()
+    ears = len(reference.split())
+    assert clean.shape == (ears, RATE)  # the longer file is cut
+    assert microphones.shape == (4 // ears, ears, RATE) and rate == RATE
+    assert levels(microphones) == expected
+
+
+def test_clips_of_scenes_have_clean_speech(tmp_path: Path, row: Utterance) -> None:
+    scenes = SceneClips([SceneFiles.from_utterance(row, tmp_path)], sample_rate=RATE, seconds=0.1)
+    clean, signals = scenes.draw_scenes(20, torch.Generator().manual_seed(0))
+    assert clean.shape == (20, 2, 1600) and signals.shape == (20, 2, 2, 1600)
+    assert bool(clean.any(-1).all())
+    ratios = signals[0].mean(-1) / signals[0, 0, 0].mean()
+    np.testing.assert_allclose(ratios, [[1.0, 4 / 3], [1 / 3, 2 / 3]], rtol=1e-3)
+
+
+@pytest.mark.parametrize("reference", ["front", "0", "1 3", "2 3", "1 2 3"])
+def test_wrong_references_are_errors(reference: str) -> None:
+    with pytest.raises(ValueError, match="the number of a channel in the column 'reference'"):
+        check_utterances([Utterance("clean.wav", "CH1.wav", reference=reference)])
+
+
+def test_references_without_microphones_are_errors(tmp_path: Path, row: Utterance) -> None:
+    for other in (Utterance("a.wav", "b.wav"), Utterance("a.wav", reference="3 4")):
+        with pytest.raises(ValueError, match="same number of references"):
+            check_utterances([row, other])
+    with pytest.raises(ValueError, match="both as clean and as noisy"):
+        check_utterances([row, Utterance("CH2.wav", "x.wav", reference="1 2")])
+    with pytest.raises(ValueError, match="with channel 5 among them"):
+        SceneFiles.from_utterance(Utterance(row.path, row.noisy, reference="5"), tmp_path).read()
+    with pytest.raises(ValueError, match="expected a noisy version"):
+        SceneFiles.from_utterance(Utterance(row.path), tmp_path)
+    write_audio(tmp_path / "CH1.wav", torch.ones(2, 2 * RATE), RATE)
+    with pytest.raises(ValueError, match="the length of its noisy version"):
+        SceneFiles.from_utterance(row, tmp_path).read()
