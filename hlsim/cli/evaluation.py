@@ -49,6 +49,8 @@ def evaluate_simulator(parser: Parser) -> None:
     option("names", str, f"msbg (exact), or checkpoints {_CHECKPOINTS}", nargs="+")
     option("--audiograms", str, EARS_TABLE, required=True)
     parser.teacher("simulator to compare with")
+    text = "folder of clean speech, of speakers that were not used in training"
+    option("--speech", input_path, text, required=True)
     _declare_items(parser, "items", 240, [50, 60, 65, 70, 80])
     text = "input of the simulators: as-is, louder (20 dB), nalr, compressed (3:1), compensated"
     parser.series("--inputs", str, text, ["as-is"])
@@ -92,6 +94,16 @@ def evaluate_compensator(parser: Parser) -> None:
     text = f"{EARS_TABLE}; used in addition to Bisgaard's ears N2 to N6 and S1 to S3"
     option("--audiograms", str, text)
     parser.audiogram(text="; single ear for everything, for a compensator trained for it")
+    speech = parser.add_mutually_exclusive_group(required=True)
+    text = "folder of clean speech, of speakers that were not used in training"
+    option("--speech", input_path, text, group=speech)
+    text = (
+        "manifest of noisy speech, with one or several microphones, instead of --speech and "
+        "--noise; its split test is used, or else valid"
+    )
+    option("--manifest", input_path, text, group=speech)
+    text = "folder to which the manifest's paths are relative; by default the manifest's folder"
+    option("--root", input_path, text)
     _declare_items(parser, "clean speech", 400, [50, 65, 80])
     parser.enhancers("time-aligned waveforms with shape (..., time) in pascals")
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
@@ -312,7 +324,7 @@ def _by_name(named_folders: Sequence[tuple[str, Path]], option: str) -> dict[str
 
 
 def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int]) -> None:
-    """Declare the options of items that are drawn from recordings.
+    """Declare the options of items that are drawn from recordings, except for the speech.
 
     Args:
         parser: Parser of the command.
@@ -321,8 +333,6 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
         levels: Default levels in dB SPL.
     """
     option = parser.option
-    text = "folder of clean speech, of speakers that were not used in training"
-    option("--speech", input_path, text, required=True)
     text = "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB"
     option("--noise", input_path, text)
     parser.series("--levels", sound_level, f"levels of the {levelled} in dB SPL, in turn", levels)

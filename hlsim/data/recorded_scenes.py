@@ -99,6 +99,7 @@ class SceneClips(Clips):
     Attributes:
         ears: Number of ears.
         microphones: Number of microphones per ear.
+        clean_files: Paths of the clean speech.
 
     Raises:
         ValueError: There are no scenes, the first one is not valid, or another one has another
@@ -108,6 +109,7 @@ class SceneClips(Clips):
     def __init__(self, scenes: Sequence[SceneFiles], **settings: Any) -> None:
         super().__init__([scene.microphones[0] for scene in scenes], **settings)
         self._scenes = scenes
+        self.clean_files = [scene.clean for scene in scenes]
         clean, microphones, _ = scenes[0].read()
         self.ears, self.microphones = len(clean), len(microphones)
         if {len(scene.references) for scene in scenes} != {self.ears}:

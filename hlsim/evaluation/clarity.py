@@ -24,7 +24,15 @@ from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.aid_properties import measure_look_ahead
-from hlsim.evaluation.conditions import NAL_R, UNAIDED, Enhanced, PluginAid, Unaided, load_enhancers
+from hlsim.evaluation.conditions import (
+    NAL_R,
+    UNAIDED,
+    Enhanced,
+    PluginAid,
+    Unaided,
+    load_enhancers,
+    takes_microphones,
+)
 from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.recorded_items import RecordedItem
 from hlsim.evaluation.recordings import score_recordings
@@ -419,7 +427,7 @@ def _input_of(condition: Condition, signals: Tensor) -> Tensor:
         condition: Condition with the aid.
         signals: Signals of the microphones. Shape: (microphones, 2, time).
     """
-    return signals if getattr(condition.process, "takes_microphones", False) else signals.mean(0)
+    return signals if takes_microphones(condition.process) else signals.mean(0)
 
 
 @one_thread()

@@ -17,6 +17,8 @@ from hlsim.audiogram.value import EarLike
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, Loudness, check_loudness, loudness_at
 from hlsim.checks import check_attributes
 from hlsim.data.clips import Clips
+from hlsim.data.manifest import read_manifest
+from hlsim.data.recorded_scenes import SceneClips, SceneFiles
 from hlsim.evaluation.aid_properties import (
     measure_aids,
     measure_gain_curve,
@@ -32,15 +34,23 @@ from hlsim.evaluation.conditions import (
     AtLevelOf,
     Enhanced,
     EqualiserLike,
+    OnMicrophones,
     PrescriptionForEar,
     Rival,
     Unaided,
     is_profound,
     load_enhancers,
     load_rival,
+    takes_microphones,
 )
 from hlsim.evaluation.digits import DigitTest
-from hlsim.evaluation.items import INPUT_LEVELS, draw_aid_items, ear_name, read_ears
+from hlsim.evaluation.items import (
+    INPUT_LEVELS,
+    draw_aid_items,
+    draw_scene_items,
+    ear_name,
+    read_ears,
+)
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.sounds import perceive_items
@@ -51,11 +61,19 @@ from hlsim.plugins import WaveformPlugin
 UTTERANCES = 6
 """Number of clips of speech, of 3 s each, with which gains are measured."""
 
+_SINGLE_SIGNAL_NOTE = (
+    "{name} has several microphones. Gain curves, the equaliser, steady tones and 'Could it be "
+    "worn?' are measured with a single signal, which goes to the hearing aid behind a directional "
+    "front end, or otherwise to all microphones."
+)
+
 
 def evaluate_compensators(
     compensators: Mapping[str, nn.Module],
     *,
-    speech: str | Path,
+    speech: str | Path | None = None,
+    manifest: str | Path | None = None,
+    root: str | Path | None = None,
     store: str | Path | None = None,
     audiograms: str | Path | None = None,
     audiogram: EarLike | None = None,
@@ -90,6 +108,11 @@ def evaluate_compensators(
         compensators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
             waveform and an ear.
         speech: Folder of recordings of clean speech.
+        manifest: Manifest of noisy speech instead of ``speech`` and ``noise``, with one or several
+            microphones, see ``read_manifest``. Its split ``test`` is used, or else ``valid``. A
+            compensator with the attribute ``takes_microphones`` gets all microphones, the others
+            get the reference.
+        root: Folder to which the paths of the manifest are relative; by default its folder.
         store: File of scores, which is created if it does not exist; None stores nothing.
         audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3.
         audiogram: Single ear for everything, for a compensator that was trained for this ear.
@@ -142,6 +165,10 @@ def evaluate_compensators(
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
     loudness = check_loudness(loudness)
+    if (manifest is None) == (speech is None) or (noise is not None and speech is None):
+        raise ValueError(
+            "expected either speech, with or without noise, or a manifest; pass one of them"
+        )
     for name, aid in compensators.items():
         check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
@@ -158,7 +185,15 @@ def evaluate_compensators(
     rival_name, rival_aid = load_rival(rival, [*ears_of_aids.values(), *dict(ears).values()])
     for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION, rival_name}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")
-    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
+    scenes = None if manifest is None else _read_scenes(manifest, root, seconds)
+    aids_of_microphones = [name for name, aid in compensators.items() if takes_microphones(aid)]
+    if aids_of_microphones and (scenes is None or srt):
+        raise ValueError(
+            f"{aids_of_microphones[0]} has several microphones; expected a manifest with a column "
+            "'reference' (--manifest), and no digit test (--srt)"
+        )
+    clean_speech: Any = speech if scenes is None else scenes.clean_files
+    clips = Clips(clean_speech, sample_rate=NEURO_RATE, seconds=3.0)
     utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     enhancer_plugins = load_enhancers(enhancers)
     prescriptions = {
@@ -166,12 +201,30 @@ def evaluate_compensators(
         rival_name: rival_aid,
         COMPRESSION: WDRC(sample_rate=NEURO_RATE),
     }
-    aids = {**prescriptions, **compensators}
-    equalisers = {name: EqualiserLike(aids[name], utterances, levels) for name in compensators}
-    conditions = _make_conditions(aids, equalisers, enhancer_plugins, rival_name)
+    settings: dict[str, Any] = {
+        "items": items,
+        "seconds": seconds,
+        "seed": seed,
+        "levels": list(levels),
+    }
+    aids = {name: _adapt(aid, scenes) for name, aid in {**prescriptions, **compensators}.items()}
+    equalisers = {
+        name: _adapt(EqualiserLike(aids[name], utterances, levels), scenes) for name in compensators
+    }
+    unaided = _adapt(Unaided(), scenes)
+    if scenes is None:
+        assert speech is not None
+        drawn = draw_aid_items(speech, noise, ears, **settings)
+    else:
+        drawn = draw_scene_items(scenes, ears, **settings)
+    notes = []
+    for name in aids_of_microphones:
+        aids[name](drawn[0].signal, drawn[0].ear)  # rejects another number of microphones
+        notes.append(_SINGLE_SIGNAL_NOTE.format(name=name))
+    conditions = _make_conditions(unaided, aids, equalisers, enhancer_plugins, rival_name)
     kinds = ("aid", "prescription", "enhanced")
     wearable = {c.name: c.process for c in conditions if c.process and c.kind in kinds}
-    with_unaided: dict[str, Any] = {UNAIDED: Unaided(), **wearable}
+    with_unaided: dict[str, Any] = {UNAIDED: unaided, **wearable}
     # These measurements come first, because they reject an aid that fails.
     details = {
         "gain_curves": measure_aids(aids, ears_of_aids, measure_gain_curve, utterances, levels),
@@ -192,15 +245,9 @@ def evaluate_compensators(
     for row in details["steady_tones"]:
         errors = zip(row["loudness_error_db"], targets, strict=True)
         row["loudness_error_db"] = [[tone - target for tone in tones] for tones, target in errors]
-    settings: dict[str, Any] = {
-        "items": items,
-        "seconds": seconds,
-        "seed": seed,
-        "levels": list(levels),
-    }
     scores = find_measures(["haspi", "hasqi", *measures], precision)
     evaluation = Evaluation.run(
-        draw_aid_items(speech, noise, ears, **settings),
+        drawn,
         conditions,
         [*scores, LEVELS, PERCEPTION, network_loss(load_pretrained(simulator))],
         store=store,
@@ -223,7 +270,8 @@ def evaluate_compensators(
         loudness_error=table["loudness_error"] - item_targets.numpy(),
         level_over_nal_r=table["level"] - table["item"].map(nal_r_levels),
     )
-    evaluation = replace(evaluation, table=table, details=details)
+    notes = [*notes, *evaluation.notes]
+    evaluation = replace(evaluation, table=table, details=details, notes=notes)
     groups = _make_groups(evaluation)
     same_level = next(c.name for c in conditions if c.kind == "same level")
     sounds = perceive_items(
@@ -232,7 +280,32 @@ def evaluate_compensators(
     return replace(evaluation, groups=groups, sounds=sounds)
 
 
+def _read_scenes(manifest: str | Path, root: str | Path | None, seconds: float) -> SceneClips:
+    """Return clips of the scenes in the split test of a manifest, or else in its split valid.
+
+    Raises:
+        ValueError: The manifest is not valid, or has no scenes in these splits.
+    """
+    folder = Path(manifest).parent if root is None else Path(root)
+    rows = read_manifest(manifest, root)
+    rows_by_split = [[row for row in rows if row.split == split] for split in ("test", "valid")]
+    chosen_rows = rows_by_split[0] or rows_by_split[1]
+    if not chosen_rows:
+        raise ValueError(
+            f"{manifest}: expected utterances in the split test or valid, got none; write test in "
+            "the column 'split' of those that were not used in training"
+        )
+    scenes = [SceneFiles.from_utterance(row, folder) for row in chosen_rows]
+    return SceneClips(scenes, sample_rate=NEURO_RATE, seconds=seconds)
+
+
+def _adapt(aid: nn.Module, scenes: SceneClips | None) -> nn.Module:
+    """Return an aid for the items of a study, which has several microphones if it has scenes."""
+    return aid if scenes is None else OnMicrophones(aid, (scenes.microphones, scenes.ears))
+
+
 def _make_conditions(
+    unaided: nn.Module,
     aids: Mapping[str, nn.Module],
     equalisers: Mapping[str, nn.Module],
     enhancers: Mapping[str, WaveformPlugin],
@@ -245,12 +318,13 @@ def _make_conditions(
     enhancer, and the aid.
 
     Args:
+        unaided: The condition without an aid.
         aids: Prescriptions, the rival among them, and then trained aids, each under its name.
         equalisers: For each trained aid, under its name, an equaliser with its mean gain.
         enhancers: Enhancers, by the part of their names after the colon.
         rival: Name of the prescription at the level of each trained aid.
     """
-    conditions = [Condition(UNAIDED, Unaided(), kind="unaided")]
+    conditions = [Condition(UNAIDED, unaided, kind="unaided")]
     for name, aid in aids.items():
         enhanced = [
             Condition(f"{prefix} + {name}", Enhanced(enhancer, aid), "enhanced", name)

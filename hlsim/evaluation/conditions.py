@@ -17,6 +17,7 @@ import scipy
 import torch
 from torch import Tensor, nn
 
+from compensators.directional import DirectionalAid
 from compensators.loading import load_compensator
 from compensators.nalr import NALR, NALRP
 from hlsim.audio import read_audio
@@ -126,6 +127,50 @@ def load_rival(rival: Rival, ears: Iterable[Audiogram]) -> tuple[str, nn.Module]
         return "prescription for the ear", PrescriptionForEar()
     name = "nalr" if rival == "for-ear" else rival
     return _RIVAL_NAMES[name], load_compensator(name, sample_rate=NEURO_RATE)
+
+
+class OnMicrophones(nn.Module):
+    """Hearing aid of one ear for the signals of several microphones at one ear or at two.
+
+    An aid with the attribute ``takes_microphones`` gets all signals, as (microphones, time) or
+    (microphones, 2, time), and another aid that of the reference, the first microphone of the first
+    ear. For two ears, the aid gets the same audiogram twice, and the output of the first ear is
+    returned.
+
+    A single signal, (time,), goes to an aid without its directional front end, and to all
+    microphones of any other aid.
+
+    Args:
+        aid: The aid.
+        shape: Number of microphones, and number of ears.
+
+    >>> OnMicrophones(Unaided(), (2, 1))(torch.eye(2).unsqueeze(1), Audiogram.standard("N3"))
+    tensor([1., 0.])
+    """
+
+    def __init__(self, aid: nn.Module, shape: tuple[int, int]) -> None:
+        super().__init__()
+        self.aid, self.shape = aid, shape
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        """Return the output for the first ear, (microphones, ears, time) or (time,) -> (time,)."""
+        is_single = waveform.ndim == 1
+        if not takes_microphones(self.aid):
+            return self.aid(waveform if is_single else waveform[0, 0], audiogram)
+        if is_single and isinstance(self.aid, DirectionalAid):
+            return self.aid.aid(waveform, audiogram)
+        signals = waveform.expand(*self.shape, -1)
+        output = self.aid(signals[:, 0] if self.shape[1] == 1 else signals, audiogram)
+        return output[0] if self.shape[1] == 2 else output
+
+
+def takes_microphones(aid: object) -> bool:
+    """Return whether an aid takes the signals of several microphones.
+
+    >>> takes_microphones(Unaided())
+    False
+    """
+    return bool(getattr(aid, "takes_microphones", False))
 
 
 class AtLevelOf(nn.Module):
@@ -249,7 +294,7 @@ class PluginAid(nn.Module):
         super().__init__()
         self.plugin = WaveformPlugin(name, "aid")
         self.sample_rate = sample_rate
-        self.takes_microphones = bool(getattr(self.plugin.function, "takes_microphones", False))
+        self.takes_microphones = takes_microphones(self.plugin.function)
 
     def forward(self, waveform: Tensor, listener: Any) -> Tensor:
         """Call the user's function, without a gradient.

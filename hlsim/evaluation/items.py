@@ -20,6 +20,7 @@ from hlsim.data.augment import compress
 from hlsim.data.clips import Clips
 from hlsim.data.ears import MILDER, draw_thresholds
 from hlsim.data.mixing import mix
+from hlsim.data.recorded_scenes import SceneClips
 from hlsim.evaluation.study import Item
 from hlsim.progress import track
 
@@ -145,6 +146,51 @@ def draw_aid_items(
         facts = {"ear": ear_name, **_facts(ear, level, "snr", snr)}
         item_seed = (seed + number) % 2**32
         drawn.append(Item(f"item {number}", clean, signal, ear, seed=item_seed, facts=facts))
+    return drawn
+
+
+def draw_scene_items(
+    scenes: SceneClips,
+    ears: Sequence[tuple[str, Audiogram]],
+    *,
+    items: int,
+    seconds: float,
+    seed: int,
+    levels: Sequence[float] = INPUT_LEVELS,
+) -> list[Item]:
+    """Draw items out of recorded scenes with several microphones, each for one of the ears.
+
+    The items cycle through the ears, and the clean speech at the item's ear through the levels. Of
+    scenes for two ears, every second item of an ear is mirrored, so that its ear, the first one, is
+    the right ear of the scene.
+
+    Args:
+        scenes: Clips of the scenes at 16 kHz.
+        ears, items, seconds, seed, levels: See ``draw_aid_items``; ``seconds`` is the length of the
+            clips.
+
+    Returns: Items, see ``Item`` for the shape of their signals. Their facts are those of
+        ``draw_aid_items``, with an unknown SNR (NaN).
+
+    Raises:
+        ValueError: A number is out of range, or a file cannot be used.
+    """
+    check_number("items", items, 1)
+    check_number("seconds", seconds, 0.02)
+    generator = torch.Generator().manual_seed(seed)
+    drawn = []
+    for number in track(range(items), "items", items):
+        turn, place = divmod(number, len(ears))
+        ear_name, ear = ears[place]
+        level, _, shift = _level_and_snr(place, turn, levels)
+        clean, signal = (signals[0] for signals in scenes.draw_scenes(1, generator))
+        if scenes.ears == 2 and (place + turn + shift) % 2 == 1:
+            clean, signal = clean.flip(0), signal.flip(1)
+        gain = 10.0 ** ((level - float(level_spl(clean[0]))) / 20.0)
+        facts = {"ear": ear_name, **_facts(ear, level, "snr", math.nan), "speech": "noisy"}
+        item_seed = (seed + number) % 2**32
+        signals = gain * clean[0], gain * signal
+        drawn.append(Item(f"item {number}", *signals, ear, seed=item_seed, facts=facts))
     return drawn
 
 

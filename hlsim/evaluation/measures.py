@@ -315,7 +315,7 @@ def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
 def _measure_perception(item: Item, output: Tensor) -> Values:
     rate = item.sample_rate
     reference = item.once("normal clean", lambda: perceive(item.clean, NORMAL, rate))
-    normal_input = item.once("normal input", lambda: perceive(item.signal, NORMAL, rate))
+    normal_input = item.once("normal input", lambda: perceive(item.reference_signal, NORMAL, rate))
     perceived = perceive(output, item.ear, rate)
     peak = 20.0 * output.abs().max().clamp_min(1e-10).log10()
     return {

@@ -87,7 +87,8 @@ class Item:
     Args:
         name: Name in tables.
         clean: Clean speech, with which measures compare an output. Shape: (time,).
-        signal: Input of the conditions, such as noisy speech. Shape: (time,).
+        signal: Input of the conditions, such as noisy speech. Shape: (time,), or (microphones,
+            ears, time), with the reference microphone and the ear of the item first.
         ear: Audiogram of the ear.
         sample_rate: Sample rate of both signals in Hz.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
@@ -111,6 +112,11 @@ class Item:
     facts: Mapping[str, Any] = field(default_factory=dict)
     recorded: Callable[[str], Tensor] | None = None
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def reference_signal(self) -> Tensor:
+        """The input at the reference microphone, (time,)."""
+        return self.signal.reshape(-1, self.signal.shape[-1])[0]
 
     @property
     def clean_name(self) -> str:
@@ -148,10 +154,11 @@ class Condition:
 
     Args:
         name: Name in tables.
-        process: Function ``(signal, ear) -> output``, for a signal with shape (time,) and an
-            ``Audiogram``; None if the outputs were recorded. A module is set to evaluation mode.
-            If it has the attribute ``may_crash = True``, its compiled code may end the process, so
-            even a study of one item runs in another process, unless ``jobs`` is 1.
+        process: Function ``(signal, ear) -> output``, for the signal of an item and an
+            ``Audiogram``, with an output of shape (time,); None if the outputs were recorded. A
+            module is set to evaluation mode. If it has the attribute ``may_crash = True``, its
+            compiled code may end the process, so even a study of one item runs in another process,
+            unless ``jobs`` is 1.
         kind: Role in the study, such as ``"unaided"``, ``"prescription"``, ``"aid"`` or
             ``"equaliser"``.
         of: Name of the condition to which this one belongs, such as the aid whose level it has;
@@ -492,7 +499,7 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     output = cut_output(condition.output(item), item.clean, item.sample_rate)
     samples = output.shape[-1]
     if samples < item.clean.shape[-1]:
-        item = replace(item, clean=item.clean[:samples], signal=item.signal[:samples])
+        item = replace(item, clean=item.clean[:samples], signal=item.signal[..., :samples])
     return item, output
 
 

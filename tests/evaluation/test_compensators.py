@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -10,9 +11,11 @@ from torch import Tensor, nn
 from compensators import NALR, NALRP, MappingCompensator
 from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
+from hlsim.audio import write_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.main import main
+from hlsim.data.manifest import Utterance, write_manifest
 from hlsim.evaluation import Item
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.conditions import Unaided, load_enhancers, load_rival
@@ -267,3 +270,64 @@ def test_command(
     warning = "mine was trained for one ear, 55, 55, 55"
     assert f"hlsim: warning: {warning}" in printed.err and "60 of 60 scores" in printed.err
     assert warning in (tmp_path / "out" / "report.md").read_text()
+
+
+class Sum(nn.Module):
+    """Aid that adds the signals of two microphones of each ear."""
+
+    takes_microphones = True
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        if waveform.shape[:-1] != (2, 2):
+            raise ValueError("expected 2 microphones at 2 ears")
+        return waveform.sum(0)
+
+
+@pytest.fixture
+def manifest(tmp_path: Path) -> Path:
+    """Manifest of a scene whose rear microphones have the noise with the opposite sign."""
+    generator = np.random.default_rng(0)
+    clean, noise = (0.05 * torch.from_numpy(generator.normal(size=(2, 2, 16000)))).float()
+    write_audio(tmp_path / "clean.wav", clean, 16000)
+    write_audio(tmp_path / "mixture.wav", torch.cat((clean + noise, clean - noise)), 16000)
+    row = Utterance("clean.wav", "mixture.wav", split="test", reference="1 2")
+    write_manifest(tmp_path / "manifest.csv", [row])
+    return tmp_path / "manifest.csv"
+
+
+@pytest.mark.slow
+def test_aids_with_several_microphones_are_compared_in_recorded_scenes(
+    manifest: Path, options: dict[str, Any]
+) -> None:
+    options |= {"speech": None, "noise": None, "manifest": manifest}
+    study = evaluate_compensators({"mine": Sum()}, **options, audiogram=N3, items=2)
+    conditions = {condition.name: condition for condition in study.conditions}
+    items: Any = study.items
+    for item in items:
+        assert item.signal.shape == (2, 2, 6400)
+        output = conditions["mine"].output(item)  # the sum, in which there is no noise
+        torch.testing.assert_close(output, 2.0 * item.clean, atol=1e-4, rtol=1e-3)
+        assert torch.equal(conditions["unaided"].output(item), item.reference_signal)
+        rival = conditions["NAL-R at mine's level"].output(item)
+        torch.testing.assert_close(level_spl(rival), level_spl(output))
+        prescribed = NALR(N3)(item.reference_signal)
+        assert float(torch.cosine_similarity(rival, prescribed, -1)) > 0.999
+    assert "mine has several microphones" in compensators_page(study).markdown()
+
+
+def test_aids_with_several_microphones_need_their_recordings(
+    manifest: Path, options: dict[str, Any]
+) -> None:
+    with pytest.raises(ValueError, match="mine has several microphones; expected a manifest"):
+        evaluate_compensators({"mine": Sum()}, **options, audiogram=N3)
+    options |= {"manifest": manifest}
+    with pytest.raises(ValueError, match=r"either speech, .* or a manifest"):
+        evaluate_compensators({"mine": Sum()}, **options, audiogram=N3)
+    options |= {"speech": None, "noise": None}
+    manifest.write_text(manifest.read_text().replace("1 2", "1"))
+    write_audio(manifest.parent / "clean.wav", torch.ones(16000), 16000)
+    with pytest.raises(ValueError, match="expected 2 microphones at 2 ears"):
+        evaluate_compensators({"mine": Sum()}, **options, audiogram=N3, items=1)
+    manifest.write_text(manifest.read_text().replace("test", "train"))
+    with pytest.raises(ValueError, match="the split test or valid"):
+        evaluate_compensators({"mine": Sum()}, **options, audiogram=N3, items=1)

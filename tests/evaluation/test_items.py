@@ -9,11 +9,14 @@ import torch
 
 from compensators import NALR
 from hlsim import Audiogram
+from hlsim.audio import write_audio
 from hlsim.calibration import level_spl
+from hlsim.data.recorded_scenes import SceneClips, SceneFiles
 from hlsim.evaluation.items import (
     SIMULATOR_LEVELS,
     apply_treatments,
     draw_aid_items,
+    draw_scene_items,
     draw_simulator_items,
     read_ears,
 )
@@ -46,6 +49,32 @@ def test_every_ear_has_every_level_and_ratio(
     noisy = [item.facts for item in drawn if item.facts["speech"] == "noisy"]
     combinations = {(facts["ear"], facts["input_level"], facts["snr"]) for facts in noisy}
     assert len(noisy) == len(combinations) == expected
+
+
+@pytest.mark.parametrize(("count", "levels"), [(3, (50.0, 65.0, 80.0)), (1, (50.0, 60.0))])
+def test_items_of_scenes_are_for_both_sides_at_every_level(
+    tmp_path: Path, count: int, levels: tuple[float, ...]
+) -> None:
+    """The channels of a scene have different powers, by which they are known."""
+    wave = 0.1 * torch.sin(0.5 * torch.arange(1600))
+    write_audio(tmp_path / "clean.wav", torch.stack((wave, 0.5 * wave)), 16000)
+    gains = torch.tensor([[1.0], [0.8], [0.6], [0.4]])
+    write_audio(tmp_path / "mixture.wav", gains * wave, 16000)
+    files = SceneFiles(tmp_path / "clean.wav", (tmp_path / "mixture.wav",), (1, 2))
+    scenes = SceneClips([files], sample_rate=16000, seconds=0.1)
+    ears = [(f"{i}", Audiogram((float(i),) * 8)) for i in range(count)]
+    number = 2 * len(levels) * count
+    drawn = draw_scene_items(scenes, ears, items=number, seconds=0.1, seed=0, levels=levels)
+    combinations = set()
+    for item in drawn:
+        assert float(level_spl(item.clean)) == pytest.approx(item.facts["input_level"], abs=1e-3)
+        ratios = level_spl(item.signal) - level_spl(item.clean)
+        is_right = bool(ratios[0, 0] > 0.1)  # whose clean speech is softer by 6 dB
+        expected = torch.tensor([[1.6, 2.0], [0.8, 1.2]] if is_right else [[1.0, 0.8], [0.6, 0.4]])
+        torch.testing.assert_close(10.0 ** (ratios / 20.0), expected, atol=1e-3, rtol=0.0)
+        assert torch.equal(item.reference_signal, item.signal[0, 0])
+        combinations.add((item.facts["ear"], item.facts["input_level"], is_right))
+    assert len(combinations) == number
 
 
 @pytest.mark.parametrize("count", [4, 5])
