@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hlsim.cli.options import Parser, input_path, share
+from hlsim.cli.options import Parser, count, input_path, share
 from hlsim.progress import ProgressLine
 
 
@@ -20,15 +20,22 @@ def prepare(parser: Parser) -> None:
     option(
         "corpus",
         input_path,
-        "folder of VoiceBank-DEMAND, LibriSpeech or LibriTTS, or another folder with the folders "
-        "train, valid and test; or a CSV file with the column path, and optionally noisy, speaker "
-        "and split",
+        "folder of VoiceBank-DEMAND, LibriSpeech, LibriTTS or Clarity's scenes, or another folder "
+        "with the folders train, valid and test; or a CSV file with the column path, and "
+        "optionally noisy, speaker, split and reference",
     )
     option(
         "--folders",
         str,
         "levels of folders in any other corpus, each split, speaker, condition (clean or noisy) "
         "or other; for example speaker, or split/speaker",
+    )
+    option(
+        "--microphones",
+        count,
+        "numbers of the microphones of Clarity's scenes, the reference first; by default all",
+        [],
+        nargs="+",
     )
     option(
         "--valid-share",
@@ -46,7 +53,11 @@ def _prepare(options: argparse.Namespace) -> None:
     folders = options.folders.split("/") if options.folders else None
     with ProgressLine("files", "reading the corpus"):
         text = prepare(
-            options.corpus, options.out, folders=folders, valid_share=options.valid_share
+            options.corpus,
+            options.out,
+            folders=folders,
+            valid_share=options.valid_share,
+            microphones=options.microphones,
         )
     print(text)
     root = options.corpus if options.corpus.is_dir() else options.corpus.parent

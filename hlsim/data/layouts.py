@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from random import Random
 
 from hlsim.audio import find_audio
 from hlsim.data.manifest import (
+    FILE_SEPARATOR,
     SPLITS,
     Utterance,
     check_utterances,
@@ -56,6 +58,21 @@ _LAYOUTS = {
 The two files of a pair differ in the group ``condition``.
 """
 
+CLARITY_REFERENCES = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
+"""Ends of the names of the clean speech in Clarity's scenes.
+
+The first two have the target without its room, and its level in the room is that of another file.
+"""
+
+_CLARITY = "scenes of the Clarity challenges"
+"""Name of the layout of ``_read_scenes``."""
+
+_CLARITY_MIXTURE = re.compile(r"(?P<scene>.+)_(mix|mixed)_CH(?P<microphone>[1-9])\.wav")
+"""Pattern of the path of a file with the signals of a microphone at both ears."""
+
+_CLARITY_SPLITS = {"train": "train", "dev": "valid", "eval": "test"}
+"""Splits of Clarity's scenes by the names of folders."""
+
 _ADVICE = (
     "correct the corpus, or use a CSV file with the columns path, noisy, speaker and split "
     "instead, or name the levels of folders, such as --folders split/speaker, or --folders split "
@@ -70,6 +87,7 @@ def prepare(
     *,
     folders: Sequence[str] | None = None,
     valid_share: float = 0.0,
+    microphones: Sequence[int] = (),
 ) -> str:
     """Recognise a corpus and write its manifest, the CSV file that training runs read.
 
@@ -80,6 +98,8 @@ def prepare(
         folders: Meaning of each level of folders, see ``recognise``.
         valid_share: Share of the training speakers that are moved to the validation split, if the
             corpus has none.
+        microphones: Numbers of the microphones that are used of Clarity's scenes, the reference
+            first; by default all.
 
     Returns:
         Text to print: the name of the layout, a table of the splits and, if files of noise were
@@ -87,7 +107,8 @@ def prepare(
 
     Raises:
         ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
-            file, the share is not from 0 to below 1, or the manifest cannot be written.
+            file, a scene lacks one of the microphones, the share is not from 0 to below 1, or the
+            manifest cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -104,7 +125,8 @@ def prepare(
     if Path(source).is_dir():
         layout, utterances = find_corpus(source, folders)
         listed_files = {file for row in utterances for file in (row.path, row.noisy)}
-        noise_files = [file for file in _relative_files(source) if file not in listed_files]
+        if layout != _CLARITY:
+            noise_files = [file for file in _relative_files(source) if file not in listed_files]
     elif folders is None:
         layout, utterances = "CSV file", read_manifest(source)
     else:
@@ -112,6 +134,8 @@ def prepare(
             f"{source}: expected a folder, because levels of folders are named; leave them out "
             "(--folders), or pass the folder"
         )
+    if microphones:
+        utterances = [_choose_microphones(row, microphones) for row in utterances]
     if valid_share:
         utterances = hold_out_speakers(utterances, valid_share)
     write_manifest(out, utterances)
@@ -192,13 +216,15 @@ def recognise(
             )
         pattern = "/".join(_LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
         return layout, _read_utterances(files, pattern, layout)
+    if any(map(_CLARITY_MIXTURE.fullmatch, files)):
+        return _CLARITY, _read_scenes(files)
     top = {file.split("/")[0] for file in files}
     only_folder = f"({re.escape(top.pop())}/)?" if len(top) == 1 else ""
     for layout, pattern in _LAYOUTS.items():
         pattern = only_folder + pattern
         if any(re.fullmatch(pattern, file, re.IGNORECASE) for file in files):
             return layout, _read_utterances(files, pattern, layout)
-    raise ValueError(f"unknown layout, expected one of {', '.join(_LAYOUTS)}")
+    raise ValueError(f"unknown layout, expected one of {', '.join((*_LAYOUTS, _CLARITY))}")
 
 
 def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utterance]:
@@ -239,6 +265,52 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
         is_moved = row.split == "train" and row.speaker in valid_speakers
         rows.append(replace(row, split="valid") if is_moved else row)
     return rows
+
+
+def _read_scenes(files: Sequence[str]) -> list[Utterance]:
+    """Convert the paths of Clarity's scenes to utterances, whose reference is microphone 1.
+
+    The interferers and other files are not used.
+
+    Raises:
+        ValueError: A scene lacks its clean speech, or its first microphone.
+    """
+    known_files = set(files)
+    mixtures: dict[str, list[str]] = defaultdict(list)
+    for file in sorted(files):
+        match = _CLARITY_MIXTURE.fullmatch(file)
+        if match:
+            mixtures[match["scene"]].append(file)
+    utterances = []
+    for scene, microphones in mixtures.items():
+        candidates = [scene + ending for ending in CLARITY_REFERENCES]
+        clean = next((path for path in candidates if path in known_files), None)
+        if clean is None or not microphones[0].endswith("_CH1.wav"):
+            raise ValueError(
+                f"{microphones[0]}: expected a file of microphone 1 (_CH1.wav) and clean speech, "
+                f"such as {candidates[0]}"
+            )
+        splits = [_CLARITY_SPLITS.get(folder.lower()) for folder in scene.split("/")[:-1]]
+        split = next(filter(None, splits), "train")
+        noisy = FILE_SEPARATOR.join(microphones)
+        utterances.append(Utterance(clean, noisy, split=split, reference="1 2"))
+    return utterances
+
+
+def _choose_microphones(row: Utterance, numbers: Sequence[int]) -> Utterance:
+    """Return a row with some microphones of a scene of Clarity, the first one as the reference.
+
+    Raises:
+        ValueError: The row is no such scene, or lacks a microphone.
+    """
+    matches = [_CLARITY_MIXTURE.fullmatch(file) for file in row.noisy_files]
+    files = {int(match["microphone"]): match[0] for match in matches if match}
+    if not files.keys() >= set(numbers):
+        raise ValueError(
+            f"{row.path}: expected microphones {numbers} of a scene of the Clarity challenges, got "
+            f"{sorted(files) or 'no such scene'}; correct the numbers, or leave --microphones out"
+        )
+    return replace(row, noisy=FILE_SEPARATOR.join(files[number] for number in numbers))
 
 
 def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import read_audio
+from hlsim.calibration import level_spl, set_level
 from hlsim.data.clips import Clips
+from hlsim.data.layouts import CLARITY_REFERENCES
 from hlsim.data.manifest import Utterance
 from hlsim.dsp.resample import resample
 
@@ -53,6 +55,9 @@ class SceneFiles(NamedTuple):
     def read(self) -> tuple[Tensor, Tensor, int]:
         """Read the signals, with the reference microphone first.
 
+        Clean speech of Clarity's scenes gets the level of the target in the room, see
+        ``file_with_room``.
+
         Returns:
             The clean speech, (ears, time), the signals of the microphones, (microphones, ears,
             time), and the sample rate in Hz.
@@ -86,7 +91,27 @@ class SceneFiles(NamedTuple):
         first = (self.references[0] - 1) // ears
         microphones = channels.unflatten(0, (-1, ears))
         later = [number for number in range(len(microphones)) if number != first]
-        return clean.expand(ears, -1), microphones[[first, *later]], rates[0]
+        clean = clean.expand(ears, -1)
+        in_room = file_with_room(self.clean)
+        if in_room is not None:
+            clean = set_level(clean, level_spl(read_audio(in_room)[0][:, :time]))
+        return clean, microphones[[first, *later]], rates[0]
+
+
+def file_with_room(clean: Path) -> Path | None:
+    """Return the file of the target in its room that belongs to clean speech of Clarity's scenes.
+
+    It is beside the clean speech, whose level is not that in the room. None if there is no such
+    file, or if the clean speech has the right level.
+
+    >>> file_with_room(Path("S00001_reference.wav")) is None
+    True
+    """
+    for ending in CLARITY_REFERENCES[:-1]:
+        file = clean.with_name(f"{clean.name.removesuffix(ending)}_target_CH1.wav")
+        if clean.name.endswith(ending) and file.is_file():
+            return file
+    return None
 
 
 class SceneClips(Clips):

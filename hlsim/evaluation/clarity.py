@@ -23,6 +23,8 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.layouts import CLARITY_REFERENCES
+from hlsim.data.recorded_scenes import file_with_room
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.conditions import (
     NAL_R,
@@ -60,9 +62,6 @@ _MIX_ENDINGS = ("_mix_CH1.wav", "_mixed_CH1.wav")
 
 _MICROPHONES = (1, 2, 3)
 """Numbers of the front, middle and rear microphone in the names of files, after ``CH``."""
-
-_REFERENCE_ENDINGS = ("_target_anechoic_CH1.wav", "_target_anechoic.wav", "_reference.wav")
-"""Ends of the names of references. The last one already has the target's level in the room."""
 
 _CHANGES = 8
 """Number of positions at which the scene changes to noise, to measure the look-ahead."""
@@ -256,7 +255,7 @@ def _read_pairs(
             raise ValueError(f"{listeners}: listener {name!r} lacks an ear; add its audiogram")
         if Path(name).name != name:
             raise ValueError(f"{listeners}: listener {name!r} cannot name a file; rename it")
-        candidates = [folder / f"{scene}{ending}" for ending in _REFERENCE_ENDINGS]
+        candidates = [folder / f"{scene}{ending}" for ending in CLARITY_REFERENCES]
         reference = next(filter(Path.is_file, candidates), None)
         if reference is None:
             expected = " or ".join(path.name for path in candidates)
@@ -510,8 +509,8 @@ def _read_scene(pair: _Pair, rate: int, microphones: Sequence[int]) -> tuple[Ten
     """
     signals = _read_microphones(pair, rate, microphones)
     reference = _read_channels(pair.reference, rate)
-    in_room_file = pair.mix.with_name(f"{pair.scene}_target_CH1.wav")
-    if pair.reference.name.endswith(_REFERENCE_ENDINGS[-1]) or not in_room_file.is_file():
+    in_room_file = file_with_room(pair.reference)
+    if in_room_file is None:
         return signals, reference
     in_room = _read_channels(in_room_file, rate)
     names = str(pair.reference), str(in_room_file)

@@ -83,6 +83,30 @@ def test_clean_and_noisy_folders_in_splits_are_pairs(tmp_path: Path) -> None:
     ]
 
 
+def test_scenes_of_the_clarity_challenges_are_recognised(tmp_path: Path) -> None:
+    kinds = "mix_CH0 mix_CH1 mix_CH2 mix_CH3 target_CH1 target_anechoic_CH1 interferer_CH1"
+    scenes = "train/scenes/S00001", "dev/scenes/S06001"
+    files = [f"{scene}_{kind}.wav" for scene in scenes for kind in kinds.split()]
+    touch_files(tmp_path, [*files, "train/targets/T010.wav"])
+    touch_files(tmp_path, [f"eval/scenes/S1_{end}.wav" for end in ("mixed_CH1", "target_anechoic")])
+    text = prepare(tmp_path, tmp_path / "m.csv")
+    assert "layout: scenes of the Clarity challenges" in text and "left out" not in text
+    microphones = [f"train/scenes/S00001_mix_CH{number}.wav" for number in (1, 2, 3)]
+    clean = "train/scenes/S00001_target_anechoic_CH1.wav"
+    rows = {row.split: row for row in read_manifest(tmp_path / "m.csv")}
+    assert rows["train"] == Utterance(clean, "|".join(microphones), reference="1 2")
+    assert rows["valid"].path == "dev/scenes/S06001_target_anechoic_CH1.wav"
+    assert rows["test"].noisy == "eval/scenes/S1_mixed_CH1.wav"
+    (tmp_path / rows["test"].noisy).unlink()
+    prepare(tmp_path, tmp_path / "m.csv", microphones=[3, 1])
+    assert read_manifest(tmp_path / "m.csv")[-1].noisy_files == microphones[::-2]
+    with pytest.raises(ValueError, match=r"expected microphones \[4\] .*, got \[1, 2, 3\]"):
+        prepare(tmp_path, tmp_path / "m.csv", microphones=[4])
+    (tmp_path / clean).unlink()
+    with pytest.raises(ValueError, match=r"of microphone 1 .* and clean speech"):
+        prepare(tmp_path, tmp_path / "m.csv")
+
+
 REJECTED = {
     "no noisy folder": [name for name in voicebank("_16k") if "noisy_test" not in name],
     "a missing file": [name for name in voicebank() if name != "noisy_testset_wav/p232_001.wav"],

@@ -61,6 +61,15 @@ def test_the_reference_is_the_first_microphone(
     assert levels(microphones) == expected
 
 
+def test_clean_speech_of_clarity_has_its_level_in_the_room(tmp_path: Path) -> None:
+    channels = 0.1 * torch.ones(2, RATE)
+    for kind, gain in (("mix_CH1", 1.0), ("target_anechoic_CH1", 0.1), ("target_CH1", 0.5)):
+        write_audio(tmp_path / f"S1_{kind}.wav", gain * channels, RATE)
+    microphones = (tmp_path / "S1_mix_CH1.wav",)
+    clean, _, _ = SceneFiles(tmp_path / "S1_target_anechoic_CH1.wav", microphones, (1, 2)).read()
+    torch.testing.assert_close(clean, 0.5 * channels, atol=1e-4, rtol=0.0)
+
+
 def test_clips_of_scenes_have_clean_speech(tmp_path: Path, row: Utterance) -> None:
     scenes = SceneClips([SceneFiles.from_utterance(row, tmp_path)], sample_rate=RATE, seconds=0.1)
     clean, signals = scenes.draw_scenes(20, torch.Generator().manual_seed(0))
