@@ -22,7 +22,7 @@ from compensators.smoothing import exponential_average
 from compensators.wearable import State, Stream
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE
-from hlsim.checks import check_attributes, check_number, check_rate, check_waveform
+from hlsim.checks import check_attributes, check_finite, check_number, check_rate, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
 from hlsim.torchtools import Audio, as_samples, as_type_of, compute_once
@@ -195,11 +195,12 @@ class MicrophoneStream:
         """Return the next output. Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The chunk has another number of microphones or ears, or other leading
-                dimensions than the first one.
+            ValueError: The chunk has another number of microphones or ears, other leading
+                dimensions than the first one, or a sample that is NaN or infinite.
         """
         signals = as_samples(chunk)
         self._front_end.check_microphones(signals)
+        check_finite(signals, "the chunk")  # It would stay in the averages of powers.
         shape: torch.Size = self._zero.shape[:-1]
         if self._state is None:
             self._state = self._front_end.initial_state(signals)

@@ -14,7 +14,7 @@ from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record
-from hlsim.checks import check_flag, check_number
+from hlsim.checks import check_flag, check_number, check_rate
 
 Trained = MappingCompensator | HearingAid | BeamformingAid
 
@@ -87,6 +87,7 @@ def load_compensator(
     >>> aid = load_compensator("hearing-aid")
     >>> output = aid(hlsim.example_speech(), "N3")
     """
+    check_rate(sample_rate)
     check_flag("linked", linked)
     check_flag("limit_to_ear", limit_to_ear)
     check_number("loudness", loudness, *LOUDNESS_RANGE)

@@ -184,6 +184,12 @@ def test_other_models_are_rejected(folder: Path, changes: dict[str, Any], messag
         load_pretrained(folder)
 
 
+@pytest.mark.parametrize("load", [load_pretrained, load_compensator])
+def test_a_rate_out_of_range_is_no_fault_of_the_checkpoint(load: Any) -> None:
+    with pytest.raises(ValueError, match=r"^expected a sample rate"):
+        load("hearing-aid", sample_rate=8000)
+
+
 @pytest.mark.parametrize("text", ["[" * 200_000, "7", "\xff", "{"])
 def test_records_that_cannot_be_read_are_rejected(folder: Path, text: str) -> None:
     (folder / "config.json").write_text(text, encoding="latin-1")

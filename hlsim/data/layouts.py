@@ -142,7 +142,7 @@ def prepare(
     lines = [f"layout: {layout}", "split  speakers  utterances  pairs"]
     for split in SPLITS:
         rows = [row for row in utterances if row.split == split]
-        speakers = {row.speaker for row in rows}
+        speakers = {row.speaker.casefold() for row in rows}
         speaker_count = "unknown" if "" in speakers else len(speakers)
         pairs = sum(bool(row.noisy) for row in rows)
         if rows:
@@ -251,7 +251,7 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
         raise ValueError(f"expected a share between 0 and 1 (--valid-share), got {share}")
     if any(row.split == "valid" for row in utterances):
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
-    speakers = sorted({row.speaker for row in utterances if row.split == "train"})
+    speakers = sorted({row.speaker.casefold() for row in utterances if row.split == "train"})
     count = max(1, round(share * len(speakers)))
     if "" in speakers or count >= len(speakers):
         raise ValueError(
@@ -262,7 +262,7 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
     valid_speakers = set(Random(0).sample(speakers, count))
     rows = []
     for row in utterances:
-        is_moved = row.split == "train" and row.speaker in valid_speakers
+        is_moved = row.split == "train" and row.speaker.casefold() in valid_speakers
         rows.append(replace(row, split="valid") if is_moved else row)
     return rows
 

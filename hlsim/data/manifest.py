@@ -197,7 +197,7 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
                 raise ValueError(
                     f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
                 )
-        for kind, name in (("file", utterance.path), ("speaker", utterance.speaker)):
+        for kind, name in (("file", utterance.path), ("speaker", utterance.speaker.casefold())):
             split = splits.setdefault((kind, name), utterance.split)
             if name and split != utterance.split:
                 raise ValueError(f"{kind} {name} is in the splits {split} and {utterance.split}")

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import SIMULATOR, HubModel, read_checkpoint
+from hlsim.checks import check_rate
 from hlsim.dsp.fft import power
 from hlsim.dsp.interpolation import interpolate
 from hlsim.msbg.recruitment import CATCH_UP_SPL
@@ -296,6 +297,7 @@ def load_pretrained(
     >>> load_pretrained("neuro-msbg")(torch.randn(2, 16000), "N3").shape
     torch.Size([2, 16000])
     """
+    check_rate(sample_rate)
     build = partial(
         NeuroMSBG, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
     )

@@ -172,7 +172,8 @@ def initial_network(
     if not is_kind or (recipe.model and start.config != network.config):
         raise ValueError(
             f"the start {recipe.start!r} is not a {network.kind} with the settings 'model' of the "
-            "recipe; choose another start, or leave 'model' out"
+            "recipe; choose another start, leave 'model' out if it is a simulator or a "
+            "mapping-compensator, or copy the settings of the start into it"
         )
     return start.train().requires_grad_(True)
 

@@ -244,6 +244,9 @@ def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
     stream(torch.zeros(2, 2, 100))
     with pytest.raises(ValueError, match="as before, got"):
         stream(torch.zeros(3, 2, 2, 100))
+    with pytest.raises(ValueError, match="the chunk has samples that are NaN"):
+        stream(torch.full((2, 2, 100), torch.nan))
+    assert bool(stream(torch.zeros(2, 2, 100)).isfinite().all())
     with pytest.raises(ValueError, match="an aid with sample_rate=16000, got 44100"):
         DirectionalAid(front_end, NALR(sample_rate=44100))
     with pytest.raises(ValueError, match="load it by"):

@@ -1,6 +1,7 @@
 """Layouts of corpora are recognised, others are rejected, and manifests are checked."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -152,6 +153,12 @@ def test_held_out_speakers_validate_and_no_longer_train() -> None:
     assert rows == hold_out_speakers(utterances, 0.2)
     assert Counter(row.split for row in rows) == {"train": 16, "valid": 4}
     assert Counter(row.split for row in hold_out_speakers(utterances, 0.01))["valid"] == 2
+    capitals = [replace(row, speaker=row.speaker.upper()) for row in utterances[::2]]
+    with pytest.raises(ValueError, match="speaker s1 is in the splits"):
+        check_utterances([utterances[3], replace(capitals[1], split="valid")])
+    rows = hold_out_speakers([*utterances[1::2], *capitals], 0.2)
+    assert Counter(row.split for row in rows) == {"train": 16, "valid": 4}
+    check_utterances(rows)
     unknown_speakers = [Utterance("1.wav"), Utterance("2.wav")]
     for invalid_rows in (rows, utterances[:2], unknown_speakers):
         with pytest.raises(ValueError):
