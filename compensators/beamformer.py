@@ -16,6 +16,7 @@ from compensators.directional import (
     POWER_FLOOR,
     DirectionalAid,
     FilterAndSum,
+    MicrophoneStream,
     front_blocking_taps,
     mvdr_taps,
 )
@@ -26,7 +27,8 @@ from compensators.wearable import State
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals
 from hlsim.checkpoint import HubModel
-from hlsim.torchtools import built_in_float32, constant
+from hlsim.dsp.resample import resample
+from hlsim.torchtools import Audio, as_samples, as_type_of, built_in_float32, constant
 
 LOOK_AHEAD_SAMPLES = 8
 """Look-ahead of the fixed filters and again of the adaptive ones in samples, 0.5 ms each."""
@@ -67,7 +69,12 @@ class AdaptiveBeamformer(FilterAndSum):
 
     Args:
         config: Sizes and choices, by default ``BeamformerConfig()``.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Whole signals at other
+            rates than 16000 are resampled. Outputs contain the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: The rate is out of range.
 
     >>> AdaptiveBeamformer()(torch.zeros(2, 2, 16000)).shape
     torch.Size([2, 16000])
@@ -75,14 +82,18 @@ class AdaptiveBeamformer(FilterAndSum):
 
     @built_in_float32
     def __init__(
-        self, config: BeamformerConfig | None = None, *, full_scale_spl: float = PASCAL_SPL
+        self,
+        config: BeamformerConfig | None = None,
+        *,
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         config = config or BeamformerConfig()
         beams = mvdr_taps(config.loading, config.spacing, NEURO_RATE, LOOK_AHEAD_SAMPLES)
         blocking = front_blocking_taps(beams, config.spacing, LOOK_AHEAD_SAMPLES)
         beams = np.pad(beams, [(0, 0)] * 3 + [(0, blocking.shape[-1] - beams.shape[-1])])
         taps = np.concatenate((beams[None], blocking))
-        super().__init__(taps.reshape(-1, *taps.shape[2:]), 2 * LOOK_AHEAD_SAMPLES)
+        super().__init__(taps.reshape(-1, *taps.shape[2:]), 2 * LOOK_AHEAD_SAMPLES, sample_rate)
         self.config = config
         self.full_scale_spl = full_scale_spl
         decisions = nn.Linear(config.hidden, 2 * EARS * config.bands)
@@ -95,6 +106,21 @@ class AdaptiveBeamformer(FilterAndSum):
         )
         nn.init.zeros_(decisions.weight)
         nn.init.zeros_(decisions.bias)
+
+    def forward(self, waveform: Audio, audiogram: AudiogramLike | None = None) -> Audio:
+        signals = as_samples(waveform)
+        self.check_microphones(signals)
+        output = super().forward(resample(signals, self.sample_rate, NEURO_RATE))
+        output = resample(output, NEURO_RATE, self.sample_rate)
+        return as_type_of(waveform, output[..., : signals.shape[-1]])
+
+    def stream(self, audiogram: AudiogramLike | None = None) -> MicrophoneStream:
+        if self.sample_rate != NEURO_RATE:
+            raise ValueError(
+                f"expected a sample rate of {NEURO_RATE} Hz for a stream, got {self.sample_rate}; "
+                "resample the signals, and build the beamformer for this rate"
+            )
+        return super().stream()
 
     def initial_state(self, waveform: Tensor) -> State:
         batch, bands = waveform.shape[:-3], self.config.bands
@@ -171,16 +197,20 @@ class BeamformingAid(DirectionalAid, HubModel):
     Args:
         audiogram: Ears of the listener, which are used by all calls that pass none.
         config: Sizes and choices of both, by default ``BeamformerConfig()``.
-        sample_rate: Sample rate of inputs and outputs in Hz, only 16000.
+        sample_rate: Sample rate of inputs and outputs in Hz, see ``AdaptiveBeamformer``.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
+    Attributes:
+        highest_frequency: Highest frequency of outputs in Hz.
+
     Raises:
-        ValueError: The rate is not 16000, or the level is out of range.
+        ValueError: The rate or the level is out of range.
 
     >>> BeamformingAid()(torch.zeros(2, 2, 16000), ["N2", "N4"]).shape
     torch.Size([2, 16000])
     """
 
+    highest_frequency = NEURO_RATE / 2.0
     kind = "beamforming-aid"
     config_class = BeamformerConfig
 
@@ -196,7 +226,7 @@ class BeamformingAid(DirectionalAid, HubModel):
         aid_config = HearingAidConfig.from_dict(config.aid)
         levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
         super().__init__(
-            AdaptiveBeamformer(config, full_scale_spl=full_scale_spl),
+            AdaptiveBeamformer(config, **levels),
             HearingAid(audiogram, aid_config, **levels),
         )
         self.config = replace(config, aid=aid_config.to_dict())

@@ -163,6 +163,9 @@ class FilterAndSum(nn.Module):
 
         Args:
             audiogram: Ignored, as in ``forward``.
+
+        Raises:
+            ValueError: The front end is a beamformer for another rate than 16000 Hz.
         """
         return MicrophoneStream(self)
 
@@ -420,9 +423,12 @@ class DirectionalAid(nn.Module):
             sliders: Values of the aid's sliders, see the ``stream`` of the aid.
 
         Raises:
-            ValueError: The aid has no streams, or rejects an ear or a slider.
+            ValueError: The aid or the front end has no streams, or the aid rejects an ear or a
+                slider.
         """
-        return MicrophoneStream(self.front_end, self.aid.stream(audiogram, **sliders))
+        stream = self.front_end.stream()
+        stream.aid = self.aid.stream(audiogram, **sliders)
+        return stream
 
 
 def look_ahead_samples(sample_rate: int) -> int:

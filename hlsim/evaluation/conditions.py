@@ -324,6 +324,7 @@ class Enhanced(nn.Module):
 
     Attributes:
         may_crash: True, because compiled code of the enhancer may end the process.
+        takes_microphones: Whether the aid takes the signals of several microphones.
 
     >>> enhancer = WaveformPlugin("torch:mul", "enhancer")  # waveform * sample_rate
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
@@ -342,6 +343,7 @@ class Enhanced(nn.Module):
         super().__init__()
         self.enhancer, self.aid, self.sample_rate = enhancer, aid, sample_rate
         self.gain = gain_to_pascals(full_scale_spl)
+        self.takes_microphones = takes_microphones(aid)
 
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
         """Enhance the waveform, and return the aid's output for the enhanced signal.

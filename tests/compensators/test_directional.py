@@ -21,6 +21,7 @@ from compensators.directional import (
     FilterAndSum,
 )
 from hlsim.data.scenes import make_scene
+from hlsim.dsp.resample import resample
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
 
 HERTZ = np.array([500.0, 1000.0, 2000.0, 4000.0])
@@ -216,8 +217,13 @@ def test_beamforming_aid_is_a_checkpoint_of_both_parts(tmp_path: Path, speech: T
     array = AdaptiveBeamformer(config)(signals.numpy())  # its network requires a gradient
     assert isinstance(array, np.ndarray)
     torch.testing.assert_close(loaded(0.1 * signals, ears), 0.1 * aid(signals, ears))
-    with pytest.raises(ValueError, match="an aid with sample_rate=16000, got 44100"):
-        load_compensator(tmp_path / "mine", sample_rate=44100)
+    fast = load_compensator(tmp_path / "mine", sample_rate=32000)
+    expected = aid.front_end(signals).detach()
+    error = resample(fast.front_end(resample(signals, 16000, 32000)), 32000, 16000) - expected
+    assert float(error[..., 1000:-1000].norm() / expected.norm()) < 0.02
+    assert fast(torch.zeros(2, 2, 4410), ears).shape == (2, 4410)
+    with pytest.raises(ValueError, match="expected a sample rate of 16000 Hz for a stream"):
+        fast.stream(ears)
 
 
 def test_filters_can_be_trained_through_the_loss(speech: Tensor, noise: Tensor) -> None:

@@ -15,6 +15,7 @@ import soundfile
 import torch
 from torch import Tensor
 
+from compensators import MappingCompensator, MappingConfig, save_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
@@ -320,7 +321,9 @@ def test_three_microphones_are_averaged_or_handed_to_an_aid(clarity: Path, tmp_p
     target, _ = soundfile.read(scenes / "S06001_target_CH1.wav")
     (note,) = evaluate_scenes({}, **settings).notes
     assert note.startswith("2 of 2 scenes have signals of other microphones than 1,")
-    aids = {"pair": f"{__name__}:Beamformer"}
+    network = MappingCompensator(config=MappingConfig(channels=4, blocks=1, microphones=3, ears=2))
+    save_compensator(network, tmp_path / "trained")
+    aids = {"pair": f"{__name__}:Beamformer", "trained": str(tmp_path / "trained")}
     study = evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
     (note,) = study.notes  # The aid returns noise alone.
     assert "outputs are not similar to their clean speech" in note and " under pair." in note
@@ -328,6 +331,8 @@ def test_three_microphones_are_averaged_or_handed_to_an_aid(clarity: Path, tmp_p
     for name, expected in (("unaided", (mix + 2 * target) / 3), ("pair", mix - target)):
         written, _ = soundfile.read(tmp_path / "signals" / name / "S06001_L0001_HA-output.wav")
         assert np.allclose(written, expected, atol=1e-6), name
+    written, _ = soundfile.read(tmp_path / "signals" / "trained" / "S06001_L0001_HA-output.wav")
+    assert written.shape == mix.shape and written.any()
     (scenes / "S06002_mix_CH3.wav").unlink()
     with pytest.raises(ValueError, match=r"S06002_mix_CH3\.wav: there is no such audio file"):
         evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
