@@ -10,7 +10,9 @@ from torch import Tensor, nn
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import Listener
 from hlsim.calibration import NEURO_RATE
+from hlsim.checks import check_waveform
 from hlsim.neuro.model import NeuroMSBG
+from hlsim.torchtools import Audio, as_samples, as_type_of
 
 
 class SimulatedStream:
@@ -48,27 +50,39 @@ class SimulatedStream:
         self._audiogram = audiogram
         self.block, look_ahead = field
         self.latency = math.ceil(look_ahead / self.block) * self.block
-        self._past = torch.zeros(2 * self.latency)
+        self._past: Tensor | None = None
 
-    def __call__(self, chunk: Tensor) -> Tensor:
+    def __call__(self, chunk: Audio) -> Audio:
         """Return the next samples of the perceived signal, ``latency`` samples late.
 
         Args:
-            chunk: Next samples of the input. Shape: (time,), or (2, time) for a listener.
+            chunk: Next samples of the input, a tensor or an array. Shape: (time,), or (2, time) for
+                a listener.
 
         Returns:
             Perceived samples of the same shape.
 
         Raises:
-            ValueError: The number of samples is no multiple of ``block``.
+            ValueError: The number of samples is no multiple of ``block``, the chunk is no waveform,
+                or its shape is not that of the first chunk.
         """
-        samples = chunk.shape[-1]
+        signals = as_samples(chunk)
+        check_waveform(signals, "chunk")
+        samples = signals.shape[-1]
         if samples % self.block:
             raise ValueError(
                 f"expected a chunk of a multiple of {self.block} samples, got {samples} samples"
             )
-        window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
+        if self._past is None:
+            self._past = signals.new_zeros(*signals.shape[:-1], 2 * self.latency)
+        past: Tensor = self._past
+        if past.shape[:-1] != signals.shape[:-1]:
+            raise ValueError(
+                f"expected a chunk of shape {(*past.shape[:-1], 'time')} as before, got "
+                f"{tuple(signals.shape)}; make a new stream for another signal"
+            )
+        window = torch.cat((past, signals), -1)
         self._past = window[..., samples:]
         with torch.no_grad():
             perceived: Tensor = self._simulator(window, self._audiogram)
-        return perceived[..., self.latency : self.latency + samples]
+        return as_type_of(chunk, perceived[..., self.latency : self.latency + samples])
