@@ -54,6 +54,7 @@ from compensators.wearable import Wearable
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE, gain_to_pascals
+from hlsim.checks import check_number
 from hlsim.extras import require
 from hlsim.files import atomic_path
 from hlsim.neuro import NeuroMSBG
@@ -88,7 +89,7 @@ def export_program(
         items: Number of waveforms per call.
 
     Raises:
-        ValueError: The simulator is no Neuro-MSBG at 16 kHz.
+        ValueError: The simulator is no Neuro-MSBG at 16 kHz, or a number is out of range.
 
     >>> import hlsim
     >>> program = export_program(hlsim.load_pretrained("neuro-msbg"), seconds=0.1)
@@ -105,6 +106,8 @@ def export_program(
             f"expected a Neuro-MSBG with sample_rate {NEURO_RATE}, got {simulator.sample_rate}; "
             f"load it at {NEURO_RATE} Hz"
         )
+    check_number("seconds", seconds, 1.0 / NEURO_RATE)
+    check_number("items", items, 1, whole=True)
     weight = next(simulator.parameters())
     inputs = {
         "waveform": weight.new_zeros(items, round(seconds * NEURO_RATE)),
@@ -164,12 +167,15 @@ def first_inputs(
         Dict of the input tensors, whose names and shapes the module's docstring lists.
 
     Raises:
-        ValueError: The aid's sample rate is not 16000 Hz, or it rejects the ear.
+        ValueError: The aid is no ``WDRC`` or ``HearingAid`` at 16 kHz, it rejects the ear, or a
+            number is out of range.
 
     >>> from compensators import WDRC
     >>> print(*first_inputs(WDRC(), "N3"))
     samples fitted past gains levels
     """
+    _check_export(aid, items)
+    check_number("hops", hops, 1, whole=True)
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
     weight = next(aid.parameters(), torch.empty(0))
@@ -245,8 +251,10 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     """Write an ONNX file that computes the parameters of a wearable aid from an audiogram.
 
     The file has the input ``thresholds`` (items, 8), in dB HL at ``hlsim.audiogram.FREQUENCIES``,
-    and the output ``fitted`` (items, n), an input of the file that ``export_aid`` writes. If an
-    error is raised, no file is written.
+    and the output ``fitted`` (items, n), an input of the file that ``export_aid`` writes. The
+    limits of an aid with ``limit_to_ear`` are predicted from the thresholds; take ``fitted`` from
+    ``first_inputs`` for an ear with measured uncomfortable levels. If an error is raised, no file
+    is written.
 
     Args:
         aid: Aid at any sample rate.
@@ -261,8 +269,19 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     >>> from compensators import WDRC
     >>> export_fit(WDRC(), "fit.onnx")  # doctest: +SKIP
     """
+    _check_export(aid, items)
     inputs = {"thresholds": EAR.repeat(items, 1)}
     _write_onnx(_to_program(aid, _fit, inputs), path, inputs)
+
+
+def _check_export(aid: Any, items: int) -> None:
+    """Raise ValueError unless an aid and its number of signals per call can be exported."""
+    if not isinstance(aid, Wearable):
+        raise ValueError(
+            f"expected a WDRC, a CAMFIT or a HearingAid, got a {type(aid).__name__}; other aids "
+            "cannot be exported, because they process whole signals"
+        )
+    check_number("items", items, 1, whole=True)
 
 
 class _Call(nn.Module):

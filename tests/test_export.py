@@ -168,3 +168,17 @@ def test_torch_exports_a_network_by_itself(name: str) -> None:
     too_high[1, 3] = 130.0
     output = call(signal, too_high)
     assert bool(output[0].isfinite().all()) and bool(output[1].isnan().all())
+
+
+def test_other_aids_and_sizes_below_one_are_errors(tmp_path: Path) -> None:
+    aid: Any = load_compensator("nalr")
+    for export in (hop_program, lambda aid: export_fit(aid, tmp_path / "fit.onnx")):
+        with pytest.raises(
+            ValueError, match="expected a WDRC, a CAMFIT or a HearingAid, got a NALR"
+        ):
+            export(aid)
+    for sizes in ({"items": 0}, {"hops": 0}):
+        with pytest.raises(ValueError, match="a whole number from 1"):
+            hop_program(load_compensator("wdrc"), **sizes)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected seconds to be a number from"):
+        export_program(load_pretrained("neuro-msbg"), seconds=0.0)
