@@ -65,6 +65,7 @@ class FilterAndSum(nn.Module):
     Attributes:
         latency: Delay of streams in samples, the look-ahead.
         takes_microphones: True, as for each aid that gets the signals of all microphones.
+        ears: Number of ears with microphones, 2.
 
     >>> mean = FilterAndSum(torch.eye(2).reshape(2, 1, 2, 1).repeat(1, 2, 1, 1) / 2)
     >>> mean(torch.ones(2, 2, 100)).shape
@@ -72,6 +73,7 @@ class FilterAndSum(nn.Module):
     """
 
     takes_microphones = True
+    ears = 2
 
     taps: Tensor
 
@@ -374,6 +376,7 @@ class DirectionalAid(nn.Module):
     """
 
     takes_microphones = True
+    ears = 2
 
     front_end: FilterAndSum
     aid: Any

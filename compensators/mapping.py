@@ -65,6 +65,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
     Attributes:
         highest_frequency: Highest frequency of outputs in Hz.
         takes_microphones: Whether there are several microphones.
+        ears: Number of ears with several microphones.
 
     Raises:
         ValueError: A rate or level is out of range.
@@ -98,6 +99,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         is_predicted = config.phase == "predicted"
         self.microphones = config.microphones
         self.takes_microphones = config.microphones > 1
+        self.ears = config.ears
         further_microphones = config.microphones - 1
         inputs = (4 if is_predicted else 3) + 3 * further_microphones
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)

@@ -88,11 +88,12 @@ def process_recording(
         model: Simulator or aid at the sample rate of the recording.
         recording: Description of the file, from ``scan_audio``.
         gain: Factor by which the input is multiplied, and the output divided again.
-        ears: Audiogram, or listener for a stereo recording.
+        ears: Audiogram, or listener for a stereo recording, or for one with several microphones.
         sliders: Further arguments of an aid, each under its name.
 
     Yields:
-        Consecutive parts at the scale of the file, (channels, time).
+        Consecutive parts at the scale of the file, (channels, time). An aid with
+        ``takes_microphones`` returns one channel per ear.
     """
 
     def read(blocks: Sequence[Block]) -> Iterable[Tensor]:
@@ -104,6 +105,8 @@ def process_recording(
     else:
         blocks = divide_recording(model, recording.samples, recording.sample_rate)
         process = _process_channels if len(blocks) > 1 else _process_all
+        if getattr(model, "takes_microphones", False):
+            process = _process_microphones
         outputs = (
             block.cut_output(process(model, part, ears, sliders))
             for block, part in zip(blocks, read(blocks), strict=True)
@@ -118,6 +121,22 @@ def _process_all(model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, f
     """
     output: Tensor = model(part, ears, **sliders)
     return output
+
+
+def _process_microphones(
+    model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]
+) -> Tensor:
+    """Return the output of a model whose microphones are the channels, left and right in turn.
+
+    Shape: (channels, time) -> (ears, time).
+
+    Raises:
+        ValueError: There is another number of channels.
+    """
+    aid: Any = model
+    signals = part if aid.ears == 1 or len(part) % 2 else part.unflatten(0, (-1, 2))
+    output: Tensor = aid(signals, ears, **sliders)
+    return output.reshape(aid.ears, -1)
 
 
 def _process_channels(

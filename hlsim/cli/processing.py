@@ -54,7 +54,8 @@ def compensate(parser: Parser) -> None:
     text = (
         "nalr or nalrp (linear prescriptions), wdrc or camfit (compression in bands), or a "
         "checkpoint's name or folder; a checkpoint that was trained for one ear causes "
-        "a warning if it is used for another"
+        "a warning if it is used for another, and one that was trained with several microphones "
+        "takes their channels, the reference first"
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
@@ -172,7 +173,8 @@ def _process_file(
     level, gain_db = level_and_gain(recording.power, options)
     model = build(recording.sample_rate)
     gain = 10.0 ** (gain_db / 20.0)
-    size = recording.channels, recording.samples, recording.sample_rate
+    channels = model.ears if getattr(model, "takes_microphones", False) else recording.channels
+    size = channels, recording.samples, recording.sample_rate
     meter = Meter()
     with torch.no_grad():
         outputs = process_recording(model, recording, gain, ear, **sliders)

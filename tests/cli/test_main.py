@@ -16,7 +16,13 @@ import torch
 from torch import Tensor
 
 import hlsim
-from compensators import NALR, MappingCompensator, MappingConfig, load_compensator
+from compensators import (
+    NALR,
+    MappingCompensator,
+    MappingConfig,
+    load_compensator,
+    save_compensator,
+)
 from hlsim import MSBG, Audiogram, Listener
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES
@@ -267,6 +273,32 @@ def test_both_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:
     gain = 10.0 ** ((80.0 - float(level_spl(scene.flatten()))) / 20.0)
     aid = load_compensator("wdrc", sample_rate=rate, limit_to_ear=True)
     check_output(out, aid(gain * scene, listener) / gain)
+
+
+@pytest.mark.parametrize("ears", [1, 2])
+def test_channels_are_the_microphones_of_a_checkpoint_that_takes_them(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], ears: int
+) -> None:
+    waveform, rate = read_audio(utterance)
+    scene, out = waveform[:, :4000] * torch.linspace(1.0, 0.5, 4)[:, None], tmp_path / "out.wav"
+    write_audio(tmp_path / "in.wav", scene, rate)
+    config = MappingConfig(channels=4, blocks=1, microphones=4 // ears, ears=ears)
+    aid = MappingCompensator(config=config, sample_rate=rate).requires_grad_(False)
+    torch.nn.init.normal_(aid.weight_decoder.leave.bias)  # type: ignore[union-attr]
+    save_compensator(aid, tmp_path / "aid")
+    command = ["compensate", tmp_path / "in.wav", out, "--compensator", tmp_path / "aid"]
+    ear: Any = "N2"
+    options: list[Any] = ["--audiogram", "N2"]
+    if ears == 2:
+        ear = Listener("N2", "N4")
+        options = ["--listener", write_listeners(tmp_path, a=ear)]
+    command += options
+    assert run(*command) == 0
+    signals = scene.reshape(2, 2, -1) if ears == 2 else scene
+    check_output(out, aid(signals, ear).reshape(ears, -1))
+    write_audio(tmp_path / "in.wav", scene[:3], rate)
+    assert run(*command) == 2
+    assert f"expected signals of {4 // ears} microphones per ear" in capsys.readouterr().err
 
 
 def test_measured_uncomfortable_levels_of_one_ear(tmp_path: Path, utterance: Path) -> None:
