@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -373,6 +375,8 @@ def _run_study(
 ) -> None:
     """Run an evaluation, write its page, and print its verdict and its first table.
 
+    The page also has the warnings of the evaluation, once each.
+
     The notes of the evaluation are printed to stderr, and if scores are missing, their number and
     the first reason.
 
@@ -392,11 +396,13 @@ def _run_study(
     used_before = {"run", "names", "out", "limit_to_ear", "ucl"}
     arguments = {name: settings[name] for name in settings.keys() - used_before}
     with ProgressLine("scores", "reading the recordings", "drawing the page") as progress:
-        evaluation = evaluate(**{**arguments, **changes}, progress=progress)
+        with _collect_warnings() as texts:
+            evaluation = evaluate(**{**arguments, **changes}, progress=progress)
+        notes = [*notes, *dict.fromkeys(texts)]
         evaluation = replace(evaluation, notes=[*notes, *evaluation.notes])
         page = make_page(evaluation)
         path = write_results(page, evaluation, options.out)
-    for note in evaluation.notes[len(notes) :]:  # Those of the caller have been printed.
+    for note in evaluation.notes[len(notes) :]:  # The others have been printed.
         print(f"hlsim: {note}", file=sys.stderr)
     tables = [table for section in page.sections for table in section.tables]
     print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path.as_uri()}")
@@ -409,3 +415,18 @@ def _run_study(
             f"{first.failure}"
         )
         print(f"hlsim: {text}", file=sys.stderr)
+
+
+@contextmanager
+def _collect_warnings() -> Iterator[list[str]]:
+    """Yield a list to which the texts of warnings are appended when they are shown."""
+    texts = []
+    show = warnings.showwarning
+
+    def show_and_collect(message: Warning | str, *place: Any) -> None:
+        texts.append(str(message))
+        show(message, *place)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show_and_collect  # type: ignore[assignment]
+        yield texts

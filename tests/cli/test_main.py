@@ -483,7 +483,7 @@ def test_haspi_report_of_a_manifest(
         pytest.importorskip(module)
     samples, rate = soundfile.read(utterance)
     for name, gain in (("clean", 1.0), ("aided", 4.0)):
-        second = gain * samples[rate : 2 * rate]
+        second = gain * samples[rate : 2 * rate - (name == "aided")]
         soundfile.write(tmp_path / f"{name}.wav", second, rate, subtype="FLOAT")
     (tmp_path / "broken.wav").write_text("this is no audio")
     (tmp_path / "study.csv").write_text(MANIFEST)
@@ -494,6 +494,8 @@ def test_haspi_report_of_a_manifest(
     assert run(*call, *measures) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith("aided") and (out / "report.html").as_uri() in printed.out
+    warning = "both are cut to the shorter length"
+    assert warning in json.loads((out / "report.json").read_text())["notes"][0]
     assert "1 of 4 outputs (one per item and condition) lack scores (one per" in printed.err
     assert "broken.wav: cannot be read" in printed.err.rpartition("the first is: ")[2]
     scores = [row["stoi"] for row in json.loads((out / "report.json").read_text())["rows"]]

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,11 @@ def end_process_at_three(number: int) -> int:
 
 def process_of(number: int) -> tuple[int, int]:
     return number, os.getpid()
+
+
+def warn_of(number: int) -> int:
+    warnings.warn(f"the number is {number}", stacklevel=1)
+    return number
 
 
 def test_tasks_come_back_with_their_results_and_an_exception_ends_the_run() -> None:
@@ -47,6 +53,12 @@ def test_a_process_that_ends_costs_only_its_task(
     results = dict(run_parallel(end_process_at_three, numbers, **settings))
     assert isinstance(results.pop(3), Crash)
     assert results == {number: number**2 for number in numbers if number != 3}
+
+
+@pytest.mark.slow  # as above
+def test_warnings_of_other_processes_are_repeated() -> None:
+    with pytest.warns(UserWarning, match="the number is 7"):
+        assert list(run_parallel(warn_of, [5, 7], jobs=2)) == [(5, 5), (7, 7)]
 
 
 @pytest.mark.slow

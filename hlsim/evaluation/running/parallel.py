@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any, TypeVar
 
 from hlsim.extras import require
@@ -59,7 +61,8 @@ def run_parallel(
     """Call a function for each task, and yield the tasks with their results, in the same order.
 
     If a process crashes, the next tasks are repeated one by one in another process, so that only
-    the result of the task that crashes is a ``Crash``.
+    the result of the task that crashes is a ``Crash``. Warnings of the function are repeated in this
+    process, where callers can record them.
 
     Args:
         function: Function of a task, which can be pickled. An exception that it raises ends the
@@ -89,7 +92,8 @@ def run_parallel(
             jobs = None
         stack.enter_context(joblib.parallel_config(**settings))
         pool = joblib.Parallel(n_jobs=jobs or -1, return_as="generator")
-        calls = [joblib.delayed(function)(task) for task in tasks]
+        call = joblib.delayed(partial(_record_warnings, function))
+        calls = [call(task) for task in tasks]
         finished = 0
         alone = len(tasks) if in_processes and jobs == 1 else 0
         while finished < len(tasks):
@@ -100,7 +104,9 @@ def run_parallel(
             else:
                 results = pool(calls[finished : finished + 1])
             try:
-                for result in results:
+                for result, texts in results:
+                    for text in texts:
+                        warnings.warn(text, stacklevel=2)
                     yield tasks[finished], result
                     finished += 1
                     alone = max(0, alone - 1)
@@ -113,6 +119,13 @@ def run_parallel(
                 yield tasks[finished], Crash()
                 finished += 1
                 alone -= 1
+
+
+def _record_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[str]]:
+    """Return the result of a function for a task, and the texts of its warnings for users."""
+    with warnings.catch_warnings(record=True) as caught:
+        result = function(task)
+    return result, [str(w.message) for w in caught if w.category is UserWarning]
 
 
 def _run_in_one_process(calls: Sequence[Any]) -> Iterator[Any]:
