@@ -61,8 +61,8 @@ def run_parallel(
     """Call a function for each task, and yield the tasks with their results, in the same order.
 
     If a process crashes, the next tasks are repeated one by one in another process, so that only
-    the result of the task that crashes is a ``Crash``. Warnings of the function are repeated in this
-    process, where callers can record them.
+    the result of the task that crashes is a ``Crash``. Warnings of the function are repeated in
+    this process, where callers can record them.
 
     Args:
         function: Function of a task, which can be pickled. An exception that it raises ends the
