@@ -140,7 +140,7 @@ class TrainingData:
             "valid_scenes": scenes["valid"],
         }
         replacements = {name: value for name, value in attributes.items() if value}
-        if scenes and replacements.keys() & {"noise", "valid_noise"}:
+        if any(scenes.values()) and replacements.keys() & {"noise", "valid_noise"}:
             raise ValueError(
                 f"{manifest}: its noisy speech at several microphones contains the noise; leave "
                 "--noise and --valid-noise out"

@@ -75,8 +75,8 @@ def test_validation_is_on_other_speech_where_there_is_some(manifest: Path) -> No
     valid = TrainingData.from_manifest(manifest, noise=None, valid_noise=None).validation()
     assert valid.speech == [pair[0]] and valid.noise == [pair]
     folder = manifest.parent / "noisy"
-    data = TrainingData.from_manifest(manifest, valid_speech=folder)
-    assert data.validation().speech == folder
+    data = TrainingData.from_manifest(manifest, valid_speech=folder, noise=folder)
+    assert data.validation().speech == data.noise == folder
     rows = manifest.read_text().replace("valid", "train")
     manifest.write_text(rows)
     data = TrainingData.from_manifest(manifest)
