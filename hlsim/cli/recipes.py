@@ -115,7 +115,7 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
     names = [setting.partition("=")[0] for setting in settings if setting.startswith("--")]
     if repeated := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"recipe: {repeated[0]} appears twice; leave one out")
-    texts = [setting.partition("=")[2] for setting in settings]
+    texts = [setting.partition("=")[2] or setting for setting in settings]
     if file is not None:
         texts.append(file.read_text(encoding="utf-8", errors="replace"))
     for text in texts:

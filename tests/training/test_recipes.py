@@ -112,6 +112,8 @@ def test_numbers_that_yaml_reads_in_base_60_are_errors(tmp_path: Path, text: str
     (tmp_path / "recipe.yaml").write_text(text)
     with pytest.raises(ValueError, match="blank behind the colon"):
         make_recipe(CompensatorRecipe, tmp_path / "recipe.yaml", [])
+    with pytest.raises(ValueError, match="blank behind the colon"):
+        make_recipe(CompensatorRecipe, None, ["--recipe.model.channels", "1:30"])
 
 
 def test_a_setting_that_is_given_twice_is_an_error(tmp_path: Path) -> None:
