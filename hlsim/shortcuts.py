@@ -22,7 +22,7 @@ from hlsim.calibration import (
     gain_to_pascals,
     set_level,
 )
-from hlsim.checks import check_finite, check_number, check_rate
+from hlsim.checks import check_finite, check_number, check_rate, check_waveform
 from hlsim.data.bundled import EXAMPLE_FILE
 from hlsim.dsp.resample import resample
 from hlsim.simulators import load_simulator
@@ -216,7 +216,7 @@ def listen(
                 f"expected shape (time,) or (2, time), got {tuple(tensor.shape)} for {label!r}; "
                 "pass one item, such as x[0]"
             )
-        check_finite(tensor, repr(label))
+        check_finite(check_waveform(tensor, repr(label)), repr(label))
         pascals[label.replace("_", " ")] = tensor * gain
     from hlsim.report.players import make_player
 

@@ -85,3 +85,10 @@ def test_a_stereo_file_can_be_played_beside_a_mono_one(tmp_path) -> None:
     assert repr(players) == f"Player(stereo {level:.0f} dB SPL, mono {left:.0f} dB SPL)"
     players.save(tmp_path / "new folder" / "players.html")
     assert (tmp_path / "new folder" / "players.html").read_text().count("<audio") == 2
+
+
+def test_whole_numbers_cannot_be_played_beside_pascals() -> None:
+    whole = (1000.0 * SPEECH).short()
+    for samples in (whole, whole.numpy()):
+        with pytest.raises(ValueError, match="divide 16-bit samples by 32768"):
+            hlsim.listen(original=SPEECH, whole=samples)

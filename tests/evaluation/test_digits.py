@@ -209,6 +209,7 @@ def test_sliders_reach_the_aid() -> None:
         ({"aid": lambda x, _: x[..., :-1]}, "return as many samples"),
         ({"aid": lambda x, _: x * float("nan")}, "without NaN"),
         ({"aid": lambda x, _: (32767 * x).short()}, "floating-point samples .* got torch.int16"),
+        ({"aid": lambda x, _: x.numpy()}, "expected the aid to return a tensor, got a ndarray"),
     ],
 )
 def test_invalid_arguments_are_rejected(settings: dict[str, Any], words: str) -> None:

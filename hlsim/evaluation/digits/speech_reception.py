@@ -222,10 +222,12 @@ def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) ->
         -> (triplets of the portion, time).
 
     Raises:
-        ValueError: The outputs have another shape, or samples that are not finite.
+        ValueError: The outputs are no tensor, have another shape, or samples that are not finite.
     """
     inputs = signals[portion]
     outputs = aid(inputs, ear)
+    if not isinstance(outputs, Tensor):
+        raise ValueError(f"expected the aid to return a tensor, got a {type(outputs).__name__}")
     expected = len(inputs), inputs.shape[-1]
     is_finite = outputs.is_floating_point() and bool(outputs.isfinite().all())
     if outputs.shape != expected or not is_finite:
