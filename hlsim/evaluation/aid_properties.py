@@ -66,7 +66,8 @@ def measure_aids(
     """Measure a property of several hearing aids, each for several ears.
 
     Args:
-        aids: Hearing aids, each under its name.
+        aids: Hearing aids, each under its name. One with a method ``is_measured`` is left out for
+            ears for which the method returns False.
         ears: Audiograms, each under its name.
         measure: Function ``(aid, ear, *arguments) -> dict``, such as ``measure_steady_tones``.
         arguments: Arguments of ``measure`` after aid and ear.
@@ -83,7 +84,11 @@ def measure_aids(
     [{'aid': 'unaided', 'ear': 'N3', 'cost': 0}]
     """
     results = []
-    pairs = [*product(ears.items(), aids.items())]
+    pairs = [
+        (ear, aid)
+        for ear, aid in product(ears.items(), aids.items())
+        if not hasattr(aid[1], "is_measured") or aid[1].is_measured(ear[1])
+    ]
     for (ear_name, ear), (name, aid) in track(pairs, "measurements of aids", len(pairs)):
         try:
             values = measure(aid, ear, *arguments)

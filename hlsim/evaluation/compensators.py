@@ -35,10 +35,8 @@ from hlsim.evaluation.conditions import (
     Enhanced,
     EqualiserLike,
     OnMicrophones,
-    PrescriptionForEar,
     Rival,
     Unaided,
-    is_profound,
     load_enhancers,
     load_rival,
     takes_microphones,
@@ -235,12 +233,6 @@ def evaluate_compensators(
         details["reception_thresholds"] = measure_reception_thresholds(
             with_unaided, ears_of_aids, UNAIDED, DigitTest.draw(seed=seed)
         )
-    if isinstance(rival_aid, PrescriptionForEar):
-        usual_ears = {name for name, ear in ears_of_aids.items() if not is_profound(ear)}
-        for kind, rows in details.items():  # NAL-R's rows of these ears say the same
-            details[kind] = [
-                row for row in rows if row["aid"] != rival_name or row["ear"] not in usual_ears
-            ]
     targets = loudness_at(loudness, torch.tensor(levels, dtype=torch.float64)).tolist()
     for row in details["steady_tones"]:
         errors = zip(row["loudness_error_db"], targets, strict=True)

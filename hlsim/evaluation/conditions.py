@@ -92,6 +92,13 @@ class PrescriptionForEar(nn.Module):
         super().__init__()
         self.usual, self.profound = NALR(sample_rate=NEURO_RATE), NALRP(sample_rate=NEURO_RATE)
 
+    def is_measured(self, audiogram: Audiogram) -> bool:
+        """Return whether the prescription for an ear is another one than NAL-R.
+
+        Otherwise, the measurements of NAL-R say the same.
+        """
+        return is_profound(audiogram)
+
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         """Return the waveform amplified by the prescription for the ear, (time,) -> (time,)."""
         aid = self.profound if is_profound(audiogram) else self.usual

@@ -21,7 +21,12 @@ from hlsim.evaluation.aid_properties import (
     measure_steady_tones,
     measure_wearability,
 )
-from hlsim.evaluation.conditions import EqualiserLike, Unaided, _equalise_bands
+from hlsim.evaluation.conditions import (
+    EqualiserLike,
+    PrescriptionForEar,
+    Unaided,
+    _equalise_bands,
+)
 from hlsim.evaluation.measures import NORMAL
 from hlsim.metrics.band_levels import band_edges
 
@@ -144,3 +149,11 @@ def raise_error(waveform: Tensor, ear: Audiogram) -> Tensor:
 def test_an_aid_that_fails_is_named(aid: Callable[..., Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=f"^mine, ear N3: .*{message}"):
         measure_aids({"mine": aid}, {"N3": N3}, measure_gain_curve, torch.randn(1, 16000), (65.0,))
+
+
+def test_a_prescription_for_the_ear_is_measured_only_where_it_is_not_nal_r() -> None:
+    aids = {"NAL-R": NALR(), "for-ear": PrescriptionForEar()}
+    ears = {"N3": N3, "profound": Audiogram([95.0] * 8)}
+    rows = measure_aids(aids, ears, lambda aid, ear: {})
+    pairs = [(row["ear"], row["aid"]) for row in rows]
+    assert pairs == [("N3", "NAL-R"), ("profound", "NAL-R"), ("profound", "for-ear")]
