@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame
 from torch import Tensor, nn
@@ -116,15 +117,13 @@ def draw_words(table: DataFrame, path: Path) -> None:
     levels = table.groupby("condition", sort=False)["level"].mean()
     levels -= levels["NAL-R"]
     softer = [name for name in levels.index if name.startswith("loudness")]
-    references = {"amplification 0.8": "s", "NAL-R": "^"}
     for panel, (simulator, title) in zip(panels, SIMULATORS.items(), strict=True):
         comparison = Comparison(table.assign(words_correct=table[simulator]))
         for number, (snr, label) in enumerate(zip(SNRS, PLACES, strict=True)):
-            shares = {name: comparison.shares(name, snr)[0] for name in levels.index}
-            line = [shares[name] for name in softer]
-            panel.plot(levels[softer], line, "o-", color=f"C{number}", label=label)
-            for name, marker in references.items():
-                panel.plot(levels[name], shares[name], marker, color=f"C{number}", mfc="none")
+            shares = np.stack([comparison.shares(name, snr) for name in softer])
+            low, high = np.nanpercentile(shares[:, 1:], (2.5, 97.5), axis=1)
+            panel.fill_between(levels[softer], low, high, alpha=0.15)
+            panel.plot(levels[softer], shares[:, 0], "o-", color=f"C{number}", label=label)
         panel.set(title=title, xlabel="output level minus NAL-R's (dB)", ylim=(0.0, 1.0))
     panels[0].set_ylabel("words correct")
     panels[0].legend()
