@@ -36,7 +36,7 @@ from hlsim.report.tables import (
     statistic,
     summary_table,
 )
-from hlsim.report.verdict import verdict
+from hlsim.report.verdict import count_items, verdict
 
 _GROUPS = {"clean": "Clean speech", "noisy": "Speech in noise"}
 
@@ -163,10 +163,17 @@ def _about(evaluation: Evaluation) -> str:
     settings = evaluation.settings
     levels = ", ".join(f"{level:g}" for level in settings["levels"])
     ears = evaluation.table["ear"].nunique()
+    incomplete = evaluation.failures["item"].nunique()
+    left_out = ""
+    if incomplete:
+        left_out = (
+            f" Tables and pictures leave out {count_items(incomplete)} without all values, which "
+            "the section Failures lists."
+        )
     return (
         f"{settings['items']} items of {settings['seconds']:g} s; ears: {ears}; speech at "
-        f"{levels} dB SPL in turn; seed {settings['seed']}. {VERSION_NOTE} Both compare with "
-        "clean speech, in noise too."
+        f"{levels} dB SPL in turn; seed {settings['seed']}.{left_out} {VERSION_NOTE} Both compare "
+        "with clean speech, in noise too."
     )
 
 

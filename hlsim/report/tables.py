@@ -318,7 +318,7 @@ def detail_section(
     failures = evaluation.failures[["name", "condition", "failure"]].to_numpy().tolist()
     if failures:
         table = Table("Outputs without all values", ("Item", "Condition", "Reason"), failures)
-        further.append(Section("Failures", ["The other items were measured."], [table]))
+        further.append(Section("Failures", ["The other items have all values."], [table]))
     versions = ", ".join(f"{name} {v}" for name, v in evaluation.versions.items())
     origin = f"Seed {evaluation.settings['seed']}. Versions: {versions}."
     further.append(Section("How the values were computed", [*notes, origin]))

@@ -212,7 +212,9 @@ def test_an_item_counts_only_if_every_condition_has_its_values(
     failures = study.failures
     assert set(failures.ear) == {"S1"} and failures.failure.str.contains("no such ear").all()
     assert set(study.groups["clean"].table.ear) == {"N2", "N3", "N4", "N5", "N6", "S2"}
-    assert "no such ear" in compensators_page(study).markdown()
+    page = compensators_page(study).markdown()
+    assert "no such ear" in page
+    assert "leave out 1 item without all values" in page
 
 
 @pytest.mark.slow
