@@ -433,7 +433,7 @@ class Stream:
     because a smaller one looks like an array with time first. At the end of a signal, ``flush``
     returns the last ``aid.latency`` samples of its output.
 
-    Chunks are tensors or NumPy arrays, and so are the outputs.
+    Chunks are tensors or NumPy arrays, and so are the outputs; ``flush`` returns a tensor.
 
     Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
 
@@ -443,16 +443,19 @@ class Stream:
     Args:
         aid: Aid at 16 kHz.
         audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the leading
-            dimensions of the chunks.
-        sliders: Value from 0 to 1 under each slider's name, one number or one value per item.
+            dimensions of the chunks; None for the ears of the aid.
+        sliders: Value from 0 to 1 under each slider's name, one number or one value per item; by
+            default those of ``aid.SLIDERS``.
 
     Raises:
         ValueError: For the constructor: the aid has another sample rate, rejects the ear or has no
-            such slider. For a call: a slider is outside 0 to 1, the leading dimensions differ from
-            those of earlier chunks, there are no samples, or a sample is NaN or infinite, which
-            would affect all later output. A rejected chunk leaves the stream as it was. A rejected
+            such slider. For a call: a slider is outside 0 to 1 (on a GPU this is not checked, and
+            the output is NaN until ``flush``), the leading dimensions differ from those of earlier
+            chunks or do not fit the ears, there are no samples, samples are no floating-point
+            numbers or above 1e9 in magnitude, or a sample is NaN or infinite, which would affect
+            all later output. A rejected chunk leaves the stream as it was. A rejected
             value of a slider stays until ``set`` replaces it.
-        RuntimeError: Values of a slider do not broadcast to the items.
+        RuntimeError: For a call: values of a slider do not broadcast to the items.
 
     >>> import hlsim
     >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")

@@ -152,7 +152,7 @@ def sha256(path: Path) -> str:
 
 
 def source_hash(code: Any) -> str | None:
-    """Compute the SHA-256 of the file with the source code of a class or function.
+    """Compute the SHA-256 of the file with the source code of a class or function, in hexadecimal.
 
     The result is None if there is no such file, as for code in a notebook.
 

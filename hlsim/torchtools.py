@@ -61,7 +61,8 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
 def built_in_float32(construct: Callable[P, None]) -> Callable[P, None]:
     """Decorate a constructor so that it uses float32 instead of torch's default dtype.
 
-    The networks compute with complex numbers, which torch does not have in half precision.
+    The networks compute with complex numbers. Torch has none for bfloat16, and few operations
+    for those of float16.
 
     >>> torch.set_default_dtype(torch.bfloat16)
     >>> class Layer(torch.nn.Linear):

@@ -284,9 +284,9 @@ def _profound_corrections() -> list[list[float]]:
 
 @constant
 def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
-    """Return the level of 0 dB HL in dB SPL at some frequencies in Hz, in a free field.
+    """Return the free-field level in dB SPL of 0 dB HL at frequencies in Hz.
 
-    It is interpolated linearly over frequency. Shape: (points,).
+    It is interpolated linearly, and constant outside 125 Hz to 12.5 kHz. Shape: (points,).
     """
     return np.interp(
         points, list(FREE_FIELD_THRESHOLD_SPL), list(FREE_FIELD_THRESHOLD_SPL.values())

@@ -109,12 +109,13 @@ def read_listeners(
 
 
 def _read_entries(path: str | Path) -> _Builders:
-    """Read Clarity's ``listeners.json``, and return functions that build the listeners.
+    """Read Clarity's ``listeners.json``, and return functions that build the listeners by name.
 
     The functions raise ValueError if an ear is missing or not valid.
 
     Raises:
-        ValueError: The file is no JSON, or has another structure.
+        ValueError: The file does not exist, is no JSON, has a key twice, or is not an object with
+            entries.
     """
     entries = read_json(path)
     if not isinstance(entries, Mapping) or not entries:

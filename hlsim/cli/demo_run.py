@@ -45,14 +45,20 @@ class DurationEstimate(Callback):
 def run_demo(out: str | Path, audiogram: Audiogram, *, steps: int = 3000, **running: Any) -> str:
     """Train an aid for one ear on bundled speech, score it beside NAL-R, and write its page.
 
+    Progress is printed.
+
     Args:
-        out: Folder of the page and of the training.
+        out: Folder of the page, the scores and the training, which resumes if it was interrupted.
         audiogram: Audiogram of the ear.
         steps: Number of training steps.
         running: Arguments ``jobs`` and ``progress`` of ``run_study``.
 
     Returns:
         Text for a terminal: the verdict, the table of results, and the address of the page.
+
+    Raises:
+        ValueError: The steps are not 1 or more, the folder has another training, or nothing could
+            be scored.
     """
     ear = f"{ear_name(audiogram)} (pure-tone average {audiogram.pta:.0f} dB HL)"
     print(f"Training an aid for the ear {ear}, {steps} steps")

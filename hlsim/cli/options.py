@@ -357,11 +357,12 @@ def ear(text: str) -> str | list[float] | dict[float, float]:
         text: A name, levels, or frequencies with levels.
 
     Returns:
-        The name; a list of levels in dB HL at the eight audiometric frequencies; or a dict from
-        frequency in Hz to level in dB HL.
+        The name, which is any text without comma and colon; a list of levels in dB HL, whose
+        number is not checked here; or a dict from frequency in Hz to level in dB HL.
 
     Raises:
-        argparse.ArgumentTypeError: A frequency occurs twice, or a level is not a number.
+        argparse.ArgumentTypeError: A frequency occurs twice, a frequency or a level is not a
+            number, or a pair is not of the form frequency:level.
 
     >>> ear("N3"), ear("500:30,4000:60")
     ('N3', {500.0: 30.0, 4000.0: 60.0})

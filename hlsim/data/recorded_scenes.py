@@ -55,7 +55,9 @@ class SceneFiles(NamedTuple):
     def read(self) -> tuple[Tensor, Tensor, int]:
         """Read the signals, with the reference microphone first.
 
-        Clean speech of Clarity's scenes gets the level of the target in the room, see
+        Samples have 1.0 as full scale. Files that differ by up to 0.1 s are cut to the shortest,
+        and clean speech with one channel is used for all ears. Anechoic clean speech of Clarity's
+        scenes gets the level of the target in the room if that file exists, see
         ``file_with_room``.
 
         Returns:
@@ -63,7 +65,8 @@ class SceneFiles(NamedTuple):
             time), and the sample rate in Hz.
 
         Raises:
-            ValueError: A file cannot be read, or the files do not fit together.
+            ValueError: A file cannot be read, or the files differ in sample rate or by more than
+                0.1 s, or have numbers of channels that do not fit.
         """
         files = [read_audio(path) for path in (self.clean, *self.microphones)]
         waveforms, rates = zip(*files, strict=True)

@@ -165,7 +165,8 @@ def _read_ears_of_folders(
     Names of listener and ear may be empty.
 
     Raises:
-        ValueError: There is neither an audiogram nor a table of audiograms, or both.
+        ValueError: There is neither an audiogram nor a table of audiograms, or both; or the table
+            cannot be read or has several rows for an ear.
     """
     if (audiogram is None) == (audiograms is None):
         raise ValueError(
@@ -367,7 +368,7 @@ def _describe_unrelated(table: DataFrame) -> list[str]:
 
 
 def _describe_lags(table: DataFrame) -> list[str]:
-    """Return a list with a note about outputs that are late or early, or an empty list."""
+    """Return a list with a note about outputs late or early by more than ``LATE_MS``, or []."""
     lags = table.get("lag_ms", [])
     late = table[[abs(lag) > LATE_MS for lag in lags]] if len(lags) else table[:0]
     if late.empty:

@@ -441,7 +441,7 @@ class HASPILoss(HearingLossLoss):
     as a rival in a comparison, and judge the result by words or by listeners. In an outside
     evaluation of one small network, it had the highest HASPI of all losses, but .15 fewer words
     correct than ``HearingLossLoss``; its output passed 121 dB SPL during training, and it was the
-    only loss that made words harder to recognise behind a linear ear (-.28).
+    only loss that made words harder to recognise behind a linear ear (a share of .28 less).
 
     It is 1 minus HASPI, optionally plus 1 minus HASQI (a score of quality), plus the error of the
     perceived level.

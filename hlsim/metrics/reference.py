@@ -221,7 +221,9 @@ class Reference(ABC):
 
         Raises:
             ValueError: The noise is unknown, the seed is out of range, or outputs have another
-                shape than the clean signals, are not finite or on another device.
+                shape than the clean signals, are not floating-point, finite and of at most 1e9, or
+                are on another device; or, if the clean side is prepared here (``keep=False``), a
+                clean signal is silent, too soft or too short.
         """
         check_choice("noise", noise, Noise)
         check_number("seed", seed, 0, 2**32 - 1, whole=True)

@@ -77,11 +77,13 @@ def in_blocks(
 def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[Block]:
     """Divide the samples of a signal into overlapping blocks.
 
-    Each block contributes about ``seconds`` to the output. Its input begins at least 0.75 s earlier
-    and ends at least 0.55 s later, because MSBG's filters make the output depend on these margins;
-    the result for the margins is discarded. A signal of up to one and a half blocks is not divided.
-    Each block begins where the frames of smearing and the steps of envelopes lie at the same
-    samples as in the whole signal.
+    Each block contributes about ``seconds`` to the output, and the last one half to one and a half
+    times as much. The exact duration is a multiple of 16 s / gcd(rate, 75), and at least once this
+    value, which is 0.64 s at 16 kHz and 16 s at 16384 Hz. The input of a block begins at least
+    0.75 s earlier than its output and ends at least 0.55 s later, because MSBG's filters make the
+    output depend on these margins; the result for the margins is discarded. A signal of up to one
+    and a half blocks is not divided. Each block begins where the frames of smearing and the steps
+    of envelopes lie at the same samples as in the whole signal.
 
     Args:
         samples: Length of the signal in samples.
@@ -97,7 +99,7 @@ def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[
     common = math.lcm(HOP, STEP, round(2 * HALF_RATE_STEP))
     # the smallest number of samples that is a whole number of hops and of steps
     unit = common * rate // math.gcd(common * rate, MSBG_RATE)
-    hop = round((seconds or _BLOCK_SECONDS) * rate)
+    hop = max(unit, round((seconds or _BLOCK_SECONDS) * rate))
     return split_into_blocks(samples, hop, _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit)
 
 

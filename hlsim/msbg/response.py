@@ -123,10 +123,10 @@ def _taps(rate: int, kind: str) -> NDArray[np.float64]:
 
     Args:
         rate: Sample rate in Hz.
-        kind: ``"phase"`` for the phase of this response, at a magnitude of 1 that falls where the
-            response is below a tenth of its maximum; ``"difference"`` for this phase minus that for
-            normal ears; ``"normal ear"`` for this phase with the magnitude of the response for
-            normal ears.
+        kind: ``"phase"`` for the phase of this response and a magnitude of 1, or less where the
+            response is below a tenth of its maximum; ``"difference"`` for a magnitude of 1 and this
+            phase minus that for ears without a loss; ``"normal ear"`` for this phase with the
+            magnitude for ears without a loss.
 
     Returns:
         Coefficients, (severities, 2 * half_length(rate)).

@@ -266,7 +266,8 @@ class Prior(nn.Module):
         """Return the matrices that smear the power spectra of sounds in front of the ear.
 
         MSBG smears behind the outer and the middle ear, so the matrices apply the power response of
-        these filters, smear, and undo the response.
+        these filters, smear, and undo the response. The smearing has its learned correction,
+        through which gradients pass.
 
         Returns:
             Matrices, (severities, frequencies, frequencies). The first one, for ears without a

@@ -50,7 +50,10 @@ def _smooth_factor(spectrum_power: Tensor, smeared_power: Tensor) -> tuple[Tenso
 
 
 def _ratio_divisor(spectrum_power: Tensor, smeared_power: Tensor) -> Tensor:
-    """Return the divisor of the smeared power, which limits the ratio to ``MAX_FACTOR``."""
+    """Return the original power plus |smeared power| / ``MAX_FACTOR``.
+
+    Smeared power divided by it never exceeds ``MAX_FACTOR`` in magnitude.
+    """
     return torch.add(spectrum_power, smeared_power.abs(), alpha=1.0 / MAX_FACTOR)
 
 

@@ -142,9 +142,10 @@ class CompensatorRecipe(TrainingRecipe):
 
     Attributes:
         kind: Type of the network, ``mapping-compensator``, ``hearing-aid`` or ``beamforming-aid``.
-            The last one is trained in random scenes, see ``draw_scenes``, or in recorded ones. The
-            recipe's ``start`` may be a hearing aid, before which it is placed, and whose weights
-            stay. Recorded scenes are used as they are, except for their level.
+            The last one, and a ``mapping-compensator`` with ``ears: 2``, are trained in random
+            scenes, see ``draw_scenes``, or in recorded ones, which are used as they are, except for
+            their level. The hearing aid inside a ``beamforming-aid`` is not trained; ``start`` may
+            name a trained one.
         model: Settings of ``MappingConfig``, ``HearingAidConfig`` or ``BeamformerConfig``.
         weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
             ``hasqi``, ``interaural``, ``denoising`` and ``intelligibility``. The first six are
@@ -152,18 +153,19 @@ class CompensatorRecipe(TrainingRecipe):
             ``beamforming-aid``, or ``ears: 2`` in ``model``. The last two train a hearing aid's
             noise reduction alone, and the others its amplification alone: ``denoising`` is the
             error of the gains of noise reduction, ``intelligibility`` is 1 - HASPI at equal level.
-            ``haspi``, ``hasqi`` (1 - score) and ``intelligibility`` require clips of 0.7 s or more.
+            ``haspi``, ``hasqi`` (1 - score) and ``intelligibility`` require clips of 0.7 s or more
+            (``seconds``); ``denoising`` and ``intelligibility`` require noise or recorded scenes.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
             them, a network learns that steady sounds are noise.
         equalised: Share of clips of speech, and of noise, that are equalised at random by up to 15
             dB. A few voices have few spectra, and the gains for other voices would be up to 20 dB
             wrong.
         noisy: Share of noisy clips among those of speech, if there is noise.
-        babble: Share of noisy clips whose noise consists of up to four other voices; 0 for a
-            ``beamforming-aid``, whose scenes have other voices in any case.
+        babble: Share of noisy clips whose noise consists of other voices of the batch, at most
+            four; 0 for random scenes of several microphones, which have other voices in any case.
         snr: Lowest and highest signal-to-noise ratio in dB. The level of the speech is its active
             level, without pauses.
-        mismatch: Standard deviation in dB of the gains of the microphones of a ``beamforming-aid``.
+        mismatch: Standard deviation in dB of the gains of the microphones in random scenes.
         unreduced: Share of items for which a hearing aid's noise reduction is off.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.

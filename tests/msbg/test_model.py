@@ -348,6 +348,12 @@ def test_bad_calls_and_settings_raise_value_error() -> None:
         fast_model().delay("Severe")
 
 
+def test_long_signals_of_every_rate_are_divided() -> None:
+    for rate in (16000, 16384, 44100):
+        blocks = block_bounds(60 * rate, rate)
+        assert max(block.output_stop - block.output_start for block in blocks) <= 24 * rate
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("rate", [16000, 44100])

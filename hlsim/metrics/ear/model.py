@@ -243,7 +243,8 @@ def _apply_gammatones(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tenso
     """Filter signals by gammatones, and return the real part and the power of the envelope.
 
     Args:
-        filters: Gammatones of all items or of each item.
+        filters: Gammatones of the channels, (channels,), or, for two or more items, of each item,
+            (items, channels).
         signal: Signals. Shape: (items, padded).
 
     Returns:

@@ -209,7 +209,7 @@ def _kernel_for(u: Tensor) -> Callable[..., Any] | None:
 
 @cache
 def _kernel() -> Callable[..., Any] | None:
-    """Return the selective scan of ``mamba_ssm``, or None if it or its kernel is not installed."""
+    """Return the selective scan of ``mamba_ssm``, or None if it cannot be imported."""
     try:
         from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
     except Exception:  # because a build for another torch or GPU may raise anything
