@@ -92,7 +92,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     ...     Path(folder, "1.wav").touch()
     ...     _ = Path(folder, "manifest.csv").write_text("path,speaker\\n1.wav,ann\\n")
     ...     read_manifest(f"{folder}/manifest.csv")
-    [Utterance(path='1.wav', noisy='', speaker='ann', split='train')]
+    [Utterance(path='1.wav', noisy='', speaker='ann', split='train', reference='')]
     """
     folder = Path(path).parent if root is None else Path(root)
     rows = read_table(path, "the manifest", COLUMNS)
