@@ -132,6 +132,12 @@ class SceneClips(Clips):
     Raises:
         ValueError: There are no scenes, the first one is not valid, or another one has another
             number of ears.
+
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> scene = SceneFiles(EXAMPLE_FILE, (EXAMPLE_FILE,), references=(1,))
+    >>> clips = SceneClips([scene], sample_rate=16000, seconds=0.5)
+    >>> clips.ears, clips.microphones
+    (1, 1)
     """
 
     def __init__(self, scenes: Sequence[SceneFiles], **settings: Any) -> None:
