@@ -174,6 +174,15 @@ def draw_scene_items(
 
     Raises:
         ValueError: A number is out of range, or a file cannot be used.
+
+    >>> from hlsim.data.bundled import EXAMPLE_FILE
+    >>> from hlsim.data.recorded_scenes import SceneFiles
+    >>> files = SceneFiles(EXAMPLE_FILE, (EXAMPLE_FILE,), references=(1,))
+    >>> scenes = SceneClips([files], sample_rate=16000, seconds=1.0)
+    >>> settings = {"items": 1, "seconds": 1.0, "seed": 0}
+    >>> (item,) = draw_scene_items(scenes, read_ears(None), **settings)
+    >>> item.clean.shape, item.signal.shape
+    (torch.Size([16000]), torch.Size([1, 1, 16000]))
     """
     check_number("items", items, 1)
     check_number("seconds", seconds, 0.02)
