@@ -41,7 +41,7 @@ SPEECH = (
     "train/flite-awb-01",
 )
 
-WINDOW_SAMPLES = 20_000
+WINDOW_SAMPLES = 40_960
 """Samples of a window of the simulator, as in docs/listen/windows.js."""
 
 SERVE = (

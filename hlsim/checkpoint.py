@@ -99,7 +99,7 @@ def read_checkpoint(
     >>> from hlsim.neuro import NeuroConfig, NeuroMSBG
     >>> kinds = {SIMULATOR: NeuroConfig.from_dict}
     >>> read_checkpoint("neuro-msbg", kinds, NeuroMSBG).config.blocks
-    2
+    1
     """
     folder = _find_folder(name)
     record = read_record(folder)

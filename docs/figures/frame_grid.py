@@ -5,7 +5,7 @@
 MSBG smears frames of 5.8 ms, one every 1.45 ms. For a signal that is shifted by less than a hop,
 the frames begin elsewhere in the speech, and the output differs. The script prints the median SNR
 of the shifted output against the output as it is, by degree of loss, and that of `neuro-msbg`,
-whose frames are one every 1.5 ms and so begin anywhere in MSBG's.
+whose frames are MSBG's.
 """
 
 import sys

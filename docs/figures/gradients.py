@@ -5,7 +5,7 @@
 It prints the cosine between the gradients of ``HearingLossLoss`` with respect to the output of an
 aid, through a network and through the exact MSBG, as the median over the items. The last row
 compares the exact MSBG with itself, for the same signals shifted by half a hop of its frames (0.7
-ms). A simulator that does not know where these frames begin can hardly be closer.
+ms). A simulator on other frames can hardly be closer.
 """
 
 import sys

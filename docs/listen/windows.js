@@ -1,9 +1,9 @@
 // The windows in which the simulator processes a signal, as in the guide "ONNX and other runtimes".
 
 export const SAMPLE_RATE = 16000;
-export const WINDOW = 20000; // samples that the exported simulator takes
-const STEP = 48; // windows start on multiples of it
-const CONTEXT = 1984; // samples on either side that the network needs
+export const WINDOW = 40960; // samples that the exported simulator takes
+const STEP = 20480; // windows start on multiples of it
+const CONTEXT = 3500; // samples on either side that the network needs
 const HOP = Math.floor((WINDOW - 2 * CONTEXT) / STEP) * STEP;
 
 // Length of a signal and the silence after it: the context that its end needs, and as much more as lets the last window

@@ -28,7 +28,7 @@ def live(parser: Parser) -> None:
     option("--compensator", str, text, "hearing-aid", group=models)
     text = (
         "simulate the hearing loss with neuro-msbg instead, in blocks of 36 ms and with a "
-        "delay of 126 ms"
+        "delay of 219 ms"
     )
     parser.flag("--simulate", text, group=models)
     parser.sliders()

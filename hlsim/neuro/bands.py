@@ -12,7 +12,8 @@ from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.neuro.config import NeuroConfig
-from hlsim.neuro.prior import CHANNELS, Prior
+from hlsim.neuro.prior import CHANNELS, BandGains
+from hlsim.neuro.smearing import Planes, power, smear_and_amplify
 
 MAX_SLOPE = 6.0
 """Limit of the difference between the natural logarithms of envelopes of neighbouring channels."""
@@ -25,7 +26,7 @@ class BandCorrection(nn.Module):
     of the network are the fluctuation of each channel's log level about its log envelope (the
     smoothed level), and the difference between the log envelopes of neighbouring channels. Neither
     changes with the level of the signal. The network predicts a correction of each channel's
-    envelope, a factor for its gain, and a phase shift.
+    envelope, and a factor for its gain.
 
     The degrees of hearing loss, or severities, have different filter banks in MSBG. Each severity
     has its own weights. Before training the last layer is 0, and the gains are those of the prior.
@@ -35,14 +36,15 @@ class BandCorrection(nn.Module):
             ``blocks``, the number of its blocks; ``stride[0]``, the number of frames per step;
             ``kernel[0]``, the length of the convolutions in steps; and ``expansion``.
 
-    >>> import torch
     >>> from hlsim.audiogram import severity_index
     >>> config = NeuroConfig(channels=8)
     >>> network = BandCorrection(config)
-    >>> spectrum = torch.randn(2, 50, 65, dtype=torch.complex64)
+    >>> spectrum = torch.randn(2, 50, 97), torch.randn(2, 50, 97)
     >>> ears = torch.full((2, 8), 40.0)
-    >>> network(spectrum, ears, severity_index(ears), Prior(config.stft)).shape
-    torch.Size([2, 50, 65])
+    >>> gains = BandGains(config.stft, rate=16537.5)
+    >>> real, imaginary = network(spectrum, ears, severity_index(ears), gains)
+    >>> real.shape
+    torch.Size([2, 50, 97])
     """
 
     def __init__(self, config: NeuroConfig) -> None:
@@ -56,21 +58,22 @@ class BandCorrection(nn.Module):
         )
         self.bias = nn.Parameter(torch.zeros(severities, width, 1))
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.blocks))
-        self.leave = nn.Parameter(torch.zeros(severities, 3 * CHANNELS, width))
+        self.leave = nn.Parameter(torch.zeros(severities, 2 * CHANNELS, width))
 
-    def forward(self, spectrum: Tensor, ears: Tensor, severity: Tensor, prior: Prior) -> Tensor:
+    def forward(self, spectrum: Planes, ears: Tensor, severity: Tensor, prior: BandGains) -> Planes:
         """Compute the spectrogram that ears perceive.
 
-        Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
-            frequencies).
+        Shape: (items, frames, frequencies) twice, (items, 8), (items,) -> (items, frames,
+            frequencies) twice.
 
         Args:
-            spectrum: Spectrogram of the output of ``prior.filter``.
+            spectrum: Real and imaginary parts of the spectra of MSBG's frames, see
+                ``hlsim.neuro.frame_grid``.
             ears: Thresholds in dB HL.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
             prior: Estimate of MSBG's gains.
         """
-        smeared, smeared_power = prior.smear(spectrum, severity)
+        smeared_power = prior.smear_powers(power(*spectrum), severity)
         levels = prior.channel_levels(smeared_power, severity)
         log_envelope = prior.smooth(levels, severity, self.step).log()
         features = self._features(levels.log(), log_envelope)
@@ -80,14 +83,13 @@ class BandCorrection(nn.Module):
             features = block(features, severity)
 
         outputs = self.leave[severity] @ features
-        envelope_correction, gain_correction, phase = outputs.split(CHANNELS, 1)
+        envelope_correction, gain_correction = outputs.split(CHANNELS, 1)
         log_gain = prior.log_gain(log_envelope + envelope_correction, ears, severity)
-        gain = (log_gain + gain_correction).exp()
-        gains = torch.cat((gain * phase.cos(), gain * phase.sin()), 1)
-        factors = prior.gains_to_factors(gains, severity)
-        frames = smeared.shape[1]
-        factors = _interpolate_steps(factors, self.step)[:, :frames]
-        return smeared * torch.view_as_complex(factors)
+        gains = (log_gain + gain_correction).exp()
+        # The last gains remain after the first frame of the last step.
+        gains = torch.cat((gains, gains[..., -1:]), -1).mT.contiguous()
+        matrices = prior.factor_matrices(severity)
+        return smear_and_amplify(spectrum, smeared_power, gains, matrices, self.step)
 
     def _features(self, log_levels: Tensor, log_envelope: Tensor) -> Tensor:
         """Compute the input of the network: fluctuations, and differences of log envelopes.
@@ -105,7 +107,8 @@ class BandCorrection(nn.Module):
         if missing_frames:
             log_levels = functional.pad(log_levels, (0, missing_frames), mode="replicate")
         frames = log_levels.unflatten(-1, (-1, self.step)).unbind(-1)
-        slope = functional.pad(log_envelope.diff(dim=1), (0, 0, 0, 1)).clamp(-MAX_SLOPE, MAX_SLOPE)
+        slope = functional.pad(log_envelope.diff(dim=1), (0, 0, 0, 1))
+        slope = functional.hardtanh(slope, -MAX_SLOPE, MAX_SLOPE)
         fluctuations = [frame - log_envelope for frame in frames]
         return torch.cat([*fluctuations, slope], 1)
 
@@ -148,19 +151,3 @@ class _Block(nn.Module):
         features = features + functional.silu(smoothed.reshape(features.shape))
         hidden = functional.silu(self.widen[severity] @ features + self.bias[severity])
         return features + self.narrow[severity] @ hidden
-
-
-def _interpolate_steps(values: Tensor, step: int) -> Tensor:
-    """Interpolate values at the first frame of each step linearly to all frames.
-
-    After the first frame of the last step, values are constant.
-
-    Shape: (items, steps, ...) -> (items, steps * step, ...).
-
-    Args:
-        values: One value per step, of any kind.
-        step: Number of frames per step.
-    """
-    following = torch.cat((values[:, 1:], values[:, -1:]), 1)
-    interpolated = [values.lerp(following, frame / step) for frame in range(1, step)]
-    return torch.stack([values, *interpolated], 2).flatten(1, 2)

@@ -183,12 +183,13 @@ class NeuroConfig(NetworkConfig):
     24
     """
 
-    fft: int = 128
+    fft: int = 192
     window: int = 96
     hop: int = 24
     channels: int = 48
     stride: tuple[int, int] = (2, 1)
-    kernel: tuple[int, int] = (7, 1)
+    blocks: int = 1
+    kernel: tuple[int, int] = (13, 1)
     structure: Structure = "bands"
     audiogram: AudiogramInput = "channel"
     phase: Phase = "predicted"
@@ -203,6 +204,13 @@ class NeuroConfig(NetworkConfig):
                 "expected structure='dual-path' or 'monolithic', or block='cnn', "
                 "phase='predicted', prior=True and level_aware=True with structure='bands', "
                 f"got {self}"
+            )
+        frames = self.fft, self.window, self.hop
+        if self.structure == "bands" and frames != (192, 96, 24):
+            raise ValueError(
+                "expected fft=192, window=96 and hop=24 with structure='bands', which works on "
+                f"MSBG's frames, got fft={self.fft}, window={self.window}, hop={self.hop}; leave "
+                "these settings out, and train the network of an older checkpoint again"
             )
 
     @property

@@ -25,8 +25,17 @@ from hlsim.neuro.encoder import (
     sine_of_phase,
 )
 from hlsim.neuro.family.frames import FrameEncoder
+from hlsim.neuro.frame_grid import (
+    FILTERS_FIELD,
+    FRAME_PERIOD,
+    FRAME_RATE,
+    analyse_frames,
+    from_frame_rate,
+    synthesise_frames,
+    to_frame_rate,
+)
 from hlsim.neuro.network import EarNetwork
-from hlsim.neuro.prior import Prior
+from hlsim.neuro.prior import BandGains, Prior
 from hlsim.torchtools import built_in_float32
 
 POWER_FLOOR = 1e-11
@@ -111,9 +120,13 @@ class NeuroMSBG(EarNetwork, HubModel):
         self.stft = config.stft
         # Training may run the network in bfloat16, but not the prior and the transforms.
         self.autocast_dtype: torch.dtype | None = None
-        self.prior = Prior(self.stft, compute_prior) if config.prior else None
+        self.prior = self._build_prior(compute_prior)
         if self.prior is not None:
             self._additional_field = self.prior.receptive_field
+
+    def _build_prior(self, compute: bool) -> BandGains | None:
+        """Build the estimate of MSBG's gains, with its constants if ``compute`` is True."""
+        return Prior(self.stft, compute) if self.config.prior else None
 
 
 class BandNeuroMSBG(NeuroMSBG):
@@ -127,18 +140,29 @@ class BandNeuroMSBG(NeuroMSBG):
     torch.Size([1600])
     """
 
-    prior: Prior
+    prior: BandGains
 
     @built_in_float32
     def __init__(self, config: NeuroConfig | None = None, **options: Any) -> None:
         super().__init__(config, **options)
         self.bands = BandCorrection(self.config)
+        self._additional_field += FILTERS_FIELD
+
+    @property
+    def receptive_field(self) -> tuple[int, int] | None:
+        field = super().receptive_field
+        return field and (FRAME_PERIOD, field[1])
+
+    def _build_prior(self, compute: bool) -> BandGains:
+        return BandGains(self.stft, FRAME_RATE, compute)
 
     def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
         severity = severity_index(ears)
-        spectrum = self.stft.analyse(self.prior.filter(signals, severity))
-        output_spectrum = self.bands(spectrum, ears, severity, self.prior)
-        return self.stft.synthesise(output_spectrum, signals.shape[-1])
+        cochlear = to_frame_rate(signals)
+        spectrum = analyse_frames(cochlear)
+        real, imaginary = self.bands(spectrum, ears, severity, self.prior)
+        perceived = synthesise_frames(real, imaginary, cochlear.shape[-1])
+        return from_frame_rate(perceived, severity, signals.shape[-1])
 
 
 class DualPathNeuroMSBG(NeuroMSBG):
@@ -152,6 +176,8 @@ class DualPathNeuroMSBG(NeuroMSBG):
     >>> DualPathNeuroMSBG(config)(torch.randn(1600), "N3").shape
     torch.Size([1600])
     """
+
+    prior: Prior | None
 
     @built_in_float32
     def __init__(self, config: NeuroConfig | None = None, **options: Any) -> None:

@@ -1,7 +1,7 @@
 """The prior: an estimate of what MSBG does to a spectrogram, by MSBG's own formulae.
 
-A network that starts from it has to learn corrections only. The steps are those of MSBG, on frames
-of 8 ms instead of single samples:
+A network that starts from it has to learn corrections only. The steps are those of MSBG, on short
+frames instead of single samples:
 
 1. ``filter`` applies to the waveform the fixed filter that MSBG is for a normal ear.
 2. *Smearing* spreads the power of each frame over neighbouring frequencies, as the broad filters of
@@ -35,8 +35,13 @@ from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filter_bank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
-from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
-from hlsim.neuro.smearing import SmoothSmearing
+from hlsim.msbg.smearing import (
+    BROADENING,
+    FFT,
+    roex_filters,
+    smearing_from_filters,
+    smearing_matrix,
+)
 from hlsim.torchtools import constant
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
@@ -74,34 +79,29 @@ _GRID_RATIO = 160
 """
 
 
-class Prior(nn.Module):
-    """An estimate of the complex factors by which MSBG multiplies a spectrogram.
+class BandGains(nn.Module):
+    """An estimate of MSBG's smearing and of its gains, on a spectrogram of sound in the cochlea.
 
-    The constants of MSBG's formulae are computed for each severity. Those of channels, envelopes
-    and smearing have a trainable correction, which has no effect before training; the two fixed
-    filters have none. The class estimates the factor itself (``forward``), and offers the steps to
-    a network that corrects them (``smear`` to ``gains_to_factors``).
+    The constants of MSBG's formulae are computed for each severity. Each has a trainable
+    correction, which has no effect before training.
 
     Args:
-        stft: Transform at 16 kHz whose window is about as short as MSBG's smearing frame, 5.8 ms.
+        stft: Transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
+        rate: Sample rate in Hz of the signals that are transformed.
         compute: Compute the constants. With False, they are undefined until a state dict is loaded.
 
     Attributes:
-        receptive_field: Number of input samples at 16 kHz before and after an output sample that
-            influence it, in addition to those of the transform.
+        receptive_field: Number of input samples before and after an output sample that influence
+            it, in addition to those of the transform.
 
-    >>> stft = STFT(128, 128, 32)
-    >>> factor = Prior(stft)(torch.ones(1, 50, 65), torch.full((1, 8), 40.0), torch.tensor([2]))
-    >>> factor.shape
-    torch.Size([1, 50, 65])
+    >>> gains = BandGains(STFT(192, 96, 24), rate=16537.5)
+    >>> gains.channel_levels(torch.ones(1, 50, 97), torch.tensor([2])).shape
+    torch.Size([1, 36, 50])
     """
 
-    response: Tensor
-    ear_power: Tensor
-
-    def __init__(self, stft: STFT, compute: bool = True) -> None:
+    def __init__(self, stft: STFT, rate: float, compute: bool = True) -> None:
         super().__init__()
-        self.receptive_field = RESPONSE_HALF_LENGTH + _ENVELOPE_HALF_LENGTH * stft.hop
+        self.receptive_field = _ENVELOPE_HALF_LENGTH * stft.hop
         severities = len(SEVERITIES)
         frequencies = stft.frequencies
         shapes = {
@@ -110,8 +110,6 @@ class Prior(nn.Module):
             "smoothing": (severities, CHANNELS, 2 * _ENVELOPE_HALF_LENGTH + 1),
             "smearing": (severities - 1, frequencies, frequencies),
         }
-        self._add_buffer("ear_power", (frequencies,))
-        self._add_buffer("response", (severities, 2 * RESPONSE_HALF_LENGTH))
         for name, shape in shapes.items():
             # A formula gives the known values. The correction, which is trained, starts at 0 and is
             # relative to them, because the spectrum of speech spans 60 dB: a small absolute change
@@ -119,9 +117,8 @@ class Prior(nn.Module):
             self._add_buffer(f"{name}_known", shape)
             self.register_parameter(f"{name}_learned", nn.Parameter(torch.zeros(shape)))
         if compute:
-            for name, values in _msbg_constants(stft).items():
-                buffer = self.get_buffer(f"{name}_known" if name in shapes else name)
-                buffer.copy_(torch.from_numpy(values))
+            for name, values in _msbg_constants(stft, rate).items():
+                self.get_buffer(f"{name}_known").copy_(torch.from_numpy(values))
 
     def _add_buffer(self, name: str, shape: tuple[int, ...]) -> None:
         """Register an uninitialised float32 buffer."""
@@ -146,6 +143,131 @@ class Prior(nn.Module):
         real = known[0] * learned[0] - known[1] * learned[1]
         imaginary = known[0] * learned[1] + known[1] * learned[0]
         return known + torch.stack((real, imaginary))
+
+    def smear_powers(self, powers: Tensor, severity: Tensor) -> Tensor:
+        """Spread the power of each frame over neighbouring frequencies.
+
+        Shape: (items, frames, frequencies), (items,) -> (items, frames, frequencies).
+
+        Args:
+            powers: Power at each point of a spectrogram in Pa^2.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
+
+        Returns:
+            Smeared powers in Pa^2, which may be negative.
+        """
+        return powers @ self.smearing()[severity].mT
+
+    def smearing(self) -> Tensor:
+        """Return the matrices that smear power spectra, with their learned correction.
+
+        Returns:
+            Matrices, (severities, frequencies, frequencies). The first one, for ears without a
+            loss, is the identity.
+        """
+        smearing = self._corrected("smearing")
+        identity = torch.eye(smearing.shape[-1], dtype=smearing.dtype, device=smearing.device)
+        return torch.cat((identity.unsqueeze(0), smearing))
+
+    def excitation(self) -> Tensor:
+        """Return the weights of the powers at each frequency in the power of each channel.
+
+        Returns:
+            Weights, (severities, channels, frequencies).
+        """
+        return self._corrected("excitation")
+
+    def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
+        """Compute the RMS pressure of each channel of MSBG's filter bank in each frame.
+
+        Shape: (items, frames, frequencies), (items,) -> (items, channels, frames) in Pa.
+
+        Args:
+            smeared_powers: Power in Pa^2 at each point of a spectrogram, spread over neighbouring
+                frequencies as ``smear`` does. Negative values are treated as 0.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
+        """
+        # Unlike relu, threshold stores nothing for its gradient that is not stored anyway. The
+        # gradient of clamp_min takes as long as ten multiplications.
+        positive_powers = functional.threshold(smeared_powers, 0.0, 0.0)
+        channel_powers = positive_powers @ self.excitation()[severity].mT
+        return (channel_powers + POWER_FLOOR).sqrt().mT
+
+    def smooth(self, levels: Tensor, severity: Tensor, step: int = 1) -> Tensor:
+        """Smooth the levels of channels over time to their envelopes in Pa, 1e-7 or more.
+
+        Shape: (items, channels, frames), (items,) -> (items, channels, ceil(frames / step)).
+
+        Args:
+            levels: Level of each channel in Pa.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the filters.
+            step: Number of frames from one value of an envelope to the next.
+        """
+        items, channels, _ = levels.shape
+        kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
+        margin = (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH)
+        padded = functional.pad(levels, margin, mode="replicate")
+        rows = padded.reshape(1, items * channels, -1)
+        envelopes = functional.conv1d(rows, kernels, stride=step, groups=items * channels)
+        envelopes = envelopes.reshape(items, channels, -1)
+        return functional.threshold(envelopes, MIN_ENVELOPE, MIN_ENVELOPE)
+
+    def log_gain(self, log_envelope: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
+        """Compute the gain that simulates recruitment in each channel, as a natural logarithm.
+
+        Shape: (items, channels, steps), (items, 8), (items,) -> (items, channels, steps).
+
+        Args:
+            log_envelope: Natural logarithm of the envelopes in Pa.
+            thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
+        """
+        weights = _threshold_weights(like=thresholds)[severity]
+        exponents = (1.0 - expansion_ratios(thresholds, weights)).unsqueeze(-1)
+        return functional.relu(_LOG_CATCH_UP - log_envelope) * exponents
+
+    def factor_matrices(self, severity: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the matrices from gains of the channels to factors on the smeared spectrogram.
+
+        A row of gains times the first matrix is the real part of the factor at each frequency. The
+        second matrix is that of the imaginary part.
+
+        Shape: (items,) -> (items, channels, frequencies) twice.
+
+        Args:
+            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
+        """
+        real, imaginary = self._corrected("relative")[:, severity]
+        return real, imaginary
+
+
+class Prior(BandGains):
+    """An estimate of the complex factors by which MSBG multiplies a spectrogram at 16 kHz.
+
+    The fixed filters are applied to the waveform first (``filter``), so that smearing and channels
+    take the outer and middle ear into account at each frequency.
+
+    Args:
+        stft: Transform at 16 kHz whose window is about as short as MSBG's smearing frame, 5.8 ms.
+        compute: Compute the constants. With False, they are undefined until a state dict is loaded.
+
+    >>> stft = STFT(128, 128, 32)
+    >>> factor = Prior(stft)(torch.ones(1, 50, 65), torch.full((1, 8), 40.0), torch.tensor([2]))
+    >>> factor.shape
+    torch.Size([1, 50, 65])
+    """
+
+    response: Tensor
+    ear_power: Tensor
+
+    def __init__(self, stft: STFT, compute: bool = True) -> None:
+        super().__init__(stft, NEURO_RATE, compute)
+        self.receptive_field += RESPONSE_HALF_LENGTH
+        self._add_buffer("ear_power", (stft.frequencies,))
+        self._add_buffer("response", (len(SEVERITIES), 2 * RESPONSE_HALF_LENGTH))
+        if compute:
+            for name, values in _ear_constants(stft).items():
+                self.get_buffer(name).copy_(torch.from_numpy(values))
 
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
         """Filter waveforms as MSBG does where the gain of all its channels is 1.
@@ -173,7 +295,7 @@ class Prior(nn.Module):
             thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
         """
-        smeared_powers = powers @ self._smearing()[severity].mT
+        smeared_powers = self.smear_powers(powers, severity)
         levels = self.channel_levels(smeared_powers, severity)
         log_envelope = self.smooth(levels, severity).log()
         gain = self.log_gain(log_envelope, thresholds, severity).exp().mT
@@ -181,102 +303,13 @@ class Prior(nn.Module):
         factor = torch.complex(gain @ real, gain @ imaginary)
         return factor * _smearing_factor(smeared_powers, powers)
 
-    def smear(self, spectrum: Tensor, severity: Tensor) -> tuple[Tensor, Tensor]:
-        """Spread the power of each frame over neighbouring frequencies, and keep the phase.
+    def smearing(self) -> Tensor:
+        # MSBG smears behind the outer and the middle ear, so the matrices apply the power response
+        # of these filters, smear, and undo the response.
+        return super().smearing() * (self.ear_power / self.ear_power.unsqueeze(-1))
 
-        Shape: complex (items, frames, frequencies), (items,) -> complex (items, frames,
-            frequencies), (items, frames, frequencies).
-
-        Args:
-            spectrum: Spectrogram of the output of ``filter``.
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
-
-        Returns:
-            The smeared spectrogram and its power in Pa^2, which may be negative.
-        """
-        smeared, smeared_power, *_ = SmoothSmearing.apply(spectrum, self._smearing()[severity])
-        return smeared, smeared_power
-
-    def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
-        """Compute the RMS pressure of each channel of MSBG's filter bank in each frame.
-
-        Shape: (items, frames, frequencies), (items,) -> (items, channels, frames) in Pa.
-
-        Args:
-            smeared_powers: Power in Pa^2 at each point of a spectrogram, spread over neighbouring
-                frequencies as ``smear`` does. Negative values are treated as 0.
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
-        """
-        excitation = self._corrected("excitation") * self.ear_power
-        channel_powers = smeared_powers.relu() @ excitation[severity].mT
-        return (channel_powers + POWER_FLOOR).sqrt().mT
-
-    def smooth(self, levels: Tensor, severity: Tensor, step: int = 1) -> Tensor:
-        """Smooth the levels of channels over time to their envelopes in Pa, 1e-7 or more.
-
-        Shape: (items, channels, frames), (items,) -> (items, channels, ceil(frames / step)).
-
-        Args:
-            levels: Level of each channel in Pa.
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the filters.
-            step: Number of frames from one value of an envelope to the next.
-        """
-        items, channels, _ = levels.shape
-        kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
-        margin = (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH)
-        padded = functional.pad(levels, margin, mode="replicate")
-        rows = padded.reshape(1, items * channels, -1)
-        envelopes = functional.conv1d(rows, kernels, stride=step, groups=items * channels)
-        return envelopes.reshape(items, channels, -1).clamp_min(MIN_ENVELOPE)
-
-    def log_gain(self, log_envelope: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Compute the gain that simulates recruitment in each channel, as a natural logarithm.
-
-        Shape: (items, channels, steps), (items, 8), (items,) -> (items, channels, steps).
-
-        Args:
-            log_envelope: Natural logarithm of the envelopes in Pa.
-            thresholds: Audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
-        """
-        weights = _threshold_weights(like=thresholds)[severity]
-        exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
-        return (log_envelope - _LOG_CATCH_UP).clamp_max(0.0) * exponents
-
-    def gains_to_factors(self, gains: Tensor, severity: Tensor) -> Tensor:
-        """Convert gains of the channels to factors on the smeared spectrogram.
-
-        Shape: (items, 2 * channels, steps), (items,) -> (items, steps, frequencies, 2).
-
-        Args:
-            gains: Complex gains: the real parts of all channels, followed by the imaginary parts.
-            severity: Degree of loss of each ear, 0 (none) to 3 (severe).
-
-        Returns:
-            Real and imaginary part of the factor at each frequency.
-        """
-        real, imaginary = self._corrected("relative")[:, severity]
-        # One matrix product computes real and imaginary parts, which alternate in its columns.
-        for_real_gains = torch.stack((real, imaginary), -1)
-        for_imaginary_gains = torch.stack((-imaginary, real), -1)
-        matrix = torch.cat((for_real_gains, for_imaginary_gains), 1).flatten(-2)
-        return (gains.mT @ matrix).unflatten(-1, (-1, 2))
-
-    def _smearing(self) -> Tensor:
-        """Return the matrices that smear the power spectra of sounds in front of the ear.
-
-        MSBG smears behind the outer and the middle ear, so the matrices apply the power response of
-        these filters, smear, and undo the response. The smearing has its learned correction,
-        through which gradients pass.
-
-        Returns:
-            Matrices, (severities, frequencies, frequencies). The first one, for ears without a
-            loss, is the identity.
-        """
-        ear_ratio = self.ear_power / self.ear_power.unsqueeze(-1)
-        smearing = self._corrected("smearing") * ear_ratio
-        identity = torch.eye(smearing.shape[-1], dtype=smearing.dtype, device=smearing.device)
-        return torch.cat((identity.unsqueeze(0), smearing))
+    def excitation(self) -> Tensor:
+        return super().excitation() * self.ear_power
 
 
 def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
@@ -296,58 +329,64 @@ def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _msbg_constants(stft: STFT) -> dict[str, NDArray[np.float64]]:
-    """Compute the constants of the prior at the frequencies of a transform, by name.
+def _msbg_constants(stft: STFT, rate: float) -> dict[str, NDArray[np.float64]]:
+    """Compute the constants of MSBG's formulae at the frequencies of a transform, by name.
 
     The computation takes most of the time in which a network is built. The constants are stored,
     because they are the same for all networks with this transform. Their shapes are those of the
-    buffers of ``Prior``.
+    buffers of ``BandGains``.
     """
-    points = _GRID_RATIO * stft.fft
-    model_points = points * 441 // 160
-    coarse = slice(None, points // 2 + 1, _GRID_RATIO)
-    banks = [BANKS[severity] for severity in SEVERITIES]
-    ear_response = np.fft.rfft(ear_filter(), model_points)[coarse]
-    response_points = _GRID_RATIO * 160
-    responses = np.stack([fixed_response(bank, NEURO_RATE, response_points) for bank in banks])
-
+    grid_ratio = _GRID_RATIO if rate == NEURO_RATE else 3
+    points = grid_ratio * stft.fft
+    model_points = round(points * MSBG_RATE / rate)
     excitation = []
     relative = []
     smoothing = []
-    for severity, bank in zip(SEVERITIES, banks, strict=True):
+    for severity in SEVERITIES:
+        bank = BANKS[severity]
         fine_channels = gammatone_response(bank, model_points, bins=points // 2 + 1)
-        channels = fine_channels[:, coarse]
+        channels = fine_channels[:, ::grid_ratio]
         # The power of a tone in a windowed frame, times this factor, is the square of the mean of
         # the rectified tone.
         scale = 32.0 / (3.0 * stft.window * stft.fft) * (2.0 / math.pi) ** 2
         scale *= 10.0 ** (-_FLUCTUATION_DB[severity] / 10.0)
         excitation.append(_pad_channels(np.abs(channels) ** 2 * scale))
         relative.append(_pad_channels(channels / channels.sum(0)))
-        smoothing.append(_pad_channels(_smoothing_kernels(bank, stft.hop)))
+        smoothing.append(_pad_channels(_smoothing_kernels(bank, rate / stft.hop)))
     factors = np.stack(relative)
     return {
-        "ear_power": np.abs(ear_response) ** 2,
-        "response": impulse_responses(responses, response_points, NEURO_RATE),
         "excitation": np.stack(excitation),
         "relative": np.stack((factors.real, factors.imag)),
         "smoothing": np.stack(smoothing),
-        "smearing": np.stack([_smearing_matrix(severity, stft) for severity in SEVERITIES[1:]]),
+        "smearing": np.stack([_smearing_matrix(name, stft, rate) for name in SEVERITIES[1:]]),
     }
 
 
-def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
+@lru_cache(maxsize=8)
+def _ear_constants(stft: STFT) -> dict[str, NDArray[np.float64]]:
+    """Compute the constants of ``Prior`` alone, by name: those of the fixed filters."""
+    ear_response = np.fft.rfft(ear_filter(), _GRID_RATIO * stft.fft * 441 // 160)
+    points = _GRID_RATIO * 160
+    responses = [fixed_response(BANKS[name], NEURO_RATE, points) for name in SEVERITIES]
+    return {
+        "ear_power": np.abs(ear_response[: _GRID_RATIO * stft.fft // 2 + 1 : _GRID_RATIO]) ** 2,
+        "response": impulse_responses(np.stack(responses), points, NEURO_RATE),
+    }
+
+
+def _smoothing_kernels(bank: FilterBank, frame_rate: float) -> NDArray[np.float64]:
     """Compute the impulse responses of the envelopes' low-passes, without delay, at the frame rate.
 
     Args:
         bank: Filter bank of a severity.
-        hop: Samples at 16 kHz from one frame to the next.
+        frame_rate: Number of frames per second.
 
     Returns:
         Kernels, (channels, 41), each with a sum of 1.
     """
     points = 4096
     length = 2 * _ENVELOPE_HALF_LENGTH + 1
-    omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / MSBG_RATE
+    omega = 2.0 * np.pi * np.fft.rfftfreq(points) * frame_rate / MSBG_RATE
     delay = np.exp(-1j * omega)
     kernels = []
     for numerator, denominator in envelope_filters(bank):
@@ -358,22 +397,27 @@ def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
     return np.array(kernels)
 
 
-def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
+def _smearing_matrix(severity: str, stft: STFT, rate: float) -> NDArray[np.float64]:
     """Compute MSBG's smearing matrix at the frequencies of a transform.
 
     Args:
         severity: ``"mild"``, ``"moderate"`` or ``"severe"``.
-        stft: Transform at 16 kHz.
+        stft: Transform at ``rate``.
+        rate: Sample rate in Hz.
 
     Returns:
         Matrix for power spectra behind the middle ear, (frequencies, frequencies).
     """
-    spacing = NEURO_RATE / stft.fft
-    # As MSBG's, the filters cover more than the frequencies of the transform, up to about 20 kHz.
-    count = round(20000.0 / spacing / 4.0) * 4
-    normal = roex_filters(1.0, 1.0, count, spacing)
-    wide = roex_filters(*BROADENING[severity], count, spacing)
-    matrix = smearing_from_filters(normal, wide)
+    spacing = rate / stft.fft
+    if spacing == MSBG_RATE / FFT:
+        matrix = smearing_matrix(severity)
+    else:
+        # As MSBG's, the filters cover more than the frequencies of the transform, up to about 20
+        # kHz.
+        count = round(20000.0 / spacing / 4.0) * 4
+        normal = roex_filters(1.0, 1.0, count, spacing)
+        wide = roex_filters(*BROADENING[severity], count, spacing)
+        matrix = smearing_from_filters(normal, wide)
     return matrix[: stft.frequencies, : stft.frequencies]
 
 

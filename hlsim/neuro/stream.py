@@ -40,16 +40,21 @@ class SimulatedStream:
     """
 
     def __init__(self, simulator: nn.Module, audiogram: Audiogram | Listener) -> None:
-        field = simulator.receptive_field if isinstance(simulator, NeuroMSBG) else None
-        if field is None or simulator.sample_rate != NEURO_RATE:
+        network = simulator if isinstance(simulator, NeuroMSBG) else None
+        field = network.receptive_field if network is not None else None
+        if network is None or field is None or network.sample_rate != NEURO_RATE:
             raise ValueError(
                 f"expected a Neuro-MSBG at {NEURO_RATE} Hz with a finite receptive field, such "
                 "as neuro-msbg"
             )
-        self._simulator = simulator
+        self._simulator = network
         self._audiogram = audiogram
-        self.block, look_ahead = field
+        self.block = network.config.step
+        self._period, look_ahead = field
         self.latency = math.ceil(look_ahead / self.block) * self.block
+        # The frames of a window lie where those of the whole signal do if it begins a whole number
+        # of periods before or after the signal.
+        self._lead = math.ceil(2 * self.latency / self._period) * self._period
         self._past: Tensor | None = None
 
     def __call__(self, chunk: Audio) -> Audio:
@@ -74,7 +79,7 @@ class SimulatedStream:
                 f"expected a chunk of a multiple of {self.block} samples, got {samples} samples"
             )
         if self._past is None:
-            self._past = signals.new_zeros(*signals.shape[:-1], 2 * self.latency)
+            self._past = signals.new_zeros(*signals.shape[:-1], self._lead)
         past: Tensor = self._past
         if past.shape[:-1] != signals.shape[:-1]:
             raise ValueError(
@@ -82,7 +87,9 @@ class SimulatedStream:
                 f"{tuple(signals.shape)}; make a new stream for another signal"
             )
         window = torch.cat((past, signals), -1)
-        self._past = window[..., samples:]
+        superfluous_periods = (window.shape[-1] - 2 * self.latency) // self._period
+        self._past = window[..., superfluous_periods * self._period :]
         with torch.no_grad():
             perceived: Tensor = self._simulator(window, self._audiogram)
-        return as_type_of(chunk, perceived[..., self.latency : self.latency + samples])
+        stop = window.shape[-1] - self.latency
+        return as_type_of(chunk, perceived[..., stop - samples : stop])

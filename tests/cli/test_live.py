@@ -140,6 +140,8 @@ def test_each_ear_gets_the_signal_of_its_microphone_or_of_the_only_one(
     devices.played = devices.played[:0]
     assert main([*command, "--simulate"]) == 0
     simulated = SimulatedStream(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
+    for _ in range(20):  # before the devices open
+        simulated(torch.zeros(2, 576))
     perceived = torch.cat([simulated(chunk) for chunk in both.split(576, -1)], -1)
     assert perceived.any()
     assert_played(devices, perceived, 1e-4)

@@ -12,7 +12,7 @@ from tests.compensators.aids import EAR
 def test_simulated_blocks_equal_the_whole_signal() -> None:
     simulator = load_pretrained("neuro-msbg")
     stream, signal = SimulatedStream(simulator, EAR), 0.03 * torch.randn(24 * 1024)
-    assert (stream.latency, stream.block) == (2016, 48)
+    assert (stream.latency, stream.block) == (3504, 48)
     perceived = torch.cat([stream(chunk) for chunk in signal.split(1536)])
     whole = simulator(signal, EAR)
     middle = slice(stream.latency, -2 * stream.latency)  # the stream begins with silence
