@@ -120,11 +120,15 @@ def from_frame_rate(waveform: Tensor, severity: Tensor, length: int) -> Tensor:
     """
     units = _transform_units(length + _OUTWARD_FIELD)
     spectrum = rfft(_precise(waveform), units * _UNIT_AT_FRAME_RATE)
-    spectrum = spectrum * _outward_responses(units, like=spectrum)[severity]
+    # ONNX cannot index complex numbers.
+    responses = torch.view_as_real(_outward_responses(units, like=spectrum))[severity]
+    spectrum = spectrum * torch.view_as_complex(responses)
     # What lies above half of the new rate is mirrored.
     split = units * _UNIT // 2
-    image = functional.pad(spectrum[..., split:].flip(-1).conj(), (split - _IMAGE_BINS * units, 0))
-    converted = torch.fft.irfft(spectrum[..., : split + 1] + image, units * _UNIT)
+    start = split - _IMAGE_BINS * units
+    image = spectrum[..., split:].flip(-1).conj()
+    spectrum = torch.cat((spectrum[..., :start], spectrum[..., start : split + 1] + image), -1)
+    converted = torch.fft.irfft(spectrum, units * _UNIT)
     return converted[..., :length].to(waveform.dtype)
 
 
