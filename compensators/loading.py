@@ -1,5 +1,6 @@
 """Loading of compensators by name, and saving of trained ones in folders."""
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -129,8 +130,9 @@ def save_compensator(
     """Save a trained compensator as a folder, which ``load_compensator`` loads.
 
     A checkpoint that is already there is replaced. A card, README.md, is written too, unless the
-    folder has one that hlsim did not write. The sample rate and ``full_scale_spl`` are not saved;
-    pass them to ``load_compensator``.
+    folder has one that hlsim did not write. The sample rate, ``full_scale_spl``, ``limit_to_ear``
+    and ``loudness`` are not saved; pass them to ``load_compensator``. A loudness other than 0
+    causes a warning, because the loaded aid will be louder.
 
     Args:
         model: Compensator to save.
@@ -150,6 +152,12 @@ def save_compensator(
         raise ValueError(
             "expected a MappingCompensator, a HearingAid or a BeamformingAid to save, got "
             f"{type(model).__name__}"
+        )
+    amplifier = model.aid if isinstance(model, BeamformingAid) else model
+    if getattr(amplifier, "loudness", 0.0) != 0.0:
+        warnings.warn(
+            f"the loudness of {amplifier.loudness:g} dB is not saved; pass it to load_compensator",
+            stacklevel=2,
         )
     ear = None if audiogram is None else audiogram.to_dict()
     model.save_pretrained(folder, about={"audiogram": ear})

@@ -167,8 +167,9 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
     Raises:
         ValueError: There are no rows, a file is both clean and noisy, a noisy file or a clean file
             without a noisy one is listed twice, a clean file is in a folder of noises, mixtures or
-            impulse responses by its name, a file or a speaker is in two splits, or a reference is
-            not valid, lacks a noisy file, or is missing in some rows only.
+            impulse responses by its name, a file or a speaker is in two splits, a microphone is in
+            a row twice, or a reference is not valid, lacks a noisy file, or is missing in some rows
+            only.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):
@@ -190,6 +191,8 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         if file in listed:
             raise ValueError(f"{file} is listed twice; remove one of the rows")
         listed.add(file)
+        if len({*utterance.noisy_files}) < len(utterance.noisy_files):
+            raise ValueError(f"{utterance.noisy}: a microphone is listed twice; remove one of them")
         if clean.intersection(utterance.noisy_files):
             raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
         for folder in utterance.path.split("/")[:-1]:

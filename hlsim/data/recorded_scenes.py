@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +27,8 @@ class SceneFiles(NamedTuple):
     Attributes:
         clean: Clean speech, with one channel, or one for each ear.
         microphones: Files of the noisy speech, whose channels count from the first to the last.
-        references: Number of the reference channel, from 1, for one ear or for two.
+        references: Number of the reference channel, from 1, for one ear or for two. Empty for a
+            single microphone, whose file has one channel.
 
     >>> SceneFiles(Path("clean.wav"), (Path("noisy.wav"),), references=(1, 2)).references
     (1, 2)
@@ -40,7 +42,7 @@ class SceneFiles(NamedTuple):
     def from_utterance(cls, row: Utterance, folder: Path) -> SceneFiles:
         """Return the files of a row of a manifest, whose paths are relative to a folder.
 
-        A row without references is a scene with one microphone.
+        A row without references is a scene with a single microphone.
 
         Raises:
             ValueError: The row has no noisy speech.
@@ -50,7 +52,24 @@ class SceneFiles(NamedTuple):
                 f"{row.path}: expected a noisy version in the column 'noisy', got none; add it"
             )
         microphones = tuple(folder / file for file in row.noisy_files)
-        return cls(folder / row.path, microphones, row.references or (1,))
+        return cls(folder / row.path, microphones, row.references)
+
+    @property
+    def files(self) -> list[Path]:
+        """All files that are read, except for the clean speech."""
+        in_room = file_with_room(self.clean, self._reference_file)
+        return [*self.microphones, *([in_room] if in_room else [])]
+
+    @property
+    def ears(self) -> int:
+        """Number of ears."""
+        return len(self.references) or 1
+
+    @property
+    def _reference_file(self) -> Path:
+        """File of the reference channel if every file has one channel for each ear."""
+        number = (self.references[0] - 1) // self.ears if self.references else 0
+        return self.microphones[min(number, len(self.microphones) - 1)]
 
     def read(self) -> tuple[Tensor, Tensor, int]:
         """Read the signals, with the reference microphone first.
@@ -77,43 +96,56 @@ class SceneFiles(NamedTuple):
                 f"{self.clean}: expected the sample rate and the length of its noisy version, "
                 f"{self.microphones[0]}; replace the files"
             )
-        ears = len(self.references)
         clean, *noisy = (waveform[:, :time] for waveform in waveforms)
         channels = torch.cat(noisy)
-        if (
-            len(clean) not in (1, ears)
-            or len(channels) % ears
-            or len(channels) < self.references[-1]
-        ):
+        if not self.references and len(channels) > 1:
+            raise ValueError(
+                f"{self.microphones[0]}: expected one channel, got {len(channels)}; name the "
+                "reference in the column 'reference' of the manifest, or mix them to mono"
+            )
+        references, ears = self.references or (1,), self.ears
+        if len(clean) not in (1, ears):
+            raise ValueError(
+                f"{self.clean}: expected clean speech with one channel, or one for each of {ears} "
+                f"ears, got {len(clean)}; replace the file"
+            )
+        if len(channels) % ears or len(channels) < references[-1]:
             raise ValueError(
                 f"{self.microphones[0]}: expected the same number of microphones for each of "
-                f"{ears} ears, with channel {self.references[-1]} among them, and clean speech "
-                f"with 1 or {ears} channels, got {len(channels)} and {len(clean)}; correct the "
-                "column 'reference' of the manifest"
+                f"{ears} ears, with channel {references[-1]} among them, got {len(channels)} "
+                "channels; correct the column 'reference' of the manifest"
             )
-        first = (self.references[0] - 1) // ears
+        first = (references[0] - 1) // ears
         microphones = channels.unflatten(0, (-1, ears))
         later = [number for number in range(len(microphones)) if number != first]
         clean = clean.expand(ears, -1)
-        in_room = file_with_room(self.clean)
+        in_room = file_with_room(self.clean, self._reference_file)
         if in_room is not None:
             clean = set_level(clean, level_spl(read_audio(in_room)[0][:, :time]))
         return clean, microphones[[first, *later]], rates[0]
 
 
-def file_with_room(clean: Path) -> Path | None:
+def file_with_room(clean: Path, noisy: Path | None = None) -> Path | None:
     """Return the file of the target in its room that belongs to clean speech of Clarity's scenes.
 
-    It is beside the clean speech, whose level is not that in the room. None if there is no such
-    file, or if the clean speech has the right level.
+    It is beside the clean speech, whose level is not that in the room, and is that of the reference
+    microphone, or else of microphone 1. None if there is no such file, or if the clean speech has
+    the right level.
+
+    Args:
+        clean: File of the clean speech.
+        noisy: File of the reference microphone, by default microphone 1.
 
     >>> file_with_room(Path("S00001_reference.wav")) is None
     True
     """
+    microphone = "CH1" if noisy is None else noisy.stem.rpartition("_")[-1]
     for ending in CLARITY_REFERENCES[:-1]:
-        file = clean.with_name(f"{clean.name.removesuffix(ending)}_target_CH1.wav")
-        if clean.name.endswith(ending) and file.is_file():
-            return file
+        scene = clean.name.removesuffix(ending)
+        for name in (f"{scene}_target_{microphone}.wav", f"{scene}_target_CH1.wav"):
+            file = clean.with_name(name)
+            if clean.name.endswith(ending) and file.is_file():
+                return file
     return None
 
 
@@ -146,8 +178,16 @@ class SceneClips(Clips):
         self.clean_files = [scene.clean for scene in scenes]
         clean, microphones, _ = scenes[0].read()
         self.ears, self.microphones = len(clean), len(microphones)
-        if {len(scene.references) for scene in scenes} != {self.ears}:
+        if {scene.ears for scene in scenes} != {self.ears}:
             raise ValueError("expected the same number of references for all scenes; correct them")
+        references = {scene.references for scene in scenes}
+        if len(references) > 1:
+            warnings.warn(
+                "the reference is not the same channel in all scenes, so that a network gets the "
+                "microphones in another order; correct the column 'reference' of the manifest "
+                "unless the microphones differ, too",
+                stacklevel=2,
+            )
 
     def draw_scenes(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw clips at random positions of random scenes in which there is clean speech.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -29,6 +30,9 @@ SIMULATOR_LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 
 INPUT_LEVELS = (50.0, 65.0, 80.0)
 """Levels of the clean speech in dB SPL through which items for hearing aids cycle."""
+
+MAX_SILENT_END = 0.1
+"""Largest share of an item that may be silent at its end without a warning; it costs 0.5 dB."""
 
 _SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB through which noisy items cycle, as in the paper."""
@@ -146,6 +150,7 @@ def draw_aid_items(
         facts = {"ear": ear_name, **_facts(ear, level, "snr", snr)}
         item_seed = (seed + number) % 2**32
         drawn.append(Item(f"item {number}", clean, signal, ear, seed=item_seed, facts=facts))
+    _warn_of_padding(drawn)
     return drawn
 
 
@@ -200,7 +205,24 @@ def draw_scene_items(
         item_seed = (seed + number) % 2**32
         signals = gain * clean[0], gain * signal
         drawn.append(Item(f"item {number}", *signals, ear, seed=item_seed, facts=facts))
+    _warn_of_padding(drawn)
     return drawn
+
+
+def _warn_of_padding(items: Sequence[Item]) -> None:
+    """Warn if silence at the end of items lowers the level that the whole item has."""
+    padded = 0
+    for item in items:
+        sound = item.clean.nonzero()
+        end = int(sound[-1]) + 1 if len(sound) else 0
+        padded += end < (1.0 - MAX_SILENT_END) * len(item.clean)
+    if padded:
+        warnings.warn(
+            f"more than a tenth of {padded} of {len(items)} items is silence at their end, as if "
+            "a recording is shorter than an item. It counts in the level, so the speech is louder "
+            "than stated; choose shorter items (seconds, --seconds) or longer recordings",
+            stacklevel=3,
+        )
 
 
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:

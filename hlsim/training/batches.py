@@ -169,9 +169,12 @@ class TrainingData:
             ValueError: A folder does not exist or contains no audio, or a table is not valid.
         """
         sources = [self.speech, self.noise, self.valid_speech, self.valid_noise]
+        references: list[tuple[int, ...]] = []
         for scenes in filter(None, (self.scenes, self.valid_scenes)):
-            sources.append([file for scene in scenes for file in scene.microphones])
-        hashes = [hash_source(source) if source else None for source in sources]
+            sources.append([file for scene in scenes for file in scene.files])
+            references += [scene.references for scene in scenes]
+        hashes: list[Any] = [hash_source(source) if source else None for source in sources]
+        hashes += references
         tables = (self.audiograms, self.valid_audiograms)
         ears = [_read_ears(table) if table else None for table in tables]
         return hashlib.sha256(repr((hashes, ears)).encode()).hexdigest()

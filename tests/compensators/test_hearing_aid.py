@@ -1,13 +1,14 @@
 """The hearing aid's sliders, loudness, gains and gradients."""
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from compensators import WDRC, HearingAid, load_compensator
+from compensators import WDRC, HearingAid, load_compensator, save_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.ears import draw_thresholds
@@ -133,3 +134,8 @@ def test_loudness_is_loaded_and_out_of_range_or_without_effect_an_error() -> Non
     for name in ("wdrc", "nalr"):
         with pytest.raises(ValueError, match="leave out loudness"):
             load_compensator(name, loudness=-5.0)
+
+
+def test_a_loudness_that_is_not_saved_causes_a_warning(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="loudness of -10 dB is not saved"):
+        save_compensator(load_compensator("hearing-aid", loudness=-10.0), tmp_path)

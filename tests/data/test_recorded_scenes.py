@@ -10,6 +10,7 @@ from torch import Tensor
 from hlsim.audio import write_audio
 from hlsim.data.manifest import Utterance, check_utterances, read_manifest, write_manifest
 from hlsim.data.recorded_scenes import SceneClips, SceneFiles
+from hlsim.training.batches import TrainingData
 
 RATE = 16000
 
@@ -68,6 +69,12 @@ def test_clean_speech_of_clarity_has_its_level_in_the_room(tmp_path: Path) -> No
     microphones = (tmp_path / "S1_mix_CH1.wav",)
     clean, _, _ = SceneFiles(tmp_path / "S1_target_anechoic_CH1.wav", microphones, (1, 2)).read()
     torch.testing.assert_close(clean, 0.5 * channels, atol=1e-4, rtol=0.0)
+    # that of the reference's microphone, if there is one
+    for kind, gain in (("mix_CH3", 1.0), ("target_CH3", 0.2)):
+        write_audio(tmp_path / f"S1_{kind}.wav", gain * channels, RATE)
+    both = (tmp_path / "S1_mix_CH3.wav", *microphones)
+    clean, _, _ = SceneFiles(tmp_path / "S1_target_anechoic_CH1.wav", both, (1, 2)).read()
+    torch.testing.assert_close(clean, 0.2 * channels, atol=1e-4, rtol=0.0)
 
 
 def test_clips_of_scenes_have_clean_speech(tmp_path: Path, row: Utterance) -> None:
@@ -98,3 +105,31 @@ def test_references_without_microphones_are_errors(tmp_path: Path, row: Utteranc
     write_audio(tmp_path / "CH1.wav", torch.ones(2, 2 * RATE), RATE)
     with pytest.raises(ValueError, match="the length of its noisy version"):
         SceneFiles.from_utterance(row, tmp_path).read()
+
+
+def test_several_channels_need_a_reference(tmp_path: Path, row: Utterance) -> None:
+    files = SceneFiles.from_utterance(Utterance(row.path, "CH1.wav"), tmp_path)
+    with pytest.raises(ValueError, match="expected one channel, got 2; name the reference"):
+        files.read()
+
+
+def test_a_microphone_that_is_listed_twice_is_an_error() -> None:
+    with pytest.raises(ValueError, match="a microphone is listed twice"):
+        check_utterances([Utterance("clean.wav", "CH1.wav|CH1.wav", reference="1")])
+
+
+def test_references_that_differ_cause_a_warning(tmp_path: Path, row: Utterance) -> None:
+    rows = [row, Utterance(row.path, row.noisy, reference="1 2")]
+    scenes = [SceneFiles.from_utterance(scene, tmp_path) for scene in rows]
+    with pytest.warns(UserWarning, match="not the same channel in all scenes"):
+        SceneClips(scenes, sample_rate=RATE, seconds=0.5)
+
+
+def test_another_reference_is_another_training(tmp_path: Path, row: Utterance) -> None:
+    identities = set()
+    for reference in ("1 2", "3 4"):
+        scene = SceneFiles.from_utterance(
+            Utterance(row.path, row.noisy, reference=reference), tmp_path
+        )
+        identities.add(TrainingData(speech=[scene.clean], scenes=[scene]).identity())
+    assert len(identities) == 2

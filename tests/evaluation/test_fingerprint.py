@@ -24,7 +24,10 @@ N3 = Audiogram.standard("N3")
 def test_settings_and_ears_distinguish_modules() -> None:
     modules = [
         *(MSBG(), MSBG(rescale_active=True), MSBG(N3), NALR(), NALR(N3), WDRC(), WDRC(release=0.2)),
-        *(load_compensator("hearing-aid"), load_compensator("hearing-aid", linked=True)),
+        load_compensator("hearing-aid"),
+        load_compensator("hearing-aid", linked=True),
+        load_compensator("hearing-aid", limit_to_ear=True),
+        load_compensator("hearing-aid", loudness=-10.0),
     ]
     fingerprints = set(map(fingerprint, modules))
     assert len(fingerprints) == len(modules) and None not in fingerprints

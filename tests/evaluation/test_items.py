@@ -139,3 +139,12 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     for unknown in ("compensated", "softer"):
         with pytest.raises(ValueError, match=unknown):
             apply_treatments(drawn, [unknown])
+
+
+def test_silence_after_short_recordings_causes_a_warning(tmp_path: Path) -> None:
+    write_audio(tmp_path / "short.wav", 0.1 * torch.ones(8000), 16000)
+    settings: dict[str, Any] = {"items": 1, "seed": 0}
+    ears = [("N3", Audiogram.standard("N3"))]
+    draw_aid_items(tmp_path, None, ears, seconds=0.5, **settings)
+    with pytest.warns(UserWarning, match="1 of 1 items is silence at their end"):
+        draw_aid_items(tmp_path, None, ears, seconds=1.0, **settings)
