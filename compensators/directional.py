@@ -410,6 +410,14 @@ class DirectionalAid(nn.Module):
         output: Tensor = self.aid(self.front_end(waveform), audiogram, **sliders)
         return output
 
+    def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
+        """Measure the insertion gains of the aid behind the front end, see ``Aid.gains``.
+
+        They hold for sound from the front, which comes out of the front end as it was received.
+        """
+        gains: Tensor = self.aid.gains(audiogram, level)
+        return gains
+
     @property
     def latency(self) -> int:
         """Delay of streams in samples, that of the front end and that of the aid."""

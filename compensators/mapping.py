@@ -1,6 +1,7 @@
 """The compensator of the Neuro-MSBG paper, whose gains change over time and frequency."""
 
 import math
+import warnings
 
 import numpy as np
 import torch
@@ -179,6 +180,11 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         if self.takes_microphones:
+            warnings.warn(
+                f"gains of an aid with {self.microphones} microphones are measured with the same "
+                "signal at all of them; its gains for recordings depend on where sounds come from",
+                stacklevel=3,
+            )
             signals = signals.unsqueeze(1).expand(-1, self.microphones, -1)
         return self.process_items(signals, ears)
 

@@ -112,13 +112,14 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
         if meaning.is_remark and meaning.hz not in measured_hz:
             raise ValueError(
                 f"column {column!r}: expected a name such as hl_500, 500 Hz, 500 or R 500 for "
-                "thresholds; rename the column"
+                "thresholds, or ucl_500 for uncomfortable levels; rename the column"
             )
     if other_columns:
         warnings.warn(
             f"not read as thresholds, because of other words in the names of the columns: "
             f"{', '.join(map(repr, other_columns))}; if they hold thresholds of air conduction, "
-            "rename them, for example to hl_500, L500 or R500",
+            "rename them, for example to hl_500, L500 or R500; if they hold uncomfortable levels, "
+            "to ucl_500",
             stacklevel=2,
         )
     return meanings

@@ -121,10 +121,11 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--rival", str, text, "nalr")
     text = (
         "target of the loudness error: loudness in dB relative to a normal ear, a number or "
-        "numbers by level, such as 50:0,65:-5,80:-9; the tables name it"
+        "numbers by level, such as 50:0,65:-5,80:-9; the tables name it; unlike --loudness of "
+        "compensate, it does not make the compensators softer"
     )
     option("--loudness", loudness, text, 0.0)
-    parser.limit_to_ear()
+    parser.limit_to_ear("--audiograms has columns such as ucl_500")
     _declare_study(parser)
 
 
@@ -138,7 +139,13 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     ear: Any = parse_ear(options)
     notes = warn_of_other_ears(checkpoints, ear)
     if options.limit_to_ear:
-        notes = [*notes, "The compensators are limited to the ear (--limit-to-ear)."]
+        levels = ", ".join(f"{level:g} dB HL at {hz:g} Hz" for hz, level in ear.ucl) if ear else ""
+        text = (
+            "The compensators are limited to the ear (--limit-to-ear), at uncomfortable levels of "
+            f"{levels or 'the file of ears, or predicted ones'}. The prescriptions with which "
+            "they are compared, such as WDRC, are not."
+        )
+        notes = [*notes, text]
     _run_study(
         options,
         evaluate_compensators,

@@ -83,10 +83,16 @@ def _uncomfortable_levels(options: argparse.Namespace, ears: int) -> Points:
     ucl = read_points(getattr(options, "ucl", None))
     if ucl and not getattr(options, "limit_to_ear", True):
         raise ValueError("--ucl has no effect without --limit-to-ear; add it, or leave --ucl out")
-    if ucl and ears != 1:
+    if ucl and ears > 1:
         raise ValueError(
-            f"--ucl has the levels of one ear of --audiogram, got {ears} ears; process each alone, "
-            "or write the levels into the file of --listener, in columns such as ucl_left_500"
+            f"--ucl has the levels of one ear of --audiogram, got {ears} ears; process each alone"
+        )
+    if ucl and ears == 0:
+        has_listener = hasattr(options, "listener")
+        option, column = ("listener", "left_500") if has_listener else ("audiograms", "500")
+        raise ValueError(
+            "--ucl has the levels of the ear of --audiogram, which is missing; write the levels "
+            f"into the file of --{option} instead, in columns such as ucl_{column}"
         )
     return ucl
 
@@ -237,7 +243,9 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
         limit_to_ear=getattr(options, "limit_to_ear", False),
         loudness=getattr(options, "loudness", 0.0),
     )
-    if not read_sliders(options).keys() <= {*getattr(compensator, "SLIDERS", ())}:
+    # A directional aid passes the sliders to the hearing aid behind its front end.
+    amplifier = getattr(compensator, "aid", compensator)
+    if not read_sliders(options).keys() <= {*getattr(amplifier, "SLIDERS", ())}:
         raise ValueError(
             f"--noise-reduction and --amplification have no effect with {options.compensator}; "
             "leave them out, or choose a hearing aid"

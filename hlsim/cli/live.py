@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from hlsim.cli.inputs import build_compensator, parse_ear, read_sliders, warn_of_other_ears
-from hlsim.cli.options import ALL_EARS, Parser, full_scale, positive_number
+from hlsim.cli.options import AIDED_EARS, Parser, full_scale, positive_number
 
 
 def live(parser: Parser) -> None:
@@ -19,7 +19,7 @@ def live(parser: Parser) -> None:
     )
     option = parser.option
     ears = parser.add_mutually_exclusive_group(required=True)
-    parser.audiogram(ears=ALL_EARS, group=ears)
+    parser.audiogram(ears=AIDED_EARS, group=ears)
     parser.listener("both ears, for stereo headphones", group=ears)
     models = parser.add_mutually_exclusive_group()
     text = (
@@ -32,7 +32,7 @@ def live(parser: Parser) -> None:
     )
     parser.flag("--simulate", text, group=models)
     parser.sliders()
-    parser.limit_to_ear()
+    parser.limit_to_ear("--listener has columns such as ucl_left_500")
     text = (
         "level in dB SPL of samples whose RMS is 1.0, at microphone and headphones, to be measured"
     )

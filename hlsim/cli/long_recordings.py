@@ -131,9 +131,14 @@ def _process_microphones(
     Shape: (channels, time) -> (ears, time).
 
     Raises:
-        ValueError: There is another number of channels.
+        ValueError: There is another number of channels, or a listener for an aid of one ear.
     """
     aid: Any = model
+    if aid.ears == 1 and isinstance(ears, Listener):
+        raise ValueError(
+            "the aid has microphones at one ear, got a listener with two ears (--listener); pass "
+            "the ear by --audiogram"
+        )
     signals = part if aid.ears == 1 or len(part) % 2 else part.unflatten(0, (-1, 2))
     output: Tensor = aid(signals, ears, **sliders)
     return output.reshape(aid.ears, -1)

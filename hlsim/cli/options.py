@@ -28,6 +28,9 @@ SIMULATED_EARS = "NH, N1 to N6, S1 to S3"
 ALL_EARS = "NH, N1 to N7, S1 to S3"
 """Standard ears of commands that do not simulate a loss."""
 
+AIDED_EARS = f"{ALL_EARS} (N7 exceeds the range of trained aids)"
+"""Standard ears of commands that process signals by an aid."""
+
 
 _EAR = re.compile(r"NH|[NS]\d|-?[\d.]+([,:]-?[\d.]+)+", re.IGNORECASE)
 """Text of an ear on the command line: a name, levels, or frequencies with levels."""
@@ -277,27 +280,31 @@ class Parser(argparse.ArgumentParser):
         text = f"link the gains of both ears ({condition}hearing aids and wdrc only)"
         self.flag("--linked", text)
 
-    def limit_to_ear(self) -> None:
-        """Declare ``--limit-to-ear``, with which no band exceeds the ear's uncomfortable level."""
+    def limit_to_ear(self, table: str) -> None:
+        """Declare ``--limit-to-ear``, with which no band exceeds the ear's uncomfortable level.
+
+        Args:
+            table: Option with a file of ears and an example of its columns, for the help text.
+        """
         text = (
             "limit each band of the output to the ear's uncomfortable level, as measured or "
             "predicted (hearing aids, wdrc and camfit only)"
         )
         self.flag("--limit-to-ear", text)
-        self.uncomfortable_levels("--limit-to-ear")
+        self.uncomfortable_levels("--limit-to-ear", f"; a file of {table} instead")
 
-    def uncomfortable_levels(self, user: str) -> None:
+    def uncomfortable_levels(self, user: str, text: str = "") -> None:
         """Declare ``--ucl``, the measured uncomfortable levels of the ear of ``--audiogram``.
 
         Args:
             user: Option or output that uses the levels, for the help text.
+            text: End of the help text.
         """
-        text = (
+        help_ = (
             f"measured uncomfortable levels for {user} by frequency in Hz, in dB HL, such as "
-            "500:100,1000:95, of the single ear of --audiogram; a file of --listener has columns "
-            "such as ucl_left_500 instead"
+            f"500:100,1000:95, of the single ear of --audiogram{text}"
         )
-        self.option("--ucl", ucl, text)
+        self.option("--ucl", ucl, help_)
 
     def enhancers(self, waveforms: str) -> None:
         """Declare ``--enhancer``, functions of the user that reduce noise.

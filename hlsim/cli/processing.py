@@ -19,7 +19,7 @@ from hlsim.cli.inputs import (
     read_sliders,
     use_one_thread,
 )
-from hlsim.cli.options import ALL_EARS, SIMULATED_EARS, Parser, input_path
+from hlsim.cli.options import AIDED_EARS, SIMULATED_EARS, Parser, input_path
 from hlsim.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def compensate(parser: Parser) -> None:
         _compensate,
         "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
         "scenes aided --listener listeners.json:L0001 --compensator nalr --no-clipping",
-        ears=ALL_EARS,
+        ears=AIDED_EARS,
     )
     text = (
         "nalr or nalrp (linear prescriptions), wdrc or camfit (compression in bands), or a "
@@ -60,7 +60,7 @@ def compensate(parser: Parser) -> None:
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
     parser.linked("stereo files; ")
-    parser.limit_to_ear()
+    parser.limit_to_ear("--listener has columns such as ucl_left_500")
 
 
 def _declare_files(

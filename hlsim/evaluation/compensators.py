@@ -248,6 +248,10 @@ def evaluate_compensators(
             "precision": precision,
             "rival": rival_name,
             "loudness": loudness,
+            "audiogram": None if audiogram is None else as_audiogram(audiogram).to_dict(),
+            "limited_to_ear": [
+                name for name, aid in compensators.items() if getattr(aid, "limit_to_ear", False)
+            ],
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),
         },

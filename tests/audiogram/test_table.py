@@ -57,12 +57,12 @@ def test_columns_are_found_whatever_their_order_case_and_delimiter(
 
 OTHER_COLUMNS = ["aided 2000", "unaided_500", "bone 1000", "masked left 500", "L aided 1k"]
 OTHER_COLUMNS += ["visit2_500", "R2_1000", "L1 500", "MCL 500", "AUXU500R", "pta_500_1000_2000"]
-OTHER_COLUMNS += ["bc_500", "hl_8000_extrapolated_flat"]
+OTHER_COLUMNS += ["bc_500", "hl_8000_extrapolated_flat", "ulc_500"]
 
 
 @pytest.mark.parametrize("column", OTHER_COLUMNS)
 def test_columns_with_a_word_before_the_frequency_are_named(tmp_path: Path, column: str) -> None:
-    with pytest.warns(UserWarning, match=f"not read as thresholds.*'{column}'"):
+    with pytest.warns(UserWarning, match=f"not read as thresholds.*'{column}'.*ucl_500"):
         ears = read_text(tmp_path, f"250,500,1000,{column}\n10,22.5,30,7\n")
     assert ears == [Audiogram((10, 22.5, 30), (250, 500, 1000))]
 

@@ -95,9 +95,16 @@ def test_every_option_reaches_its_parameter(
         assert arguments["store"] == tmp_path / "out" / "scores.jsonl"
 
 
-@pytest.mark.parametrize("words", ["", " --limit-to-ear"])
+@pytest.mark.parametrize(
+    ("words", "levels"),
+    [
+        ("", ""),
+        (" --limit-to-ear", "of the file of ears, or predicted ones. The prescriptions"),
+        (" --limit-to-ear --audiogram N3 --ucl 500:90", "levels of 90 dB HL at 500 Hz."),
+    ],
+)
 def test_a_page_says_that_aids_were_limited_to_the_ear(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: str, levels: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = Mock()
     monkeypatch.setattr("hlsim.cli.evaluation._run_study", run)
@@ -105,6 +112,7 @@ def test_a_page_says_that_aids_were_limited_to_the_ear(
     assert main(command.split()) == 0
     notes = " ".join(run.call_args.kwargs["notes"])
     assert ("limited to the ear" in notes) == bool(words)
+    assert levels in notes
 
 
 def _letter(value: Any) -> Any:

@@ -30,6 +30,7 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.evaluation import _read_labels
 from hlsim.cli.main import main, make_parser
+from hlsim.evaluation.fitting.gain_tables import export_gains
 from tests.helpers import write_table
 
 N3 = Audiogram.standard("N3")
@@ -124,6 +125,7 @@ export-gains --audiogram N3 --to CamillaDSP | no format 'CamillaDSP' (did you me
 evaluate-compensator nalr --speech {folder} --out {out} --levels 65,x | got 'x'
 compensate {speech} {out} --audiogram N3 --ucl 500:90 | without --limit-to-ear
 compensate {speech} {out} --listener {ears}:a --limit-to-ear --ucl 500:90 | such as ucl_left_500
+evaluate-compensator wdrc --speech {folder} --out {out} --limit-to-ear --ucl 500:90 | --audiograms
 compensate {speech} {out} --audiogram N3 --audiogram N4 --limit-to-ear --ucl 500:90 | got 2 ears
 compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500 | such as 500:100,1000:95
 compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500:900 | got 900 at 500 Hz
@@ -296,9 +298,29 @@ def test_channels_are_the_microphones_of_a_checkpoint_that_takes_them(
     assert run(*command) == 0
     signals = scene.reshape(2, 2, -1) if ears == 2 else scene
     check_output(out, aid(signals, ear).reshape(ears, -1))
+    if ears == 1:
+        listener = write_listeners(tmp_path, a=Listener("N2", "N4"))
+        assert run(*command[:5], "--listener", listener) == 2
+        assert "microphones at one ear" in capsys.readouterr().err
     write_audio(tmp_path / "in.wav", scene[:3], rate)
     assert run(*command) == 2
     assert f"expected signals of {4 // ears} microphones per ear" in capsys.readouterr().err
+
+
+def test_a_directional_aid_has_the_sliders_and_gains_of_its_hearing_aid(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waveform, rate = read_audio(utterance)
+    scene, out = waveform[:, :rate].expand(4, -1), tmp_path / "out.wav"
+    write_audio(tmp_path / "in.wav", scene, rate)
+    name = "hearing-aid-directional"
+    options = ("--audiogram", "N3", "--compensator", name)
+    assert run("compensate", tmp_path / "in.wav", out, *options, "--amplification", 0.5) == 0
+    aid = load_compensator(name, sample_rate=rate)
+    check_output(out, aid(scene.reshape(2, 2, -1), "N3", amplification=0.5))
+    capsys.readouterr()
+    assert run("export-gains", *options, "--to", "csv") == 0
+    assert capsys.readouterr().out == export_gains(aid.aid, "N3", "csv")
 
 
 def test_measured_uncomfortable_levels_of_one_ear(tmp_path: Path, utterance: Path) -> None:
@@ -415,6 +437,12 @@ def test_n7_is_offered_where_it_is_accepted() -> None:
         assert "N1 to N6" in " ".join(make_parser(command).format_help().split())
     for command in ("compensate", "haspi-report", "live"):
         assert "N1 to N7" in " ".join(make_parser(command).format_help().split())
+
+
+def test_help_names_only_options_of_the_command() -> None:
+    for command in ("verify", "evaluate-compensator"):
+        help_ = make_parser(command).format_help()
+        assert "--ucl" in help_ and "--listener" not in help_
 
 
 def test_a_missing_extra_names_the_command_that_installs_it(

@@ -91,9 +91,13 @@ def test_conditions_groups_and_page(
     monkeypatch.setattr("hlsim.report.plots._draw_svg", lambda *_: b"<svg></svg>")
     Path("my_enhancer.py").write_text(ENHANCERS)
     enhancers = ["my_enhancer:half"]
+    aid = Gain()
+    aid.limit_to_ear = True
     study = evaluate_compensators(
-        {"mine": Gain()}, **options, audiogram=N3, items=2, enhancers=enhancers, listen=1
+        {"mine": aid}, **options, audiogram=N3, items=2, enhancers=enhancers, listen=1
     )
+    assert study.settings["limited_to_ear"] == ["mine"]
+    assert study.settings["audiogram"] == N3.to_dict()
     names = ["unaided", "NAL-R", "half + NAL-R", "WDRC", "half + WDRC"]
     names += ["NAL-R at mine's level", "equaliser at mine's level", "half + mine", "mine"]
     assert study.names == names and len(study.table) == 2 * len(names)

@@ -22,7 +22,8 @@ def export_gains(parser: Parser) -> None:
     text = "program that reads the file: camilladsp, equalizer-apo, openmha, or csv for a table"
     option("--to", str, text, required=True)
     text = (
-        "aid whose gains are exported: nalr, nalrp, wdrc, camfit, or a checkpoint's name or folder"
+        "aid whose gains are exported: nalr, nalrp, wdrc, camfit, or a checkpoint's name or "
+        "folder; of one with a directional front end, the gains behind it"
     )
     option("--compensator", str, text, "hearing-aid")
     text = (

@@ -26,7 +26,7 @@ def verify(parser: Parser) -> None:
     option("input", input_path, "input of the aid, a mono file of 16 to 48 kHz")
     option("output", input_path, "output of the aid at the same scale and rate")
     parser.audiogram(ears=SIMULATED_EARS, required=True)
-    parser.uncomfortable_levels("--plot and --csv")
+    parser.uncomfortable_levels("the table and --plot")
     text = (
         "aid whose gains are the targets: nalr, nalrp, wdrc, camfit, or "
         "a checkpoint's name or folder"
