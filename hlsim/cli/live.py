@@ -75,6 +75,11 @@ def _live(options: argparse.Namespace) -> None:
     else:
         warn_of_other_ears({options.compensator: options.compensator}, ears)
         aid = build_compensator(options, NEURO_RATE)
+        if getattr(aid, "takes_microphones", False):
+            raise ValueError(
+                f"{options.compensator} has several microphones, but there is one per ear; choose "
+                "an aid with one"
+            )
         stream = aid.stream(ears, **sliders)
         block = latency = aid.latency
     play(

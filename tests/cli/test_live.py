@@ -226,6 +226,7 @@ def test_keys_are_read_from_a_terminal_whose_settings_are_restored(
         ("--audiogram N3 --simulate --amplification 1", "no effect with --simulate"),
         ("--audiogram N3 --simulate --limit-to-ear", "no effect with --simulate"),
         ("--audiogram N3 --simulate --loudness -5", "no effect with --simulate"),
+        ("--audiogram N3 --compensator hearing-aid-directional", "has several microphones"),
         ("--audiogram N3 --compensator nalr --limit-to-ear", "leave out limit_to_ear"),
         ("--audiogram N3 --compensator wdrc --amplification 1", "no effect with wdrc"),
         ("--audiogram N7", "100"),
