@@ -34,6 +34,7 @@ NOT_RUN = {
     "hlsim live": "needs a microphone",
     "RNNoise": "needs pyrnnoise",
     "machine_listener.py": "needs a model of Whisper",
+    "aid_loudness.py": "needs moonshine_voice",
     "listening_page.py": "needs npm",
     "http.server": "does not end",
     "HLSIM_GOLDEN": "takes minutes, and .ci/run does the same",
@@ -126,6 +127,14 @@ def _write_corpus(folder: Path) -> None:
         for number, waveform in enumerate(clean):
             file = f"{kind}_fileid_{number + 6}.wav"
             write_audio(folder / "dns" / "training" / kind / file, waveform, 16000)
+    # the same recording for all microphones, which only a test may have
+    for name, channels, reference in (("manifest", 4, "1 2"), ("array", 6, "1")):
+        rows = ["path,noisy,split,reference"]
+        for number, split in enumerate(("train", "train", "valid", "test")):
+            (folder / name).mkdir(exist_ok=True)
+            write_audio(folder / name / f"{number}.wav", noisy[number].expand(channels, -1), 16000)
+            rows.append(f"clean/{number:03}.wav,{name}/{number}.wav,{split},{reference}")
+        (folder / f"{name}.csv").write_text("\n".join(rows) + "\n")
     (folder / "ears.csv").write_text("listener,ear,hl_500,hl_4000\nL1,left,30,60\nL1,right,20,50\n")
     _write_listeners(folder, clean[0])
     hlsim.save_compensator(hlsim.MappingCompensator(), folder / "runs" / "aid" / "checkpoint")
