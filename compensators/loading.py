@@ -5,8 +5,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torch import nn
+
 from compensators.beamformer import BeamformingAid
 from compensators.config import BeamformerConfig, HearingAidConfig, MappingConfig
+from compensators.directional import DirectionalAid
 from compensators.hearing_aid import LOUDNESS_RANGE, HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR, NALRP
@@ -101,7 +104,7 @@ def load_compensator(
         kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
         compensator = read_checkpoint(name, kinds, build)
     compensator.eval().requires_grad_(False)
-    amplifier = compensator.aid if isinstance(compensator, BeamformingAid) else compensator
+    amplifier = _amplifier(compensator)
     if isinstance(amplifier, Wearable):
         amplifier.linked = linked
         amplifier.limit_to_ear = limit_to_ear
@@ -122,6 +125,11 @@ def load_compensator(
             f"{name} has no loudness to choose; load hearing-aid, or leave out loudness"
         )
     return compensator
+
+
+def _amplifier(compensator: nn.Module) -> nn.Module:
+    """Return the aid behind a front end, or the compensator itself if it has no front end."""
+    return compensator.aid if isinstance(compensator, DirectionalAid) else compensator
 
 
 def save_compensator(
@@ -153,10 +161,10 @@ def save_compensator(
             "expected a MappingCompensator, a HearingAid or a BeamformingAid to save, got "
             f"{type(model).__name__}"
         )
-    amplifier = model.aid if isinstance(model, BeamformingAid) else model
-    if getattr(amplifier, "loudness", 0.0) != 0.0:
+    loudness = getattr(_amplifier(model), "loudness", 0.0)
+    if loudness:
         warnings.warn(
-            f"the loudness of {amplifier.loudness:g} dB is not saved; pass it to load_compensator",
+            f"the loudness of {loudness:g} dB is not saved; pass it to load_compensator",
             stacklevel=2,
         )
     ear = None if audiogram is None else audiogram.to_dict()

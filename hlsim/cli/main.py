@@ -142,6 +142,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("-V", "--version", action="version", version=f"hlsim {__version__}")
     parser.add_argument("command", metavar="COMMAND", help="one of the commands below")
     command = parser.parse_args(words).command
+    # ``suggest`` of hlsim.checks would import torch, which takes seconds.
     similar = get_close_matches(command.lower(), COMMANDS, n=1)
     suggestion = f" (did you mean {similar[0]}?)" if similar else ""
     parser.error(f"there is no command {command!r}{suggestion}")

@@ -156,7 +156,7 @@ class Parser(argparse.ArgumentParser):
     def series(
         self, name: str, kind: Callable[[str], Any], text: str, default: Any = None, **settings: Any
     ) -> None:
-        """Declare an option that takes several values, separated by blanks or commas.
+        """Declare an option that takes several values, separated by spaces or commas.
 
         Args:
             name: Name, such as ``--levels``.

@@ -149,8 +149,8 @@ def _check_yaml(text: str) -> None:
         def construct_object(self, node: Any, deep: bool = False) -> Any:
             if node.tag.endswith(("int", "float")) and ":" in node.value:
                 raise ValueError(
-                    f"recipe: got {node.value}; write a blank behind the colon of a mapping, such "
-                    "as {50: 0, 65: -5}, and a number without a colon"
+                    f"recipe: got {node.value}; put a space after the colon of a mapping, such as "
+                    "{50: 0, 65: -5}, and write numbers without a colon"
                 )
             return super().construct_object(node, deep)
 

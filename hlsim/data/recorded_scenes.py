@@ -57,8 +57,7 @@ class SceneFiles(NamedTuple):
     @property
     def files(self) -> list[Path]:
         """All files that are read, except for the clean speech."""
-        in_room = file_with_room(self.clean, self._reference_file)
-        return [*self.microphones, *([in_room] if in_room else [])]
+        return [*self.microphones, *filter(None, [self._file_with_room])]
 
     @property
     def ears(self) -> int:
@@ -66,10 +65,15 @@ class SceneFiles(NamedTuple):
         return len(self.references) or 1
 
     @property
-    def _reference_file(self) -> Path:
-        """File of the reference channel if every file has one channel for each ear."""
-        number = (self.references[0] - 1) // self.ears if self.references else 0
-        return self.microphones[min(number, len(self.microphones) - 1)]
+    def reference_number(self) -> int:
+        """Number of the reference microphone, from 0."""
+        return (self.references[0] - 1) // self.ears if self.references else 0
+
+    @property
+    def _file_with_room(self) -> Path | None:
+        """File of the target in its room, see ``file_with_room``."""
+        last = len(self.microphones) - 1  # a file may have the channels of several microphones
+        return file_with_room(self.clean, self.microphones[min(self.reference_number, last)])
 
     def read(self) -> tuple[Tensor, Tensor, int]:
         """Read the signals, with the reference microphone first.
@@ -103,23 +107,24 @@ class SceneFiles(NamedTuple):
                 f"{self.microphones[0]}: expected one channel, got {len(channels)}; name the "
                 "reference in the column 'reference' of the manifest, or mix them to mono"
             )
-        references, ears = self.references or (1,), self.ears
+        ears = self.ears
         if len(clean) not in (1, ears):
             raise ValueError(
                 f"{self.clean}: expected clean speech with one channel, or one for each of {ears} "
                 f"ears, got {len(clean)}; replace the file"
             )
-        if len(channels) % ears or len(channels) < references[-1]:
+        last_reference = max(self.references, default=1)
+        if len(channels) % ears or len(channels) < last_reference:
             raise ValueError(
                 f"{self.microphones[0]}: expected the same number of microphones for each of "
-                f"{ears} ears, with channel {references[-1]} among them, got {len(channels)} "
+                f"{ears} ears, with channel {last_reference} among them, got {len(channels)} "
                 "channels; correct the column 'reference' of the manifest"
             )
-        first = (references[0] - 1) // ears
+        first = self.reference_number
         microphones = channels.unflatten(0, (-1, ears))
         later = [number for number in range(len(microphones)) if number != first]
         clean = clean.expand(ears, -1)
-        in_room = file_with_room(self.clean, self._reference_file)
+        in_room = self._file_with_room
         if in_room is not None:
             clean = set_level(clean, level_spl(read_audio(in_room)[0][:, :time]))
         return clean, microphones[[first, *later]], rates[0]

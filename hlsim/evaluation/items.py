@@ -97,6 +97,7 @@ def draw_simulator_items(
         gain = 10.0 ** ((level - float(level_spl(signal))) / 20.0)
         facts = _facts(ear, level, "noise_snr", snr)
         drawn.append(Item(f"item {number}", clean * gain, signal * gain, ear, facts=facts))
+    _warn_of_silence(drawn)
     return drawn
 
 
@@ -150,7 +151,7 @@ def draw_aid_items(
         facts = {"ear": ear_name, **_facts(ear, level, "snr", snr)}
         item_seed = (seed + number) % 2**32
         drawn.append(Item(f"item {number}", clean, signal, ear, seed=item_seed, facts=facts))
-    _warn_of_padding(drawn)
+    _warn_of_silence(drawn)
     return drawn
 
 
@@ -205,22 +206,23 @@ def draw_scene_items(
         item_seed = (seed + number) % 2**32
         signals = gain * clean[0], gain * signal
         drawn.append(Item(f"item {number}", *signals, ear, seed=item_seed, facts=facts))
-    _warn_of_padding(drawn)
+    _warn_of_silence(drawn)
     return drawn
 
 
-def _warn_of_padding(items: Sequence[Item]) -> None:
-    """Warn if silence at the end of items lowers the level that the whole item has."""
-    padded = 0
+def _warn_of_silence(items: Sequence[Item]) -> None:
+    """Warn if silence at the end of items lowers the level of the whole item."""
+    silent = 0
     for item in items:
         sound = item.clean.nonzero()
         end = int(sound[-1]) + 1 if len(sound) else 0
-        padded += end < (1.0 - MAX_SILENT_END) * len(item.clean)
-    if padded:
+        silent += end < (1.0 - MAX_SILENT_END) * len(item.clean)
+    if silent:
         warnings.warn(
-            f"more than a tenth of {padded} of {len(items)} items is silence at their end, as if "
-            "a recording is shorter than an item. It counts in the level, so the speech is louder "
-            "than stated; choose shorter items (seconds, --seconds) or longer recordings",
+            f"{silent} of {len(items)} items end in silence for more than a tenth of their length, "
+            "for example because recordings are shorter. The silence counts in the level, so the "
+            "speech is louder than stated; choose shorter items (seconds, --seconds) or longer "
+            "recordings",
             stacklevel=3,
         )
 

@@ -336,6 +336,7 @@ def _msbg_constants(stft: STFT, rate: float) -> dict[str, NDArray[np.float64]]:
     because they are the same for all networks with this transform. Their shapes are those of the
     buffers of ``BandGains``.
     """
+    # 44.1 kHz is 441 / 160 times 16 kHz and 8 / 3 times MSBG's frame rate.
     grid_ratio = _GRID_RATIO if rate == NEURO_RATE else 3
     points = grid_ratio * stft.fft
     model_points = round(points * MSBG_RATE / rate)

@@ -207,11 +207,11 @@ class CompensatorRecipe(TrainingRecipe):
         expected = "beamforming-aid, or ears: 2 in model, because interaural compares two ears"
         has_two_ears = self.kind == "beamforming-aid" or self.model.get("ears") == 2
         self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
-        expected = "beamforming-aid, the only kind for which mismatch has an effect"
+        expected = "beamforming-aid, or ears: 2 in model, because mismatch is that of microphones"
         self._require("kind", has_two_ears or not self.mismatch, expected)
         expected = "2 or more, because the voices of a scene are those of other items"
         self._require("batch", self.batch > 1 or not has_two_ears, expected)
-        expected = "0 for a beamforming-aid, whose scenes have other voices in any case"
+        expected = "0 for two ears, because their scenes have other voices in any case"
         self._require("babble", not self.babble or not has_two_ears, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"

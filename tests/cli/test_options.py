@@ -104,7 +104,7 @@ def test_lists_that_begin_with_a_minus_are_values() -> None:
 
 
 @pytest.mark.parametrize("words", ["65,80", "65 80"])
-def test_values_are_separated_by_commas_or_blanks(words: str) -> None:
+def test_values_are_separated_by_commas_or_spaces(words: str) -> None:
     command = f"msbg --speech . --out o --gain-ears n3,s2 --levels {words}"
     parsed = make_parser("evaluate-compensator").parse_args(command.split())
     assert parsed.levels == [65.0, 80.0] and parsed.gain_ears == ["N3", "S2"]

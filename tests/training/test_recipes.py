@@ -110,9 +110,9 @@ def test_numbers_by_level_have_the_form_of_the_other_commands() -> None:
 def test_numbers_that_yaml_reads_in_base_60_are_errors(tmp_path: Path, text: str) -> None:
     pytest.importorskip("jsonargparse")
     (tmp_path / "recipe.yaml").write_text(text)
-    with pytest.raises(ValueError, match="blank behind the colon"):
+    with pytest.raises(ValueError, match="space after the colon"):
         make_recipe(CompensatorRecipe, tmp_path / "recipe.yaml", [])
-    with pytest.raises(ValueError, match="blank behind the colon"):
+    with pytest.raises(ValueError, match="space after the colon"):
         make_recipe(CompensatorRecipe, None, ["--recipe.model.channels", "1:30"])
 
 
