@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import logging
 import math
 import sys
@@ -18,11 +19,12 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from hlsim.checkpoint import CONFIG, read_record, read_weights, save_checkpoint
-from hlsim.files import lock_folder
+from hlsim.files import lock_folder, write_atomically
 from hlsim.progress import ProgressLine, clear_line
 from hlsim.training.batches import BatchData
 from hlsim.training.module import TrainingModule
@@ -104,6 +106,28 @@ class BestCheckpoint(L.Callback):
         }
         if module.trainer.is_global_zero:
             save_checkpoint(self.folder, self.kind, network, network.config.to_dict(), record)
+
+
+class AtomicCheckpoints(TorchCheckpointIO):
+    """Lightning's writer of states, each of which is written completely or not at all.
+
+    Lightning's own one writes to the system's folder of temporary files. If this is on another
+    disk, the file is then copied over the earlier state, and both are lost if the process is killed
+    or the disk is full.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     AtomicCheckpoints().save_checkpoint({"step": 1}, f"{folder}/last.ckpt")
+    ...     torch.load(f"{folder}/last.ckpt")
+    {'step': 1}
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None
+    ) -> None:
+        contents = io.BytesIO()  # torch.save does not raise OSError if the disk is full
+        torch.save(checkpoint, contents)
+        write_atomically(path, contents.getvalue())
 
 
 class StepProgress(L.Callback):
@@ -204,6 +228,7 @@ def train_network(
     callbacks = [Timer(duration, verbose=False), *callbacks, best, last]
     if not options.setdefault("enable_progress_bar", False):
         callbacks.append(StepProgress())
+    plugins = [*options.pop("plugins", ()), AtomicCheckpoints()]
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings(), ExitStack() as locks:
         warnings.filterwarnings("ignore", f".*({_EXPECTED_WARNINGS})")
@@ -218,6 +243,7 @@ def train_network(
                 num_sanity_val_steps=-1,  # A training begins with a validation.
                 gradient_clip_val=1.0,
                 callbacks=callbacks,
+                plugins=plugins,
                 enable_model_summary=False,
                 logger=TensorBoardLogger(str(folder), name="", version="events"),
                 **options,

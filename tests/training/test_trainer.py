@@ -287,3 +287,12 @@ def test_a_loss_that_is_not_finite_ends_the_training(tmp_path: Path, factor: flo
     with pytest.raises(ValueError, match="step 3"):
         run(VectorTraining(factor=factor), tmp_path)
     assert last_state(tmp_path)["global_step"] == 2
+
+
+def test_a_state_is_written_beside_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder of temporary files may be on another disk, from which files are copied."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "no such folder"))
+    run(VectorTraining(steps=2), tmp_path / "out")
+    assert last_state(tmp_path / "out")["global_step"] == 2
