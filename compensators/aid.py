@@ -21,7 +21,7 @@ from hlsim.audiogram.thresholds import (
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import check_device, check_number, check_rate
+from hlsim.checks import check_device, check_number, check_rate, check_settings
 from hlsim.dsp.fft import power
 from hlsim.torchtools import constant
 
@@ -50,6 +50,7 @@ class Aid(nn.Module):
 
     thresholds: Tensor | None
 
+    @check_settings
     def __init__(
         self,
         audiogram: AudiogramLike | None = None,

@@ -27,6 +27,7 @@ from compensators.wearable import State
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals
 from hlsim.checkpoint import HubModel
+from hlsim.checks import check_settings
 from hlsim.dsp.resample import resample
 from hlsim.torchtools import Audio, as_samples, as_type_of, built_in_float32, constant
 
@@ -214,6 +215,7 @@ class BeamformingAid(DirectionalAid, HubModel):
     kind = "beamforming-aid"
     config_class = BeamformerConfig
 
+    @check_settings
     def __init__(
         self,
         audiogram: AudiogramLike | None = None,

@@ -18,7 +18,7 @@ from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checkpoint import HubModel
-from hlsim.checks import check_number
+from hlsim.checks import check_number, check_settings
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.torchtools import built_in_float32
 
@@ -97,6 +97,7 @@ class HearingAid(Wearable, HubModel):
 
     SLIDERS: ClassVar = {"noise_reduction": DEFAULT_NOISE_REDUCTION, "amplification": 1.0}
 
+    @check_settings
     @built_in_float32
     def __init__(
         self,

@@ -17,7 +17,7 @@ from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, check_two_channels
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import HubModel
-from hlsim.checks import check_waveform
+from hlsim.checks import check_settings, check_waveform
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
 from hlsim.dsp.interpolation import interpolate, interpolation_weights
@@ -83,6 +83,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 
     config: MappingConfig
 
+    @check_settings
     @built_in_float32
     def __init__(
         self,

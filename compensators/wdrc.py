@@ -25,7 +25,7 @@ from hlsim.audiogram.prescription import (
 )
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import check_choice, check_number
+from hlsim.checks import check_choice, check_number, check_settings
 from hlsim.dsp.interpolation import interpolate
 
 KNEE_DB = 20.0
@@ -74,6 +74,7 @@ class WDRC(Wearable):
 
     bands = 20
 
+    @check_settings
     def __init__(
         self,
         audiogram: AudiogramLike | None = None,
@@ -151,4 +152,9 @@ class CAMFIT(WDRC):
     """
 
     def __init__(self, audiogram: AudiogramLike | None = None, **options: Any) -> None:
+        if "prescription" in options:
+            raise ValueError(
+                "CAMFIT is a prescription; leave prescription out, or write "
+                f"WDRC(prescription={options['prescription']!r})"
+            )
         super().__init__(audiogram, prescription="camfit", **options)

@@ -7,12 +7,14 @@ fix. Functions that return something return the validated value.
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from numbers import Real
-from typing import Any, get_args
+from typing import Any, ParamSpec, get_args
 
 import numpy as np
 import torch
@@ -29,6 +31,8 @@ LOUDEST_SPL = 120.0
 
 MOST_CHANNELS = 8
 """Largest last dimension that, behind a longer dimension, is taken as channels instead of time."""
+
+P = ParamSpec("P")
 
 Lengths = Tensor | Sequence[int]
 """Number of samples of each item of a padded batch, in the shape of the leading dimensions."""
@@ -47,7 +51,7 @@ def suggest(name: str, names: Iterable[str]) -> str:
     ''
     """
     similar = difflib.get_close_matches(name.lower(), names, n=1)
-    return f" (did you mean {similar[0]}?)" if similar else ""
+    return f" (did you mean {similar[0]}?)" if similar and similar[0] != name else ""
 
 
 def check_names(names: Iterable[Any], known: Iterable[str], description: str) -> None:
@@ -68,6 +72,27 @@ def check_names(names: Iterable[Any], known: Iterable[str], description: str) ->
             f"unknown {description}: {', '.join(texts)}; expected some of "
             f"{', '.join(known) or 'none'}"
         )
+
+
+def check_settings(construct: Callable[P, None]) -> Callable[P, None]:
+    """Decorate a constructor so that an unknown keyword argument raises ValueError with a hint.
+
+    >>> class Filter:
+    ...     @check_settings
+    ...     def __init__(self, order: int = 1) -> None:
+    ...         pass
+    >>> Filter(ordre=2)
+    Traceback (most recent call last):
+    ValueError: unknown settings of Filter: ordre (did you mean order?); expected some of order
+    """
+    _, *known = inspect.signature(construct).parameters
+
+    @wraps(construct)
+    def call(*args: P.args, **kwargs: P.kwargs) -> None:
+        check_names(kwargs, known, f"settings of {type(args[0]).__name__}")
+        construct(*args, **kwargs)
+
+    return call
 
 
 def check_attributes(thing: Any, noun: str, **expected: Any) -> None:

@@ -20,6 +20,7 @@ from compensators import (
     load_compensator,
     save_compensator,
 )
+from compensators.beamformer import BeamformingAid
 from compensators.limiter import soft_limit
 from hlsim import Audiogram, Listener
 from hlsim.calibration import set_level
@@ -158,6 +159,12 @@ BAD_SETTINGS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     (MappingConfig, {"start": 0.5}),
     (MappingConfig, {"phase": "minimum"}),
     (MappingConfig.from_dict, {"data": {"layers": 3}}),
+    (NALR, {"limit_to_ear": True}),
+    (CAMFIT, {"prescription": "nalr"}),
+    (CAMFIT, {"knee": 20.0}),
+    (HearingAid, {"noise_reduction": 0.5}),
+    (MappingCompensator, {"linked": True}),
+    (BeamformingAid, {"limit_to_ear": True}),
 ]
 
 
