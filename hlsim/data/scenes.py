@@ -156,6 +156,9 @@ def draw_scenes(
         Scenes with leading dimension (items,). The gains of the microphones are those of ``input``
         alone.
 
+    Raises:
+        ValueError: There is only one item, which would be its own masker.
+
     >>> voices = torch.randn(2, 8000)
     >>> scenes = draw_scenes(voices, voices, None, torch.zeros(2), torch.Generator())
     >>> scenes.input.shape
@@ -166,6 +169,10 @@ def draw_scenes(
         return low + (high - low) * float(torch.rand((), generator=generator))
 
     count = len(targets)
+    if count < 2:
+        raise ValueError(
+            f"expected two or more items, because each voice masks that of another, got {count}"
+        )
     scenes = []
     for item, target in enumerate(targets):
         is_diffuse = noise is not None and draw(0.0, 1.0) < 0.5

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -269,7 +270,8 @@ class _CompensatorBatches(_RandomBatches):
 
     Raises:
         ValueError: The recipe's network has other microphones than the scenes, or several
-            microphones for which there are no scenes.
+            microphones for which there are no scenes, or a batch has no second voice for random
+            scenes.
     """
 
     recipe: CompensatorRecipe
@@ -294,6 +296,11 @@ class _CompensatorBatches(_RandomBatches):
             raise ValueError(
                 f"expected recorded scenes for {self.microphones} microphones, because only those "
                 "of 2 microphones for each of 2 ears are simulated; add them (--manifest)"
+            )
+        elif self.microphones > 1 and recipe.batch == 1:
+            raise ValueError(
+                "recipe: batch is 1, expected 2 or more, because the voices of a random scene are "
+                "those of other items"
             )
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
@@ -376,6 +383,28 @@ def _microphones_and_ears(recipe: CompensatorRecipe) -> tuple[int, int]:
         config = MappingConfig.from_dict(recipe.model)
         return config.microphones, config.ears
     return (2, 2) if recipe.kind == "beamforming-aid" else (1, 1)
+
+
+def _warn_of_settings_without_effect(recipe: CompensatorRecipe, data: TrainingData) -> None:
+    """Warn of settings that a user has changed, and that have no effect on the data."""
+    unused: dict[str, Any] = {}  # by name, the value that the data have
+    reason = ""
+    if data.scenes:
+        unused = {"babble": 0.0, "equalised": 0.0, "mismatch": 0.0, "noisy": 1.0, "sounds": 0.0}
+        unused["snr"] = None
+        reason = "recorded scenes, which are used as they are, except for their level"
+    elif data.noise is None and _microphones_and_ears(recipe)[0] == 1:
+        unused = {"noisy": 0.0, "snr": None}
+        reason = "data without noise; add a folder of noise (--noise)"
+    defaults = {setting.name: setting.default for setting in fields(recipe)}
+    changed = [
+        name
+        for name, value in unused.items()
+        if getattr(recipe, name) not in (defaults[name], value)
+    ]
+    if changed:
+        names = ", ".join(sorted(changed))
+        warnings.warn(f"recipe: {names} without effect on {reason}", stacklevel=3)
 
 
 def _babble(voices: Tensor) -> Tensor:
@@ -465,6 +494,7 @@ def make_data(
         plain |= {"levels": levels, "treated": False}
     elif isinstance(recipe, CompensatorRecipe):
         plain["equalised"] = 0.0
+        _warn_of_settings_without_effect(recipe, data)
         has_noise = data.noise or data.scenes
         if (recipe.trains_noise_reduction() or recipe.babble) and not has_noise:
             raise ValueError(

@@ -6,6 +6,7 @@ so that the help is shown at once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -14,6 +15,9 @@ _SHARES = ("sounds", "equalised", "noisy", "babble", "unreduced")
 
 _NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
 """Criteria that train the noise reduction of a hearing aid, and nothing else."""
+
+_SCORES = ("haspi", "hasqi", "intelligibility")
+"""Criteria that are scores, which mean nothing for short clips."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +74,10 @@ class TrainingRecipe:
         self._require("seconds", 0.0 < self.seconds <= 600.0, "above 0 and at most 600")
         self._require("learning_rate", self.learning_rate > 0.0, "a number above 0")
         self._require("seed", abs(self.seed) < 2**32, "a whole number below 2**32 in magnitude")
+        for name in ("levels", "snr"):
+            lowest, highest = getattr(self, name, (0.0, 0.0))
+            expected = "the lowest and the highest number of dB"
+            self._require(name, -math.inf < lowest <= highest < math.inf, expected)
         for name in _SHARES:
             self._require(name, 0.0 <= getattr(self, name, 0.0) <= 1.0, "a share from 0 to 1")
         criteria = self.criteria()
@@ -201,7 +209,12 @@ class CompensatorRecipe(TrainingRecipe):
         return (*CRITERIA, *_NOISE_REDUCTION_CRITERIA)
 
     def __post_init__(self) -> None:
+        from hlsim.metrics.pair import SHORTEST_SECONDS  # imports torch
+
         super().__post_init__()
+        scores = [name for name in _SCORES if self.weights.get(name)]
+        expected = f"{SHORTEST_SECONDS} or more for {' and '.join(scores)}"
+        self._require("seconds", self.seconds >= SHORTEST_SECONDS or not scores, expected)
         expected = "2 or more, because babble consists of the other items"
         self._require("batch", self.batch > 1 or not self.babble, expected)
         expected = "beamforming-aid, or ears: 2 in model, because interaural compares two ears"
@@ -209,8 +222,6 @@ class CompensatorRecipe(TrainingRecipe):
         self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
         expected = "beamforming-aid, or ears: 2 in model, because mismatch is that of microphones"
         self._require("kind", has_two_ears or not self.mismatch, expected)
-        expected = "2 or more, because the voices of a scene are those of other items"
-        self._require("batch", self.batch > 1 or not has_two_ears, expected)
         expected = "0 for two ears, because their scenes have other voices in any case"
         self._require("babble", not self.babble or not has_two_ears, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:

@@ -117,3 +117,9 @@ def test_wrong_arguments_raise_errors(speech: Tensor, noise: Tensor) -> None:
         make_scene(speech, [noise], [500.0], snr=0.0)
     with pytest.raises(ValueError, match="snr"):
         make_scene(speech, diffuse=noise, snr=float("nan"))
+
+
+def test_a_scene_needs_another_voice() -> None:
+    voices = torch.randn(1, 8000)
+    with pytest.raises(ValueError, match="expected two or more items"):
+        draw_scenes(voices, voices, None, torch.zeros(1), torch.Generator())

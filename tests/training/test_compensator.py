@@ -1,5 +1,6 @@
 """A compensator learns, and only the parts that the recipe names are trained."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -296,6 +297,27 @@ def test_other_microphones_than_those_of_the_scenes_are_errors(
         TrainingData.from_manifest(tmp_path / "manifest.csv", noise=tmp_path)
     two_ears = replace(SMALL, model={**SMALL.model, "microphones": 2, "ears": 2})
     assert draw(two_ears, data, 2)["signal"].shape == (2, 2, 2, 3200)
+
+
+def test_a_batch_of_one_needs_recorded_scenes_for_two_ears(
+    scenes: TrainingData, data: TrainingData
+) -> None:
+    recorded = replace(SMALL, model={**SMALL.model, "microphones": 3, "ears": 2}, batch=1)
+    assert make_data(scenes, recorded).training[0]["signal"].shape == (1, 3, 2, 3200)
+    random = replace(recorded, model={**SMALL.model, "microphones": 2, "ears": 2})
+    with pytest.raises(ValueError, match="batch is 1, expected 2 or more"):
+        make_data(data, random)
+
+
+def test_settings_without_effect_are_named(scenes: TrainingData, data: TrainingData) -> None:
+    recipe = replace(SMALL, babble=0.5, snr=(-5.0, 5.0), sounds=0.5)
+    with pytest.warns(UserWarning, match="recipe: babble, snr, sounds without effect on recorded"):
+        make_data(scenes, recipe)
+    with pytest.warns(UserWarning, match="recipe: snr without effect on data without noise"):
+        make_data(data, replace(recipe, babble=0.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_data(data, SMALL)
 
 
 def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: TrainingData) -> None:
