@@ -92,6 +92,32 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         lock.release()
 
 
+def check_output_folder(folder: str | Path) -> None:
+    """Raise ValueError unless files can be written to a folder, which need not exist yet.
+
+    Commands call this function first, because they would otherwise fail after their work.
+
+    >>> check_output_folder(tempfile.gettempdir())
+    """
+    paths = [Path(folder).absolute(), *Path(folder).absolute().parents]
+    existing = next(path for path in paths if path.exists())
+    reason = "" if os.access(existing, os.W_OK) else "there is no permission"
+    if not existing.is_dir():
+        reason = f"{existing} is a file"
+    if reason:
+        raise ValueError(f"{folder}: cannot write to this folder ({reason}); choose another one")
+
+
+def check_output_file(path: str | Path) -> None:
+    """Raise ValueError unless a file can be written, whose folder need not exist yet.
+
+    >>> check_output_file(f"{tempfile.gettempdir()}/page.html")
+    """
+    if Path(path).is_dir():
+        raise ValueError(f"{path}: expected the name of a file, got a folder; add a name")
+    check_output_folder(Path(path).parent)
+
+
 def write_atomically(path: str | Path, data: str | bytes) -> None:
     """Write a file completely, or leave it unchanged if writing fails.
 

@@ -396,8 +396,10 @@ def _run_study(
         notes: Sentences with which the page begins, before those of the evaluation.
         changes: Arguments of ``evaluate`` that replace options or are added to them.
     """
+    from hlsim.files import check_output_folder
     from hlsim.report.writing import write_results
 
+    check_output_folder(options.out)
     settings = {**vars(options), "listen": _PLAYED_ITEMS}
     settings["measures"] = [*settings.get("measures", []), *settings.pop("own_measures")]
     used_before = {"run", "names", "out", "limit_to_ear", "ucl"}

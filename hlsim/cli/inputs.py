@@ -253,6 +253,25 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
     return compensator
 
 
+def build_single_microphone_aid(options: argparse.Namespace, sample_rate: int) -> Any:
+    """Load the compensator that ``--compensator`` names, which must take one signal per ear.
+
+    Args:
+        options: Options of the command.
+        sample_rate: Sample rate in Hz of the signals to process.
+
+    Raises:
+        ValueError: See ``build_compensator``; or the compensator takes several microphones.
+    """
+    compensator = build_compensator(options, sample_rate)
+    if getattr(compensator, "takes_microphones", False):
+        raise ValueError(
+            f"{options.compensator} has several microphones, but there is one signal per ear; "
+            "choose an aid with one microphone"
+        )
+    return compensator
+
+
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
     """Return the values of the sliders of a hearing aid that a user has set, by name."""
     values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import (
-    build_compensator,
     build_simulator,
+    build_single_microphone_aid,
     check_extras,
     level_and_gain,
     parse_ears,
@@ -22,6 +22,7 @@ from hlsim.progress import ProgressLine, track
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from hlsim.audio import AudioInfo
     from hlsim.report.page import Section
 
 
@@ -57,12 +58,14 @@ def _listen(options: argparse.Namespace) -> None:
         )
     use_one_thread()
     check_extras("eval")
-    from hlsim.files import write_atomically
+    from hlsim.audio import scan_audio
+    from hlsim.files import check_output_file, write_atomically
     from hlsim.report.page import Page
 
+    check_output_file(options.out)
     ears = parse_ears(options)
     simulator = cache(partial(build_simulator, options))
-    aid = cache(partial(build_compensator, options))
+    aid = cache(partial(build_single_microphone_aid, options))
 
     def make_sounds(waveform: Tensor, rate: int) -> dict[str, Tensor]:
         sounds = {"original": waveform}
@@ -86,19 +89,25 @@ def _listen(options: argparse.Namespace) -> None:
         "Switch between them while one plays: the position stays the same. "
     )
     with ProgressLine("files", "starting", "writing the page"):
-        files = track(options.files, "files", len(options.files))
-        sections = [_make_section(options, file, make_sounds) for file in files]
+        # Whatever cannot be processed is reported before the first file is.
+        recordings = [scan_audio(file) for file in options.files]
+        for recording in recordings:
+            simulator(recording.sample_rate)
+            if options.compensator:
+                aid(recording.sample_rate)
+        tracked = track(recordings, "files", len(recordings))
+        sections = [_make_section(options, recording, make_sounds) for recording in tracked]
         page = Page(title, text + " ".join(thresholds), sections)
         write_atomically(options.out, page.html())
     print(f"The page: {options.out.resolve().as_uri()}")
 
 
-def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> Section:
+def _make_section(options: argparse.Namespace, recording: AudioInfo, make_sounds: Any) -> Section:
     """Return the section of the page for one audio file, with its player.
 
     Args:
         options: Options of the command.
-        file: Audio file.
+        recording: Properties of the audio file.
         make_sounds: Function from samples (channels, time), at the scale of
             ``options.full_scale_spl``, and their rate in Hz to a dict from label to sound.
 
@@ -107,14 +116,13 @@ def _make_section(options: argparse.Namespace, file: Path, make_sounds: Any) -> 
     """
     import torch
 
-    from hlsim.audio import read_parts, scan_audio
+    from hlsim.audio import read_parts
     from hlsim.calibration import gain_to_pascals
     from hlsim.files import convert_at
     from hlsim.report.page import Section
     from hlsim.report.players import make_player
 
-    recording = scan_audio(file)
-    rate = recording.sample_rate
+    file, rate = recording.path, recording.sample_rate
     level, gain_db = level_and_gain(recording.power, options)
     stop = min(recording.samples, max(1, round(options.seconds * rate)))
     (waveform,) = read_parts(recording, [(0, stop)])

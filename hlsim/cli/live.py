@@ -6,7 +6,12 @@ import argparse
 import math
 from typing import Any
 
-from hlsim.cli.inputs import build_compensator, parse_ear, read_sliders, warn_of_other_ears
+from hlsim.cli.inputs import (
+    build_single_microphone_aid,
+    parse_ear,
+    read_sliders,
+    warn_of_other_ears,
+)
 from hlsim.cli.options import AIDED_EARS, Parser, full_scale, positive_number
 
 
@@ -74,12 +79,7 @@ def _live(options: argparse.Namespace) -> None:
         block, latency = 12 * stream.block, stream.latency
     else:
         warn_of_other_ears({options.compensator: options.compensator}, ears)
-        aid = build_compensator(options, NEURO_RATE)
-        if getattr(aid, "takes_microphones", False):
-            raise ValueError(
-                f"{options.compensator} has several microphones, but there is one per ear; choose "
-                "an aid with one"
-            )
+        aid = build_single_microphone_aid(options, NEURO_RATE)
         stream = aid.stream(ears, **sliders)
         block = latency = aid.latency
     play(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from hlsim.cli.inputs import build_compensator, parse_ears, read_sliders
+from hlsim.cli.inputs import build_single_microphone_aid, parse_ears, read_sliders
 from hlsim.cli.options import Parser, count, seed, sound_level
 from hlsim.progress import ProgressLine
 
@@ -46,7 +46,7 @@ def _srt(options: argparse.Namespace) -> None:
     if options.loudness and not options.compensator:
         raise ValueError("--loudness has no effect without --compensator; add it, or leave it out")
     if options.compensator:
-        aid = build_compensator(options, NEURO_RATE)
+        aid = build_single_microphone_aid(options, NEURO_RATE)
     sliders: dict[str, Any] = {**read_sliders(options)}
     with ProgressLine("tests") as progress:
         result = reception_threshold(

@@ -15,7 +15,7 @@ from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram, as_audiogram
 from hlsim.audiogram.value import EarLike
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, Loudness, check_loudness, loudness_at
-from hlsim.checks import check_attributes
+from hlsim.checks import check_attributes, check_number
 from hlsim.data.clips import Clips
 from hlsim.data.manifest import read_manifest
 from hlsim.data.recorded_scenes import SceneClips, SceneFiles
@@ -53,6 +53,7 @@ from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.sounds import perceive_items
 from hlsim.evaluation.study import Condition
+from hlsim.metrics.pair import SHORTEST_SECONDS
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
 
@@ -163,6 +164,9 @@ def evaluate_compensators(
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
     loudness = check_loudness(loudness)
+    check_number("seconds", seconds, SHORTEST_SECONDS)
+    scores = find_measures(["haspi", "hasqi", *measures], precision)
+    network = load_pretrained(simulator)
     if (manifest is None) == (speech is None) or (noise is not None and speech is None):
         raise ValueError(
             "expected either speech, with or without noise, or a manifest; pass one of them"
@@ -237,11 +241,10 @@ def evaluate_compensators(
     for row in details["steady_tones"]:
         errors = zip(row["loudness_error_db"], targets, strict=True)
         row["loudness_error_db"] = [[tone - target for tone in tones] for tones, target in errors]
-    scores = find_measures(["haspi", "hasqi", *measures], precision)
     evaluation = Evaluation.run(
         drawn,
         conditions,
-        [*scores, LEVELS, PERCEPTION, network_loss(load_pretrained(simulator))],
+        [*scores, LEVELS, PERCEPTION, network_loss(network)],
         store=store,
         settings={
             **settings,

@@ -106,11 +106,12 @@ def evaluate_simulators(
         "levels": list(levels),
     }
     loaded = {label: load_simulator(simulator) for label, simulator in simulators.items()}
+    scores = [_fidelity_to(teacher), *map(load_measure, measures)]
     drawn = draw_simulator_items(speech, noise, audiograms, **settings)
     evaluation = Evaluation.run(
         apply_treatments(drawn, inputs, compensator),
         [Condition(name, module, "simulator") for name, module in loaded.items()],
-        [_fidelity_to(teacher), *map(load_measure, measures)],
+        scores,
         store=store,
         settings={"teacher": teacher, **settings, "inputs": inputs},
         **running,

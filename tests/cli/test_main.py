@@ -137,7 +137,21 @@ simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect
 train-simulator --speech {folder} --root {folder} --out o | no effect without --manifest
-evaluate-compensator nalr a=nalr a=wdrc --speech {folder} --out {out} | LABEL=NAME"""
+evaluate-compensator nalr a=nalr a=wdrc --speech {folder} --out {out} | LABEL=NAME
+listen {speech} --audiogram N3 --compensator hearing-aid-directional --out {out} | per ear
+srt --audiogram N3 --compensator hearing-aid-directional | one signal per ear
+listen {speech} --audiogram N3 --out {folder} | got a folder; add a name
+listen {speech} --audiogram N3 --out {text}/page.html | text.wav is a file
+listen {speech} {text} --audiogram N3 --simulator no-such --out {out} | text.wav: cannot
+haspi-report --clean {folder} --after {folder} --out {text} | text.wav is a file
+evaluate-compensator nalr --speech {folder} --out {text}/judged | text.wav is a file
+evaluate-compensator nalr --speech {folder} --seconds 0.6 --out {out} | a number from 0.7
+evaluate-compensator nalr --speech {folder} --simulator msbg --out {out} | checkpoint 'msbg'; e
+evaluate-compensator nalr --speech {folder} --measure none:f --out {out} | measure none:f
+evaluate-simulator msbg --speech {folder} --audiograms standard --teacher x --out o | checkpoint
+train-compensator --speech {folder} --recipe.weights.haspi 1 --out {out} | seconds is 0.6
+train-simulator --speech {folder} --recipe.levels [80,.nan] --out {out} | levels is (80.0, nan)
+train-compensator --speech {folder} --recipe.snr [20,0] --out {out} | snr is (20.0, 0.0)"""
 
 
 @pytest.mark.parametrize("line", ERRORS.splitlines())

@@ -50,7 +50,7 @@ def options(
     """Return settings of an evaluation that takes seconds."""
     measure_aids_briefly(monkeypatch)
     folders = {"speech": speech_dir / "valid", "noise": speech_dir / "train"}
-    settings = {"seconds": 0.4, "levels": (60.0, 75.0), "gain_ears": ("N3",)}
+    settings = {"seconds": 0.7, "levels": (60.0, 75.0), "gain_ears": ("N3",)}
     return {**folders, **settings, "jobs": 1}
 
 
@@ -268,7 +268,7 @@ def test_command(
     about = {"audiogram": Audiogram.standard("N4").to_dict()}
     save_checkpoint(tmp_path / "n4", "mapping-compensator", model, model.config.to_dict(), about)
     command = ["evaluate-compensator", f"mine={tmp_path / 'n4'}", "--speech", options["speech"]]
-    command += ["--items", "2", "--seconds", "0.4", "--out", tmp_path / "out", "--jobs", "1"]
+    command += ["--items", "2", "--seconds", "0.7", "--out", tmp_path / "out", "--jobs", "1"]
     command += ["--audiogram", "N3"]
     assert main([str(part) for part in command]) == 0
     printed = capsys.readouterr()

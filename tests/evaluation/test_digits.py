@@ -204,6 +204,7 @@ def test_sliders_reach_the_aid() -> None:
         ({"triplets": 3}, "triplets to be a whole number"),
         ({"seed": -1}, "seed"),
         ({"noise_reduction": 0.5}, "no effect without an aid"),
+        ({"aid": "hearing-aid-directional"}, "an aid with one microphone"),
         ({"aid": NALR(sample_rate=44100)}, "an aid with sample_rate=16000, got 44100"),
         ({"aid": NALR(full_scale_spl=100.0)}, "an aid with full_scale_spl=94"),
         ({"aid": lambda x, _: x[..., :-1]}, "return as many samples"),

@@ -279,8 +279,8 @@ def reception_threshold(
 
     Raises:
         ValueError: An ear, an aid, a simulator, a listener or a number is not valid, there are
-            sliders without an aid, the aid was built for another rate or level, or its output has
-            another shape or is not finite.
+            sliders without an aid, the aid was built for another rate or level or has several
+            microphones, or its output has another shape or is not finite.
 
     >>> import hlsim
     >>> result = hlsim.reception_threshold("N3", "nalr", simulator="attenuation", triplets=30)
@@ -300,6 +300,11 @@ def reception_threshold(
         function = load_compensator(aid) if isinstance(aid, str | Path) else aid
         settings = {"sample_rate": NEURO_RATE, "full_scale_spl": PASCAL_SPL}
         check_attributes(function, "an aid", **settings)
+        if getattr(function, "takes_microphones", False):
+            raise ValueError(
+                "expected an aid with one microphone, because the test has one signal per ear; "
+                "choose another aid"
+            )
         if isinstance(function, nn.Module):
             function.eval()
         aids.append(partial(function, **sliders))
