@@ -233,15 +233,6 @@ class BeamformingAid(DirectionalAid, HubModel):
         )
         self.config = replace(config, aid=aid_config.to_dict())
 
-    @property
-    def limit_to_ear(self) -> bool:
-        """Whether the hearing aid limits its bands to the uncomfortable levels of the ears."""
-        return bool(self.aid.limit_to_ear)
-
-    @limit_to_ear.setter
-    def limit_to_ear(self, value: bool) -> None:
-        self.aid.limit_to_ear = value
-
 
 def _subtract(frames: Tensor, weights: Tensor) -> Tensor:
     """Subtract the filtered signals without sound from the front from the beams.

@@ -442,6 +442,16 @@ class DirectionalAid(nn.Module):
         return stream
 
 
+def behind_front_end(aid: Any) -> Any:
+    """Return the hearing aid behind a front end, or the aid itself if it has no front end.
+
+    >>> from compensators import NALR
+    >>> type(behind_front_end(DirectionalAid(BinauralMVDR(), NALR()))).__name__
+    'NALR'
+    """
+    return aid.aid if isinstance(aid, DirectionalAid) else aid
+
+
 def look_ahead_samples(sample_rate: int) -> int:
     """Return the look-ahead of the filters in whole samples, at most 1 ms.
 

@@ -1,20 +1,15 @@
 """Loading of compensators by name, and saving of trained ones in folders."""
 
 import warnings
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torch import nn
-
 from compensators.beamformer import BeamformingAid
-from compensators.config import BeamformerConfig, HearingAidConfig, MappingConfig
-from compensators.directional import DirectionalAid
+from compensators.directional import behind_front_end
 from compensators.hearing_aid import LOUDNESS_RANGE, HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR, NALRP
 from compensators.wdrc import CAMFIT, WDRC
-from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record
@@ -22,12 +17,10 @@ from hlsim.checks import check_flag, check_number, check_rate
 
 Trained = MappingCompensator | HearingAid | BeamformingAid
 
-Config = MappingConfig | HearingAidConfig | BeamformerConfig
-
-CONFIGS: dict[str, type[Config]] = {
-    kind.kind: kind.config_class for kind in (MappingCompensator, HearingAid, BeamformingAid)
+TRAINED: dict[str, type[Trained]] = {
+    aid.kind: aid for aid in (MappingCompensator, HearingAid, BeamformingAid)
 }
-"""Class of the settings of each kind of compensator, by the name of the kind in ``config.json``."""
+"""Class of each kind of compensator with weights, by the name of the kind in ``config.json``."""
 
 UNTRAINED: dict[str, type[NALR | WDRC]] = {
     "nalr": NALR,
@@ -36,23 +29,6 @@ UNTRAINED: dict[str, type[NALR | WDRC]] = {
     "camfit": CAMFIT,
 }
 """Compensators without a checkpoint."""
-
-
-def build_compensator(config: Config, **levels: Any) -> Trained:
-    """Build an untrained compensator from its settings.
-
-    Args:
-        config: Settings. Their class selects the kind of compensator.
-        levels: Arguments ``sample_rate`` and ``full_scale_spl``, as in ``load_compensator``.
-
-    >>> build_compensator(HearingAidConfig(bands=12)).bands
-    12
-    """
-    if isinstance(config, BeamformerConfig):
-        return BeamformingAid(config=config, **levels)
-    if isinstance(config, HearingAidConfig):
-        return HearingAid(config=config, **levels)
-    return MappingCompensator(config=config, **levels)
 
 
 def load_compensator(
@@ -100,36 +76,19 @@ def load_compensator(
     if str(name) in UNTRAINED:
         compensator = UNTRAINED[str(name)](**levels)
     else:
-        build = partial(build_compensator, **levels)
-        kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
-        compensator = read_checkpoint(name, kinds, build)
-    compensator.eval().requires_grad_(False)
-    amplifier = _amplifier(compensator)
-    if isinstance(amplifier, Wearable):
-        amplifier.linked = linked
-        amplifier.limit_to_ear = limit_to_ear
-    elif linked:
-        raise ValueError(
-            f"{name} cannot link its gains between ears; load wdrc or hearing-aid, or leave out "
-            "linked"
-        )
-    elif limit_to_ear:
-        raise ValueError(
-            f"{name} cannot limit its bands to the ear; load wdrc, camfit or hearing-aid, or leave "
-            "out limit_to_ear"
-        )
-    if isinstance(amplifier, HearingAid):
-        amplifier.loudness = loudness
-    elif loudness:
-        raise ValueError(
-            f"{name} has no loudness to choose; load hearing-aid, or leave out loudness"
-        )
+        compensator = read_checkpoint(name, [*TRAINED.values()], **levels)
+    compensator.eval()
+    amplifier = behind_front_end(compensator)
+    settings = {"linked": linked, "limit_to_ear": limit_to_ear, "loudness": loudness}
+    for setting, value in settings.items():
+        if hasattr(amplifier, setting):
+            setattr(amplifier, setting, value)
+        elif value:
+            raise ValueError(
+                f"{name} has no setting {setting}; load an aid that has it, such as hearing-aid, "
+                f"or leave out {setting}"
+            )
     return compensator
-
-
-def _amplifier(compensator: nn.Module) -> nn.Module:
-    """Return the aid behind a front end, or the compensator itself if it has no front end."""
-    return compensator.aid if isinstance(compensator, DirectionalAid) else compensator
 
 
 def save_compensator(
@@ -161,7 +120,7 @@ def save_compensator(
             "expected a MappingCompensator, a HearingAid or a BeamformingAid to save, got "
             f"{type(model).__name__}"
         )
-    loudness = getattr(_amplifier(model), "loudness", 0.0)
+    loudness = getattr(behind_front_end(model), "loudness", 0.0)
     if loudness:
         warnings.warn(
             f"the loudness of {loudness:g} dB is not saved; pass it to load_compensator",

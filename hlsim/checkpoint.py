@@ -11,10 +11,10 @@ loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import safetensors
 import safetensors.torch
@@ -26,8 +26,6 @@ from hlsim.extras import require
 from hlsim.files import atomic_path, read_json, write_atomically
 from hlsim.version import __version__
 
-Model = TypeVar("Model", bound=nn.Module)
-Config = TypeVar("Config")
 Settings = Mapping[str, Any]
 
 WEIGHTS = "model.safetensors"
@@ -78,35 +76,31 @@ def _loader_name(kind: str) -> str:
     return _LOADERS.get(kind, "load_compensator")
 
 
-def read_checkpoint(
-    name: str | Path,
-    kinds: Mapping[str, Callable[[Settings], Config]],
-    build: Callable[[Config], Model],
-) -> Model:
-    """Load a model from a checkpoint onto torch's default device.
+def read_checkpoint(name: str | Path, classes: Sequence[Any], **options: Any) -> Any:
+    """Load a model from a checkpoint, in evaluation mode and without gradients of its weights.
 
-    If the default device is ``meta``, which stores no values, the model is loaded onto the CPU.
+    The model is on torch's default device. If this is ``meta``, which stores no values, the model
+    is on the CPU.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
-        kinds: Accepted kinds of checkpoints. The value of each kind is a function that converts the
-            settings in ``config.json`` to the argument of ``build``.
-        build: Function that builds the model, whose weights are then loaded.
+        classes: Classes of the accepted kinds of checkpoints, which extend ``HubModel``.
+        options: Further arguments of the class of the checkpoint.
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, or its kind is not accepted.
 
-    >>> from hlsim.neuro import NeuroConfig, NeuroMSBG
-    >>> kinds = {SIMULATOR: NeuroConfig.from_dict}
-    >>> read_checkpoint("neuro-msbg", kinds, NeuroMSBG).config.blocks
+    >>> from hlsim.neuro import NeuroMSBG
+    >>> read_checkpoint("neuro-msbg", [NeuroMSBG]).config.blocks
     1
     """
+    class_of = {model_class.kind: model_class for model_class in classes}
     folder = _find_folder(name)
     record = read_record(folder)
     kind = str(record.get("kind"))
-    if kind not in kinds:
+    if kind not in class_of:
         raise ValueError(
-            f"{folder}: expected a checkpoint of kind {' or '.join(kinds)}, got {kind}; load it "
+            f"{folder}: expected a checkpoint of kind {' or '.join(class_of)}, got {kind}; load it "
             f"with {_loader_name(kind)}"
         )
     weights = read_weights(folder)
@@ -116,11 +110,14 @@ def read_checkpoint(
         # Gradients may flow through the model later, hence no inference mode. Initialisation must
         # not advance the caller's random numbers.
         with torch.inference_mode(False), torch.device("cpu"), torch.random.fork_rng(devices=[]):
-            model = build(kinds[kind](settings))
+            model_class = class_of[kind]
+            config = model_class.config_class.from_dict(settings)
+            model = model_class(config=config, **{**model_class.build_options, **options})
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, ValueError, RuntimeError, safetensors.SafetensorError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"{folder}: weights and configuration do not fit: {reason}") from error
+    model.eval().requires_grad_(False)
     device = torch.get_default_device()
     if device.type == "meta":
         return model
@@ -331,7 +328,7 @@ class HubModel:
     without this package.
 
     Subclasses define ``kind``, ``config_class`` and ``config``, and may define ``build_options``,
-    arguments of the class that ``from_pretrained`` passes to it.
+    arguments with which the class is built when a checkpoint is loaded.
 
     >>> import hlsim
     >>> with TemporaryDirectory() as folder:
@@ -413,11 +410,7 @@ class HubModel:
                 token=token,
                 allow_patterns=files,
             )
-        options = {**cls.build_options, **settings}
-        kinds = {cls.kind: cls.config_class.from_dict}
-        build: Any = cls
-        model: Any = read_checkpoint(folder, kinds, lambda config: build(config=config, **options))
-        return cast(Self, model.eval().requires_grad_(False))
+        return cast(Self, read_checkpoint(folder, [cls], **settings))
 
     def push_to_hub(
         self,

@@ -116,7 +116,7 @@ def test_cells_of_notebooks_that_train_or_score_show_their_progress() -> None:
 def test_recipes_are_readable() -> None:
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("lightning")
-    from compensators.loading import CONFIGS
+    from compensators.loading import TRAINED
     from hlsim.neuro import NeuroConfig
     from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
@@ -126,4 +126,4 @@ def test_recipes_are_readable() -> None:
             NeuroConfig.from_dict(SimulatorRecipe(**settings).model)
         else:
             recipe = CompensatorRecipe(**settings)
-            CONFIGS[recipe.kind].from_dict(recipe.model)
+            TRAINED[recipe.kind].config_class.from_dict(recipe.model)

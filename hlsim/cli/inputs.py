@@ -234,6 +234,7 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
         ValueError: There is no such compensator, or it lacks a slider that is set.
     """
     from compensators import load_compensator
+    from compensators.directional import behind_front_end
 
     compensator = load_compensator(
         options.compensator,
@@ -244,7 +245,7 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
         loudness=getattr(options, "loudness", 0.0),
     )
     # A directional aid passes the sliders to the hearing aid behind its front end.
-    amplifier = getattr(compensator, "aid", compensator)
+    amplifier = behind_front_end(compensator)
     if not read_sliders(options).keys() <= {*getattr(amplifier, "SLIDERS", ())}:
         raise ValueError(
             f"--noise-reduction and --amplification have no effect with {options.compensator}; "

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from compensators.directional import behind_front_end
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram, as_audiogram
@@ -253,7 +254,9 @@ def evaluate_compensators(
             "loudness": loudness,
             "audiogram": None if audiogram is None else as_audiogram(audiogram).to_dict(),
             "limited_to_ear": [
-                name for name, aid in compensators.items() if getattr(aid, "limit_to_ear", False)
+                name
+                for name, aid in compensators.items()
+                if getattr(behind_front_end(aid), "limit_to_ear", False)
             ],
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),

@@ -1,6 +1,5 @@
 """Neuro-MSBG, a neural network that emulates MSBG, and a function that loads trained networks."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -324,8 +323,6 @@ def load_pretrained(
     torch.Size([2, 16000])
     """
     check_rate(sample_rate)
-    build = partial(
-        NeuroMSBG, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
-    )
-    model = read_checkpoint(name, {SIMULATOR: NeuroConfig.from_dict}, build)
-    return model.eval().requires_grad_(False)
+    levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+    model: NeuroMSBG = read_checkpoint(name, [NeuroMSBG], **levels)
+    return model

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from compensators.beamformer import BeamformingAid
 from compensators.config import BeamformerConfig
 from compensators.hearing_aid import HearingAid
-from compensators.loading import CONFIGS, build_compensator, load_compensator
+from compensators.loading import TRAINED, load_compensator
 from hlsim.audiogram import Audiogram
 from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.training.batches import Batch, TrainingData, make_data
@@ -52,11 +52,12 @@ class CompensatorTraining(TrainingModule):
     recipe: CompensatorRecipe
 
     def __init__(self, recipe: CompensatorRecipe, *, simulator: Simulator = "neuro-msbg") -> None:
-        config = CONFIGS[recipe.kind].from_dict(recipe.model)
+        aid_class = TRAINED[recipe.kind]
+        config: Any = aid_class.config_class.from_dict(recipe.model)
         load: Callable[[str], nn.Module] = load_compensator
         if isinstance(config, BeamformerConfig):
             load = partial(_load_beamforming_aid, config)
-        network = initial_network(recipe, partial(build_compensator, config), load)
+        network = initial_network(recipe, partial(aid_class, config=config), load)
         if isinstance(network, HearingAid):
             network.limit_to_ear = recipe.limit_to_ear
         elif isinstance(config, BeamformerConfig) and network.config.spacing != config.spacing:
@@ -171,7 +172,6 @@ def train_compensator(
     return train_network(
         CompensatorTraining(recipe, simulator=simulator),
         make_data(data, recipe, audiogram),
-        recipe.kind,
         out=out,
         about=about,
         **options,

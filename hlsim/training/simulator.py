@@ -10,7 +10,6 @@ import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch import Tensor, nn
 
-from hlsim.checkpoint import SIMULATOR
 from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import paper_parts
 from hlsim.losses.teacher_distance import (
@@ -150,7 +149,6 @@ def train_simulator(
     return train_network(
         SimulatorTraining(recipe, load_simulator(teacher)),
         make_data(data, recipe),
-        SIMULATOR,
         out=out,
         about={"data": data.identity(), **describe_simulator("teacher", teacher)},
         callbacks=[EMAWeightAveraging(use_buffers=False, decay=recipe.average)],

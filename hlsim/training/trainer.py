@@ -23,7 +23,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
-from hlsim.checkpoint import CONFIG, read_record, read_weights, save_checkpoint
+from hlsim.checkpoint import CONFIG, read_record, read_weights
 from hlsim.files import lock_folder, write_atomically
 from hlsim.progress import ProgressLine, clear_line
 from hlsim.training.batches import BatchData
@@ -45,20 +45,18 @@ class BestCheckpoint(L.Callback):
 
     Args:
         folder: Folder to write, which ``load_pretrained`` or ``load_compensator`` reads.
-        kind: Kind of the checkpoint, such as ``"hearing-aid"``.
         record: Entries about the training for the checkpoint's ``config.json``. Results of the
             first validation are added to it.
 
     Attributes:
         best_score: Highest validation score so far.
 
-    >>> BestCheckpoint(Path("runs"), "hearing-aid", record={"seed": 0}).best_score
+    >>> BestCheckpoint(Path("runs"), record={"seed": 0}).best_score
     -inf
     """
 
-    def __init__(self, folder: Path, kind: str, record: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, record: dict[str, Any]) -> None:
         self.folder = folder
-        self.kind = kind
         self.record = record
         self.best_score = -math.inf
 
@@ -105,7 +103,7 @@ class BestCheckpoint(L.Callback):
             "validation": module.validation,
         }
         if module.trainer.is_global_zero:
-            save_checkpoint(self.folder, self.kind, network, network.config.to_dict(), record)
+            network.save_pretrained(self.folder, about=record)
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
@@ -176,7 +174,6 @@ class StepProgress(L.Callback):
 def train_network(
     module: TrainingModule,
     data: BatchData,
-    kind: str,
     *,
     out: str | Path,
     about: Mapping[str, Any],
@@ -189,7 +186,6 @@ def train_network(
     Args:
         module: Network, loss and recipe.
         data: Batches for training and validation.
-        kind: Kind of the checkpoint, such as ``"hearing-aid"``.
         out: Folder for the checkpoint, Lightning's state and TensorBoard's events. If it contains a
             state, the training resumes from it.
         about: Description of data and teacher for the checkpoint's ``config.json``. A training
@@ -224,7 +220,7 @@ def train_network(
         save_on_train_epoch_end=False,
         enable_version_counter=False,
     )
-    best = BestCheckpoint(folder / "checkpoint", kind, record)
+    best = BestCheckpoint(folder / "checkpoint", record)
     callbacks = [Timer(duration, verbose=False), *callbacks, best, last]
     if not options.setdefault("enable_progress_bar", False):
         callbacks.append(StepProgress())

@@ -16,15 +16,17 @@ pytest.importorskip("lightning")
 
 from lightning.pytorch.callbacks import EMAWeightAveraging
 
-from hlsim.checkpoint import read_record
+from hlsim.checkpoint import HubModel, read_record
 from hlsim.training.batches import MAX_DEVICES, Batch, BatchData
 from hlsim.training.module import TrainingModule, relative_learning_rate
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.trainer import train_network
 
 
-class Vector(nn.Module):
+class Vector(nn.Module, HubModel):
     """A network whose only parameter is a vector."""
+
+    kind = "vector"
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,7 +92,7 @@ def run(module: VectorTraining, out: Path, **options: Any) -> Path:
     data = BatchData(NoisyTargets(), [{}])
     settings: dict[str, Any] = {"about": {}, "accelerator": "cpu"}
     settings["callbacks"] = [EMAWeightAveraging(use_buffers=False, decay=0.9)]
-    return train_network(module, data, "vector", out=out, **settings | options)
+    return train_network(module, data, out=out, **settings | options)
 
 
 def last_state(out: Path) -> dict[str, Any]:

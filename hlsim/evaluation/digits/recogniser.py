@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.calibration import NEURO_RATE
-from hlsim.checkpoint import DIGIT_LISTENER, read_checkpoint
+from hlsim.checkpoint import DIGIT_LISTENER, HubModel, read_checkpoint
 from hlsim.checks import check_number
 from hlsim.data.bundled import SLOT_SAMPLES
 from hlsim.dsp.erb import erb_frequency, erb_number
@@ -56,7 +56,7 @@ class DigitListenerConfig(ModelConfig):
         check_number("channels", self.channels, 1, 256, whole=True)
 
 
-class DigitListener(nn.Module):
+class DigitListener(nn.Module, HubModel):
     """Recogniser of digits in what an ear perceives, which knows when each digit begins.
 
     It computes the level over time in frequency bands. The part of each digit, a picture of bands
@@ -70,6 +70,8 @@ class DigitListener(nn.Module):
     torch.Size([2, 3, 10])
     """
 
+    kind = DIGIT_LISTENER
+    config_class = DigitListenerConfig
     bands: Tensor
 
     def __init__(self, config: DigitListenerConfig | None = None) -> None:
@@ -138,6 +140,5 @@ def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
     >>> load_listener().config.bands
     40
     """
-    kinds = {DIGIT_LISTENER: DigitListenerConfig.from_dict}
-    listener = read_checkpoint(name, kinds, DigitListener)
-    return listener.eval().requires_grad_(False)
+    listener: DigitListener = read_checkpoint(name, [DigitListener])
+    return listener
