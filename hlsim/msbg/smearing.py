@@ -91,38 +91,6 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
     return filters
 
 
-def smearing_from_filters(
-    normal: NDArray[np.float64], wide: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Compute a matrix that makes a normal ear perceive a power spectrum as an impaired ear does.
-
-    The matrix is multiplied by the power spectrum. The filters of the normal ear have nearly the
-    same outputs for the product as the filters of the impaired ear for the spectrum itself:
-    ``normal @ matrix`` approximates ``wide``.
-
-    Shape: (count, count), (count, count) -> (count, count).
-
-    Args:
-        normal: Filters of a normal ear, from ``roex_filters``.
-        wide: Filters of an impaired ear, from ``roex_filters``.
-
-    >>> filters = roex_filters(1.0, 1.0, count=8, spacing=1000.0)
-    >>> print(smearing_from_filters(filters, filters).shape)
-    (8, 8)
-    """
-    count = len(normal)
-    half = count // 2
-    # Above the highest frequency, each filter continues with the mirror image of its lower side.
-    # Without this continuation, the division would ring.
-    extended = np.concatenate((normal, np.zeros((count, half))), axis=1)
-    for i in range(half, count):
-        stop = min(2 * i - 1, 3 * half)
-        mirrored = normal[i, 2 * i - count : max(1, 2 * i - 3 * half) : -1]
-        extended[i, count:stop] = mirrored[: stop - count]
-    solution = np.linalg.lstsq(extended, wide, rcond=-1)[0]
-    return np.asarray(solution[:count], dtype=np.float64)
-
-
 @constant
 def smearing_matrix(
     severity: str, rate_divisor: int = 1, highest: float = MSBG_RATE / 2.0
@@ -144,11 +112,39 @@ def smearing_matrix(
     (103, 103)
     """
     bins = min(FFT // 2 // rate_divisor, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
-    count = FFT // 2
-    spacing = MSBG_RATE / FFT
+    return design_smearing(severity, FFT // 2, MSBG_RATE / FFT)[:bins, :bins]
+
+
+def design_smearing(severity: str, count: int, spacing: float) -> NDArray[np.float64]:
+    """Compute a matrix that makes a normal ear perceive a power spectrum as an impaired ear does.
+
+    The matrix is multiplied by the power spectrum. The filters of the normal ear have nearly the
+    same outputs for the product as the filters of the impaired ear for the spectrum itself:
+    ``normal @ matrix`` approximates ``wide``.
+
+    Args:
+        severity: Severity of the hearing loss, ``"mild"``, ``"moderate"`` or ``"severe"``.
+        count: Number of frequencies, and of filters of each ear.
+        spacing: Distance in Hz between frequencies, the first of which is 0 Hz.
+
+    Returns:
+        Matrix, (count, count).
+
+    >>> design_smearing("mild", count=8, spacing=1000.0).shape
+    (8, 8)
+    """
     normal = roex_filters(1.0, 1.0, count, spacing)
     wide = roex_filters(*BROADENING[severity], count, spacing)
-    return smearing_from_filters(normal, wide)[:bins, :bins]
+    half = count // 2
+    # Above the highest frequency, each filter continues with the mirror image of its lower side.
+    # Without this continuation, the division would ring.
+    extended = np.concatenate((normal, np.zeros((count, half))), axis=1)
+    for i in range(half, count):
+        stop = min(2 * i - 1, 3 * half)
+        mirrored = normal[i, 2 * i - count : max(1, 2 * i - 3 * half) : -1]
+        extended[i, count:stop] = mirrored[: stop - count]
+    solution = np.linalg.lstsq(extended, wide, rcond=-1)[0]
+    return np.asarray(solution[:count], dtype=np.float64)
 
 
 def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:

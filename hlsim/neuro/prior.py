@@ -35,13 +35,7 @@ from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filter_bank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.response import fixed_response, half_length, impulse_responses
-from hlsim.msbg.smearing import (
-    BROADENING,
-    FFT,
-    roex_filters,
-    smearing_from_filters,
-    smearing_matrix,
-)
+from hlsim.msbg.smearing import FFT, design_smearing
 from hlsim.torchtools import constant
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
@@ -410,15 +404,12 @@ def _smearing_matrix(severity: str, stft: STFT, rate: float) -> NDArray[np.float
         Matrix for power spectra behind the middle ear, (frequencies, frequencies).
     """
     spacing = rate / stft.fft
-    if spacing == MSBG_RATE / FFT:
-        matrix = smearing_matrix(severity)
-    else:
+    count = FFT // 2
+    if spacing != MSBG_RATE / FFT:
         # As MSBG's, the filters cover more than the frequencies of the transform, up to about 20
         # kHz.
         count = round(20000.0 / spacing / 4.0) * 4
-        normal = roex_filters(1.0, 1.0, count, spacing)
-        wide = roex_filters(*BROADENING[severity], count, spacing)
-        matrix = smearing_from_filters(normal, wide)
+    matrix = design_smearing(severity, count, spacing)
     return matrix[: stft.frequencies, : stft.frequencies]
 
 
