@@ -20,7 +20,7 @@ from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_weights
 from hlsim.dsp.resample import resample
 from hlsim.losses import coherent_bands, paper
-from hlsim.losses.frozen_simulator import Reference, check_shape
+from hlsim.losses.frozen_simulator import ReferenceKind, check_shape
 from hlsim.losses.interaural import interaural_loss
 from hlsim.losses.score_loss import SCORES, score_loss
 from hlsim.metrics.band_levels import band_level_loss
@@ -99,7 +99,7 @@ class Criterion:
 
     weights: Mapping[str, float]
     compute: Callable[[Comparison], dict[str, Tensor]]
-    reference: Reference | None
+    reference: ReferenceKind | None
     limits_gradient: bool = False
     handles_padding: bool = False
     two_ears: bool = False
@@ -159,18 +159,18 @@ CRITERIA = {
     "coherent-bands": Criterion(
         weights=coherent_bands.DEFAULT_WEIGHTS,
         compute=_coherent_bands,
-        reference=Reference(is_fixed=True),
+        reference=ReferenceKind(is_fixed=True),
         limits_gradient=True,
     ),
     "bands": Criterion(
         weights={"band_levels": 1.0},
         compute=_bands,
-        reference=Reference(is_fixed=True, normal_ear="simulator", bank_phase=False),
+        reference=ReferenceKind(is_fixed=True, normal_ear="simulator", bank_phase=False),
     ),
     "paper": Criterion(
         weights=paper.DEFAULT_WEIGHTS,
         compute=_paper,
-        reference=Reference("clean", normal_ear="simulator"),
+        reference=ReferenceKind("clean", normal_ear="simulator"),
     ),
     **{
         name: Criterion(
@@ -202,7 +202,7 @@ def function_criterion(function: Callable[[Tensor, Tensor], Tensor]) -> Criterio
     ['criterion']
     """
     return Criterion(
-        weights={"criterion": 1.0}, compute=partial(_call, function), reference=Reference()
+        weights={"criterion": 1.0}, compute=partial(_call, function), reference=ReferenceKind()
     )
 
 

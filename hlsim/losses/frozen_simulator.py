@@ -20,7 +20,7 @@ ReferenceName = Literal["clean", "normal-hearing"]
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceKind:
     """Signal with which a criterion compares what an impaired ear perceives.
 
     Attributes:
@@ -33,7 +33,7 @@ class Reference:
         bank_phase: Whether the reference gets the phase of MSBG's filter bank for the impaired ear,
             if the simulator emulates MSBG.
 
-    >>> Reference("clean").bank_phase
+    >>> ReferenceKind("clean").bank_phase
     True
     """
 
@@ -133,7 +133,7 @@ class FrozenSimulator:
 
     def compute_reference(
         self,
-        reference: Reference | None,
+        reference: ReferenceKind | None,
         clean: Tensor,
         thresholds: Tensor,
         batch: torch.Size,

@@ -33,7 +33,7 @@ from hlsim.checks import (
     check_waveform,
 )
 from hlsim.losses.criteria import Comparison, CriterionLike, read_criterion, weighted_sum
-from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, Reference, ReferenceName
+from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceKind, ReferenceName
 from hlsim.losses.gradient_limit import limit_gradient_spikes
 from hlsim.torchtools import flatten_items, not_compiled, silence_after
 
@@ -293,7 +293,7 @@ class HearingLossLoss(nn.Module):
         with torch.autocast(clean.device.type, enabled=False):
             perceived = self._frozen.simulate(output, ears, ends)
             batch = perceived.shape[:-1]
-            reference = self._compute_reference(Reference(), clean, ears, batch, ends)
+            reference = self._compute_reference(ReferenceKind(), clean, ears, batch, ends)
             if ends is not None:
                 perceived = silence_after(perceived, ends)
                 reference = silence_after(reference, ends)
@@ -392,7 +392,7 @@ class HearingLossLoss(nn.Module):
 
     def _compute_reference(
         self,
-        reference: Reference | None,
+        reference: ReferenceKind | None,
         clean: Tensor,
         ears: Tensor,
         batch: torch.Size,

@@ -16,7 +16,7 @@ from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
 from hlsim.losses.coherent_bands import coherent_band_parts
 from hlsim.losses.criteria import CRITERIA, Comparison, Criterion
-from hlsim.losses.frozen_simulator import Reference
+from hlsim.losses.frozen_simulator import ReferenceKind
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics.band_levels import band_level_loss
 from hlsim.msbg.response import apply_bank_phase
@@ -368,7 +368,7 @@ def test_new_criterion_is_one_entry_and_one_function(
         return {"softer": (powers[1] - powers[0]).relu(), "louder": (powers[0] - powers[1]).relu()}
 
     entry = Criterion(
-        weights={"softer": 1.0, "louder": 2.0}, compute=compare_powers, reference=Reference()
+        weights={"softer": 1.0, "louder": 2.0}, compute=compare_powers, reference=ReferenceKind()
     )
     monkeypatch.setitem(CRITERIA, "power", entry)
     assert "power" in CompensatorRecipe(weights={"power": 1.0}).criteria()
