@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
@@ -227,20 +226,3 @@ def _replace_nonfinite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_replace_nonfinite(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def predict_words(scores: Iterable[float]) -> float:
-    """Predict which share of words, 0 to 1, a new listener understands with one aid, from HASPI.
-
-    Args:
-        scores: HASPI v2 of one or more sentences. NaN is ignored, and other values are limited to 0
-            to 1.
-
-    Raises:
-        ValueError: There are no scores, or all are NaN.
-
-    >>> predict_words([0.2]) < predict_words([0.8, math.nan])
-    True
-    """
-    haspi = np.array([score for score in scores if not math.isnan(score)]).clip(0.0, 1.0)
-    return words_change(haspi, haspi).before

@@ -172,6 +172,24 @@ def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = No
     )
 
 
+def predict_words(scores: ArrayLike) -> float:
+    """Predict which share of words, 0 to 1, a new listener understands with one aid, from HASPI.
+
+    Args:
+        scores: HASPI v2 of one or more sentences. NaN is ignored, and other values are limited to 0
+            to 1.
+
+    Raises:
+        ValueError: There are no scores, or all are NaN.
+
+    >>> predict_words([0.2]) < predict_words([0.8, math.nan])
+    True
+    """
+    array = np.asarray(scores, dtype=np.float64)
+    haspi = array[~np.isnan(array)].clip(0.0, 1.0)
+    return words_change(haspi, haspi).before
+
+
 def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
     """Convert HASPI scores to a float64 array, (items,), and return it with its mean.
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from hlsim.evaluation.conditions import NAL_R, NAL_R_AT_LEVEL, TRAINED
-from hlsim.evaluation.result import Evaluation, predict_words
+from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.sounds import NORMAL_EAR
+from hlsim.metrics.words import predict_words
 from hlsim.report.page import Card, Page, Picture, Section, Table
 from hlsim.report.players import make_player
 from hlsim.report.plots import (
