@@ -65,7 +65,7 @@ The first two have the target without its room, and its level in the room is tha
 """
 
 _CLARITY = "scenes of the Clarity challenges"
-"""Name of the layout of ``_read_scenes``."""
+"""Name of the layout of ``_read_clarity_scenes``."""
 
 _CLARITY_MIXTURE = re.compile(r"(?P<scene>.+)_(mix|mixed)_CH(?P<microphone>[1-9])\.wav")
 """Pattern of the path of a file with the signals of a microphone at both ears."""
@@ -217,7 +217,7 @@ def recognise(
         pattern = "/".join(_LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
         return layout, _read_utterances(files, pattern, layout)
     if any(map(_CLARITY_MIXTURE.fullmatch, files)):
-        return _CLARITY, _read_scenes(files)
+        return _CLARITY, _read_clarity_scenes(files)
     top = {file.split("/")[0] for file in files}
     only_folder = f"({re.escape(top.pop())}/)?" if len(top) == 1 else ""
     for layout, pattern in _LAYOUTS.items():
@@ -267,7 +267,7 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
     return rows
 
 
-def _read_scenes(files: Sequence[str]) -> list[Utterance]:
+def _read_clarity_scenes(files: Sequence[str]) -> list[Utterance]:
     """Convert the paths of Clarity's scenes to utterances, whose reference is microphone 1.
 
     The interferers and other files are not used.

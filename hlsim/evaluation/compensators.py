@@ -188,7 +188,7 @@ def evaluate_compensators(
     rival_name, rival_aid = load_rival(rival, [*ears_of_aids.values(), *dict(ears).values()])
     for name in compensators.keys() & {UNAIDED, NAL_R, COMPRESSION, rival_name}:
         raise ValueError(f"{name} is always evaluated; give the compensator another name")
-    scenes = None if manifest is None else _read_scenes(manifest, root, seconds)
+    scenes = None if manifest is None else _read_scene_clips(manifest, root, seconds)
     aids_of_microphones = [name for name, aid in compensators.items() if takes_microphones(aid)]
     if aids_of_microphones and (scenes is None or srt):
         raise ValueError(
@@ -282,7 +282,7 @@ def evaluate_compensators(
     return replace(evaluation, groups=groups, sounds=sounds)
 
 
-def _read_scenes(manifest: str | Path, root: str | Path | None, seconds: float) -> SceneClips:
+def _read_scene_clips(manifest: str | Path, root: str | Path | None, seconds: float) -> SceneClips:
     """Return clips of the scenes in the split test of a manifest, or else in its split valid.
 
     Raises:
