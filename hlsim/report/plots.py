@@ -289,9 +289,7 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
     means: list[tuple[str, float, tuple[float, float] | None]] = []
     for name in scores:
         values = scores[name].dropna().to_numpy()
-        is_enough = len(values) >= MIN_ITEMS_FOR_INTERVAL
-        interval = bootstrap_interval(values) if is_enough else None
-        means.append((name, float(values.mean()), interval))
+        means.append((name, float(values.mean()), bootstrap_interval(values)))
 
     def draw(axes: Any) -> None:
         for place, (name, mean, interval) in enumerate(means):
