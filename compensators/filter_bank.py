@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.published import SPEECH_SPECTRUM
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power
@@ -51,14 +52,6 @@ GRID_POINTS = 4096
 
 SPEECH_SPL = 65.0
 """Level in dB SPL at which average speech is presented."""
-
-# Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's:
-# Byrne et al. 1994, Journal of the Acoustical Society of America 96(4)
-SPEECH_SPECTRUM = {
-    63: 38.6, 80: 43.5, 100: 54.4, 125: 57.7, 160: 56.8, 200: 60.2, 250: 60.3, 315: 59.0,
-    400: 62.1, 500: 62.1, 630: 60.5, 800: 56.8, 1000: 53.7, 1250: 53.0, 1600: 52.0, 2000: 48.7,
-    2500: 48.1, 3150: 46.8, 4000: 45.6, 5000: 44.5, 6300: 44.3, 8000: 43.7,
-}  # fmt: skip
 
 
 @lru_cache(maxsize=8)

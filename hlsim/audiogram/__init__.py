@@ -8,6 +8,7 @@ Wherever an ear is expected, an ``Audiogram``, a name such as ``"N3"``, eight th
 of frequencies to thresholds will do.
 """
 
+from hlsim.audiogram.published import STANDARD
 from hlsim.audiogram.scale import (
     FREQUENCIES,
     HIGHEST_LEVEL,
@@ -15,7 +16,6 @@ from hlsim.audiogram.scale import (
     LOWEST_LEVEL,
     SEVERITIES,
 )
-from hlsim.audiogram.standard import STANDARD
 from hlsim.audiogram.value import Audiogram, as_audiogram, severity_index
 
 __all__ = [

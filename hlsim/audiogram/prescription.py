@@ -15,6 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.published import (
+    CAMBRIDGE_INTERCEPTS,
+    FREE_FIELD_THRESHOLD_SPL,
+    NALRP_CORRECTIONS,
+)
 from hlsim.audiogram.scale import FREQUENCIES
 from hlsim.torchtools import constant
 
@@ -40,19 +45,6 @@ LOWEST_CAMFIT_SLOPE = 13.0 / SPEECH_RANGE_DB - 1.0
 
 CAMFIT_LIMIT_SPL = 100.0
 """Level in dB SPL beyond which CAMFIT amplifies no band."""
-
-# Level in dB SPL of 0 dB HL, for tones in a free field from the front: ISO 389-7:2005
-FREE_FIELD_THRESHOLD_SPL = {
-    125: 22.1, 160: 17.9, 200: 14.4, 250: 11.4, 315: 8.6, 400: 6.2, 500: 4.4, 630: 3.0, 800: 2.2,
-    1000: 2.4, 1250: 3.5, 1600: 1.7, 2000: -1.3, 2500: -4.2, 3150: -6.0, 4000: -5.4, 5000: -1.5,
-    6300: 6.0, 8000: 12.6, 10000: 13.9, 12500: 12.3,
-}  # fmt: skip
-
-# Constant of the Cambridge formula in dB; above 5 kHz it stays the same
-CAMBRIDGE_INTERCEPTS = {
-    125: -11.0, 250: -10.0, 500: -8.0, 750: -6.0, 1000: 0.0, 1500: -1.0, 2000: 1.0, 3000: -1.0,
-    4000: 0.0, 5000: 1.0,
-}  # fmt: skip
 
 
 class CompressiveGains(NamedTuple):
@@ -267,19 +259,8 @@ def _nalrp_bias() -> list[float]:
 
 @constant
 def _profound_corrections() -> list[list[float]]:
-    """Return NAL-RP's corrections in dB for profound losses (1991, Figure 9). Shape: (7, 8).
-
-    The rows are thresholds of 90, 95, ... 120 dB HL at 2 kHz, the columns ``NALRP_FREQUENCIES``.
-    """
-    return [
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [4.0, 3.0, 0.0, -1.0, -2.0, -2.0, -2.0, -2.0],
-        [6.0, 4.0, 0.0, -2.0, -3.0, -3.0, -3.0, -3.0],
-        [8.0, 5.0, 0.0, -3.0, -5.0, -5.0, -5.0, -5.0],
-        [11.0, 7.0, 0.0, -3.0, -6.0, -6.0, -6.0, -6.0],
-        [13.0, 8.0, 0.0, -4.0, -8.0, -8.0, -8.0, -8.0],
-        [15.0, 9.0, 0.0, -5.0, -9.0, -9.0, -9.0, -9.0],
-    ]
+    """Return NAL-RP's corrections in dB for profound losses. Shape: (7, 8)."""
+    return NALRP_CORRECTIONS
 
 
 @constant

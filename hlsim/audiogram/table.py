@@ -11,8 +11,8 @@ from typing import Any
 
 from hlsim.audiogram.columns import UCL_WORDS, threshold_columns
 from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.published import STANDARD
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, EarName
-from hlsim.audiogram.standard import STANDARD
 from hlsim.audiogram.value import Audiogram, ears_in_row
 from hlsim.files import convert_at, read_json, read_table
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.discomfort import Points, UclLike, read_points, uncomfortable_levels_at
 from hlsim.audiogram.plot import EAR_STYLES, frequency_axis
+from hlsim.audiogram.published import STANDARD
 from hlsim.audiogram.scale import (
     EARS,
     FREQUENCIES,
@@ -31,7 +32,6 @@ from hlsim.audiogram.scale import (
     WHO_GRADES,
     EarName,
 )
-from hlsim.audiogram.standard import STANDARD
 from hlsim.extras import require
 
 _UNMEASURED = ("", "na", "n/a", "null", "none", "nan")

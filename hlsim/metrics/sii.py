@@ -8,29 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-SII_BANDS = (
-    *(160, 200, 250, 315, 400, 500, 630, 800, 1000, 1250, 1600, 2000),
-    *(2500, 3150, 4000, 5000, 6300, 8000),
-)
+from hlsim.audiogram.published import SII_TABLE
+
+SII_BANDS = tuple(SII_TABLE)
 """Centres of the 18 third octaves in Hz."""
 
-_IMPORTANCE = (
-    *(0.0083, 0.0095, 0.0150, 0.0289, 0.0440, 0.0578, 0.0653, 0.0711, 0.0818, 0.0844, 0.0882),
-    *(0.0898, 0.0868, 0.0844, 0.0771, 0.0527, 0.0364, 0.0185),
-)
-"""Importance of each band, 1 in sum, table 3 of the standard."""
-
-_NORMAL_SPEECH = (
-    *(32.41, 34.48, 34.75, 33.98, 34.59, 34.27, 32.06, 28.30, 25.01, 23.00, 20.15, 17.32),
-    *(13.18, 11.55, 9.33, 5.31, 2.59, 1.13),
-)
-"""Spectrum level of speech of normal vocal effort in dB SPL per Hz, table 3."""
-
-INTERNAL_NOISE = (
-    *(0.6, -1.7, -3.9, -6.1, -8.2, -9.7, -10.8, -11.9, -12.5, -13.5, -15.4, -17.7),
-    *(-21.2, -24.2, -25.9, -23.6, -15.8, -7.1),
-)
-"""Spectrum level of the internal noise of a normal ear in dB SPL per Hz, table 3."""
+_IMPORTANCE, _NORMAL_SPEECH, INTERNAL_NOISE = zip(*SII_TABLE.values(), strict=True)
 
 SILENCE = -50.0
 """Spectrum level in dB SPL per Hz that means no noise."""
