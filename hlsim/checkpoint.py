@@ -39,7 +39,6 @@ _WITHOUT_CHECKPOINT = (
 """Names of simulators and aids that have no checkpoint."""
 CARD = "README.md"
 
-_REPLACED = {"neuro-msbg-light": "; neuro-msbg replaced it, which has its structure"}
 """Hint for an error message, by name of a checkpoint that existed in an earlier version."""
 
 SIMULATOR = "neuro-msbg"
@@ -204,9 +203,7 @@ def _find_folder(name: str | Path) -> Path:
     for folder in (path, path / "checkpoint", checkpoints_folder() / path):
         if (folder / CONFIG).is_file():
             return folder
-    suggestion = _REPLACED.get(str(name)) or suggest(
-        str(name), [*list_pretrained(), *_WITHOUT_CHECKPOINT]
-    )
+    suggestion = suggest(str(name), [*list_pretrained(), *_WITHOUT_CHECKPOINT])
     raise ValueError(
         f"no checkpoint {str(name)!r}{suggestion}; expected {', '.join(list_pretrained())}, or a "
         f"folder with {CONFIG}; models without a checkpoint are {', '.join(_WITHOUT_CHECKPOINT)}"

@@ -204,8 +204,8 @@ def test_errors_suggest_what_can_be_loaded() -> None:
             load_pretrained(name)
     with pytest.raises(ValueError, match="load it with load_compensator"):
         load_pretrained("compensator-general")
-    with pytest.raises(ValueError, match="'neuro-msbg-light'; neuro-msbg replaced it"):
-        load_pretrained("neuro-msbg-light")
+    with pytest.raises(ValueError, match=r"'neuro-msgb' \(did you mean neuro-msbg\?\)"):
+        load_pretrained("neuro-msgb")
 
 
 @pytest.mark.parametrize(("name", "loader"), list_pretrained().items())

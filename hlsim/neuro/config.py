@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_origin, get_type_hints
 
 from hlsim.calibration import NEURO_RATE
-from hlsim.checks import check_choice, check_names, check_number, describe
+from hlsim.checks import check_choice, check_flag, check_names, check_number, describe
 from hlsim.dsp.stft import STFT
 
 Block = Literal["cnn", "mamba", "lstm", "transformer"]
@@ -104,8 +104,8 @@ class NetworkConfig(ModelConfig):
             elif kind is int:
                 lowest = 0 if name == "dense_depth" else 1
                 check_number(name, value, lowest, MAX_SIZE, whole=True)
-            elif kind is bool and not isinstance(value, bool):
-                raise ValueError(f"expected {name} to be true or false, got {describe(value)}")
+            elif kind is bool:
+                check_flag(name, value)
             elif get_origin(kind) is Literal:
                 check_choice(name, value, kind)
         if any(length % 2 == 0 for length in self.kernel):

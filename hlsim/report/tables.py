@@ -166,9 +166,7 @@ def summary_table(
     return Table.from_rows(caption, cells)
 
 
-def fact_tables(
-    table: DataFrame, columns: Columns, captions: Mapping[str, str], first: str = "Items"
-) -> list[Table]:
+def fact_tables(table: DataFrame, columns: Columns, captions: Mapping[str, str]) -> list[Table]:
     """Return one table of statistics for each property of the items that has several values.
 
     A table has one row per value and condition.
@@ -177,7 +175,6 @@ def fact_tables(
         table: Table of the study.
         columns: Functions that compute the cells, see ``Columns``.
         captions: Captions of the tables by the column with the property, such as ``"snr"``.
-        first: Title of the first column, see ``summary_table``.
 
     >>> import pandas
     >>> rows = [("aid", 5.0, 0.2), ("aid", 0.0, 0.4)]
@@ -187,7 +184,7 @@ def fact_tables(
     ['By SNR']
     """
     return [
-        summary_table(caption, table, columns, fact, first)
+        summary_table(caption, table, columns, fact, "Items")
         for fact, caption in captions.items()
         if fact in table and table[fact].nunique() > 1
     ]

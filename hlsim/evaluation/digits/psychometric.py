@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
+from hlsim.evaluation.digits.material import DIGITS_PER_TRIPLET
+
 Array = NDArray[np.float64]
 
 LOWEST_SNR, HIGHEST_SNR = -22.0, 32.0
@@ -54,13 +56,12 @@ class Estimate(NamedTuple):
     high: Any
 
 
-def estimate_threshold(snr: Array, right: Array, asked: int = 3) -> Estimate:
+def estimate_threshold(snr: Array, right: Array) -> Estimate:
     """Estimate the signal-to-noise ratio at which half of the triplets are understood.
 
     Args:
         snr: Signal-to-noise ratio of each triplet in dB, (triplets,).
         right: Number of digits of each triplet that were recognised, (triplets,).
-        asked: Number of digits per triplet.
 
     Returns:
         The threshold in dB, the mean of its posterior distribution, with its 95 % interval. All
@@ -76,7 +77,7 @@ def estimate_threshold(snr: Array, right: Array, asked: int = 3) -> Estimate:
     threshold, slope, lapse = (values.reshape(-1, 1) for values in points)
     span = 1.0 - _GUESS - lapse
     share = _GUESS + span * expit(slope * (snr - threshold) + logit((TARGET - _GUESS) / span))
-    likelihoods = right * np.log(share) + (asked - right) * np.log1p(-share)
+    likelihoods = right * np.log(share) + (DIGITS_PER_TRIPLET - right) * np.log1p(-share)
     log_likelihood = likelihoods.sum(-1).reshape(len(_THRESHOLDS), -1)
     posterior = np.exp(log_likelihood - log_likelihood.max()).sum(-1)
     posterior /= posterior.sum()

@@ -146,7 +146,7 @@ def cepstrum(levels: Tensor, channels: slice = slice(None)) -> Tensor:
     >>> cepstrum(torch.ones(32, 4)).shape
     torch.Size([5, 4])
     """
-    return _cosines(like=levels)[:, channels] @ levels
+    return _unit_cosines(like=levels)[:, channels] @ levels
 
 
 def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
@@ -185,13 +185,22 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
 
 
 @constant
-def _cosines() -> NDArray[np.float64]:
+def cosines() -> NDArray[np.float64]:
     """Return the cosines over the channels that define the five cepstral coefficients.
 
-    They have 0.5, 1, ... 2.5 periods and the norm 1. Shape: (5, 32).
+    They have 0.5, 1, ... 2.5 periods and the amplitude 1. Shape: (5, 32).
+
+    >>> cosines().shape
+    (5, 32)
     """
     angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
-    waves = np.cos(np.arange(1, COSINES + 1)[:, None] * angle)
+    return np.cos(np.arange(1, COSINES + 1)[:, None] * angle)
+
+
+@constant
+def _unit_cosines() -> NDArray[np.float64]:
+    """Return ``cosines`` with the norm 1. Shape: (5, 32)."""
+    waves = cosines()
     return waves / np.linalg.norm(waves, axis=1, keepdims=True)
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.metrics.ear.envelope_modulation import ENERGY_FLOOR, normalised_covariance
+from hlsim.metrics.ear.envelope_modulation import ENERGY_FLOOR, cosines, normalised_covariance
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.model import CHANNELS, centre_frequencies
 from hlsim.metrics.ear.recursions import RATE
@@ -150,7 +150,7 @@ def envelope_correlation(
     # Audible segments are moved to the front, in their order, because silence between them does not
     # count; the rest of a shorter item is cut by ``extent``.
     order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
-    basis = _cosines(like=clean)
+    basis = cosines(like=clean)
     waves = []
     for levels in (clean, output):
         wave = extent.centred(basis @ levels.take_along_dim(order, -1))
@@ -176,16 +176,6 @@ def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
     """
     loudness = (levels.detach() * NEPERS_PER_DB).exp().mean(1)
     return counts.inside(levels.device) & (loudness > 10.0 ** (SILENCE_DB / 20.0))
-
-
-@constant
-def _cosines() -> NDArray[np.float64]:
-    """Return the cosines over the channels that define the five cepstral coefficients.
-
-    They have 0.5, 1, ... 2.5 periods and the amplitude 1. Shape: (5, 32).
-    """
-    angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
-    return np.cos(np.arange(1, 6)[:, None] * angle)
 
 
 # -- fine structure --------------------------------------------------------------------------------
