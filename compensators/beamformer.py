@@ -1,7 +1,5 @@
 """A trained directional front end, which cancels noise in the bands of the hearing aid."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -3,8 +3,6 @@
 Each block continues with the state in which the block before has left the aid.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 

@@ -4,8 +4,6 @@ Each function raises ValueError with what is wrong, what was expected and, where
 fix. Functions that return something return the validated value.
 """
 
-from __future__ import annotations
-
 import difflib
 import inspect
 import math

@@ -38,8 +38,6 @@ Without torch, the file of ``export_fit`` computes ``fitted`` for an ear. The st
 zeros, except ``gliding``, which equals ``sliders``.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Atomic writing of files, locks on folders, hashes of files, and reading of tables."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import hashlib

@@ -1,7 +1,5 @@
 """Plug-ins: simulators, enhancers, aids and measures from your own code, loaded by name."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.machinery
 import importlib.util

@@ -1,7 +1,5 @@
 """Loading of all simulators: MSBG, trained networks, a linear ear, and simulators of your own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Columns of thresholds in a table, recognised by names that spreadsheets and clinics use."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Uncomfortable levels (UCL): from which level on a pure tone is uncomfortably loud for an ear."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 

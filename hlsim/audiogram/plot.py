@@ -1,7 +1,5 @@
 """Axes and symbols of drawn audiograms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Audiograms and listeners in files and in pandas' data frames."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence

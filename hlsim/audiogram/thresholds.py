@@ -1,7 +1,5 @@
 """Conversion of ears into tensors of thresholds at eight frequencies, and their validation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

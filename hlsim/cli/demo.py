@@ -1,7 +1,5 @@
 """The command ``demo``, which trains an aid for one ear and writes a page about it."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

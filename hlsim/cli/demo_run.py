@@ -1,7 +1,5 @@
 """The command ``demo``: an aid for one ear is trained through Neuro-MSBG, scored and shown."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

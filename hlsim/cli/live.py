@@ -1,7 +1,5 @@
 """The command ``live``, which runs an aid or a simulator from microphone to headphones."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Simulators and aids on recordings of any length: block by block, with one block in memory."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The program ``hlsim``. Every error ends with exit status 2 and a message of one line."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import os

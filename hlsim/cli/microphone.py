@@ -4,8 +4,6 @@ A *stream* is a function from a block of samples to its output, which stores wha
 earlier blocks: a ``compensators.wearable.Stream`` or a ``hlsim.neuro.stream.SimulatedStream``.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import select

@@ -4,8 +4,6 @@ Options of all trainings are in ``training.py``, and those of all evaluations in
 This module does not import torch, so that ``--help`` takes a fraction of a second.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

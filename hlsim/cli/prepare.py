@@ -1,7 +1,5 @@
 """The command ``prepare``, which writes the manifest of a corpus."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Options of a recipe: ``--recipe FILE``, and ``--recipe.NAME VALUE`` for each of its settings."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import json

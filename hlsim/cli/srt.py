@@ -1,7 +1,5 @@
 """The command ``srt``, which measures the speech reception threshold in noise of simulated ears."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The commands ``train-simulator`` and ``train-compensator``."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Random ears that vary like measured ones."""
 
-from __future__ import annotations
-
 import math
 
 import torch

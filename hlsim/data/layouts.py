@@ -3,8 +3,6 @@
 A layout is recognised by the names of folders and files. Corpora that deviate from it are rejected.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections import defaultdict

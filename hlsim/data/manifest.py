@@ -1,7 +1,5 @@
 """Manifests: CSV files that list the utterances of a corpus, with their speakers and splits."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

@@ -1,7 +1,5 @@
 """Linear interpolation of levels or gains from some frequencies to others."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor

@@ -3,8 +3,6 @@
 An aid is a function ``(waveform, ear) -> waveform`` for one signal at 16 kHz in pascals, (time,).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product

@@ -5,8 +5,6 @@ reference is the target without its room, at the level of the target in the room
 file is 100 dB SPL. A listener has one score per measure, that of the ear with the higher score.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

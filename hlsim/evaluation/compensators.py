@@ -1,7 +1,5 @@
 """The study of ``evaluate-compensator``: compensators are compared with other hearing aids."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

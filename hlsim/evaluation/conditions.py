@@ -6,8 +6,6 @@ with which it is compared, for all ears the same or by a rule for the ear. A hea
 function or module ``(waveform, ear) -> waveform``.
 """
 
-from __future__ import annotations
-
 import uuid
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Items of studies that are drawn from a seed: speech in noise, for several ears and levels."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence

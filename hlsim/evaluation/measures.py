@@ -4,8 +4,6 @@ A measure is a function of an ``Item`` and of the output of a condition. It retu
 columns of the study's table to numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

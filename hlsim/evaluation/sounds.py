@@ -1,7 +1,5 @@
 """Sounds of a study for the players of a page: outputs of conditions, as an ear perceives them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Paired tests of two scores per item, and intervals for their mean difference."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """HASPI and HASQI as losses, for training batches that may contain silence and clicks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -3,8 +3,6 @@
 They show how closely a network reproduces the hearing-loss simulator from which it learned.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

@@ -20,8 +20,6 @@ Source: Kates and Arehart 2016, "The hearing-aid audio quality index (HAAQI)", I
 on Audio, Speech, and Language Processing 24(2), 354-365, doi 10.1109/TASLP.2015.2507858.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 import torch

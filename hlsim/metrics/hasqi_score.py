@@ -7,8 +7,6 @@ Source: Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) ve
 Eng. Soc. 62(3), 99-117.
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike

@@ -4,8 +4,6 @@ The differences are computed in five octaves around 250 Hz to 4 kHz. The trainin
 ``hlsim.losses.interaural`` compares the differences of two signals.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

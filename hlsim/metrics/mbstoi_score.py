@@ -18,8 +18,6 @@ time objective intelligibility measure for spatially diverse conditions", Speech
 1-13, doi 10.1016/j.specom.2018.06.001.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The two signals that a score compares: validated, cut, and scored item by item."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Literal

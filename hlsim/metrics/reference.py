@@ -4,8 +4,6 @@
 computes items in groups: one at a time on a CPU, all at once on a GPU.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 

@@ -3,8 +3,6 @@
 The index is the audible share of speech, 0 to 1, with a weight for the importance of each band.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

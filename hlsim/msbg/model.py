@@ -1,7 +1,5 @@
 """The exact MSBG: batched, differentiable, on a CPU or a GPU."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import partial

@@ -1,7 +1,5 @@
 """Settings of the networks: dataclasses that a checkpoint stores as JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_origin, get_type_hints

@@ -1,7 +1,5 @@
 """Base class of the networks that process a waveform for an ear: calibration, rates and memory."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

@@ -1,7 +1,5 @@
 """A simulator for a signal that arrives in chunks."""
 
-from __future__ import annotations
-
 import math
 
 import torch

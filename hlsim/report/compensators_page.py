@@ -1,7 +1,5 @@
 """The page of ``evaluate-compensator``: it presents what ``evaluation.compensators`` computes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The page of the demo: how training changes an aid, in numbers, sounds and pictures."""
 
-from __future__ import annotations
-
 from hlsim.evaluation.conditions import NAL_R, NAL_R_AT_LEVEL, TRAINED
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.sounds import NORMAL_EAR

@@ -1,7 +1,5 @@
 """Players for pages and notebooks: sounds to switch between, with spectrograms in dB SPL."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ Drawing a picture raises MissingExtraError without matplotlib. Pyplot is not use
 window, no global state and no notebook's backend is involved.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

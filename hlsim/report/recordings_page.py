@@ -1,7 +1,5 @@
 """The pages about recordings: those of ``haspi-report`` and of ``clarity``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hlsim.evaluation.clarity import RULE_MS

@@ -1,7 +1,5 @@
 """Sentences about comparisons: which condition is better, and what limits the verdict."""
 
-from __future__ import annotations
-
 import math
 from itertools import chain, combinations
 

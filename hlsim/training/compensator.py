@@ -1,7 +1,5 @@
 """Training of a compensator through ``HearingLossLoss``, for one ear or for all."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Training criteria for a hearing aid's noise reduction: the error of its gains, and HASPI."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

@@ -4,8 +4,6 @@ A simulator serves to train aids, so its gradient matters as much as its output.
 nearly the same output may have different gradients, above all where the output is soft.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional

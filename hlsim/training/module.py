@@ -1,7 +1,5 @@
 """The Lightning module of both trainings: learning rate, validation scores, and initial weights."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import math

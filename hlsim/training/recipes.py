@@ -4,8 +4,6 @@ The command line shows the docstrings of these classes as help. This module does
 so that the help is shown at once.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any, Literal

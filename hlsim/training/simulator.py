@@ -1,7 +1,5 @@
 """Training of a Neuro-MSBG on the output of the exact MSBG or of another teacher."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

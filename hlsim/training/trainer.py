@@ -1,7 +1,5 @@
 """Training with Lightning: it can resume, saves the best network, and stops after a time limit."""
 
-from __future__ import annotations
-
 import copy
 import io
 import logging

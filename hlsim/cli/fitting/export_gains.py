@@ -1,7 +1,5 @@
 """The command ``export-gains``, which writes an aid's gains for another program."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

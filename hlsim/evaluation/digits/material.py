@@ -1,7 +1,5 @@
 """Sounds of the digits-in-noise test: triplets of digits, masking noise, and noise of the ear."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, NamedTuple
 

@@ -8,8 +8,6 @@ ears in the free field, in noise of 65 dB SPL.
 Source: Oldenburg Hearing Health Record, Jafri et al. 2025, doi 10.5281/zenodo.16919812, CC BY 4.0.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

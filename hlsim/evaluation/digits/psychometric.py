@@ -9,8 +9,6 @@ Source: Schuett, Harmeling, Macke and Wichmann (2016), Vision Research 122, doi
 of Audiology 43, doi 10.1080/14992020400050004 (the test).
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The simulated listener of the digits-in-noise test: a small network that recognises digits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

@@ -5,8 +5,6 @@ compressor ``dc``. CamillaDSP and Equalizer APO are linear: a file holds the gai
 level.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

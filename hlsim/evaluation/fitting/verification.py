@@ -4,8 +4,6 @@ A clinic measures the same at a person's ear: percentiles of the level of speech
 (IEC 60118-15), insertion gains beside their targets, and the audible share of speech (ANSI S3.5).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -9,8 +9,6 @@ modules outside hlsim may add an attribute ``fingerprint``, such as a version, w
 when the outputs change.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """One function applied to many tasks: in this process, on several cores, or on a Dask cluster."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack

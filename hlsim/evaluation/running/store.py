@@ -4,8 +4,6 @@ The file holds one JSON object per line. Two runs can append to it at the same t
 read it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

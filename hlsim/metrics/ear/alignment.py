@@ -1,7 +1,5 @@
 """Alignment in time of an output with the clean signal: first as a whole, then by channel."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ resampled to the ear's rate of 24 kHz, and cut to its audible part. The output o
 resampled to the same rate, shifted in time to match the clean signal, and cut to the same part.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

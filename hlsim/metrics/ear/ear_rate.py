@@ -3,8 +3,6 @@
 Signals are resampled to 24 kHz, and silence before and after the clean signal is found.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -12,8 +12,6 @@ Source: Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI)
 Communication 131, 35-46.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

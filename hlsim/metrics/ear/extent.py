@@ -4,8 +4,6 @@ Items of a batch have different lengths, but share one tensor, so that all but t
 padded at their end. Computations of scores must not depend on the padding.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

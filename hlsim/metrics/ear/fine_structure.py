@@ -14,8 +14,6 @@ Source: Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) ve
 Eng. Soc. 62(3), 99-117.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Noise on the motion of the basilar membrane, drawn as pyclarity draws it."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

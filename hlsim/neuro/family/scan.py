@@ -7,8 +7,6 @@ A) and drive[t] = delta[t] B[t] u[t].
 Source: Gu and Dao (2023), arXiv:2312.00752.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
