@@ -209,8 +209,7 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
     The store drops the results that were not used for the longest time.
 
     Args:
-        function: Function at the top level of a module, with hashable arguments, which returns a
-            tensor or another object with ``nbytes``.
+        function: Function at the top level of a module, with hashable arguments.
 
     >>> @compute_once
     ... def window(points):
@@ -526,7 +525,16 @@ class _Store:
     @property
     def nbytes(self) -> int:
         """Bytes of all results."""
-        return sum(result.nbytes for result in self._results.values())
+        return _count_bytes([*self._results.values()])
+
+
+def _count_bytes(value: Any) -> int:
+    """Return the bytes of a tensor or an array, or of all those in a sequence or an object."""
+    if isinstance(value, Tensor | np.ndarray):
+        return value.nbytes
+    if not isinstance(value, list | tuple):
+        value = vars(value).values() if hasattr(value, "__dict__") else ()
+    return sum(map(_count_bytes, value))
 
 
 _STORE = _Store(STORE_BYTES)

@@ -115,11 +115,6 @@ class Reference(ABC):
         if keep:
             self._batches = map_on_cores(self._prepare, self._groups, self._clean)
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the stored features in bytes, 0 with ``keep=False``."""
-        return _count_bytes(self._batches)
-
     def _thresholds(self, audiogram: AudiogramLike) -> Tensor:
         """Return the thresholds in dB HL of the ear of each item. Shape: -> (items, 8).
 
@@ -238,12 +233,3 @@ class Reference(ABC):
         with torch.autocast(rows.device.type, enabled=False):
             numbers = map_on_cores(compare, range(len(self._groups)), rows)
         return torch.cat(numbers).reshape(*outputs.shape[:-1], -1)
-
-
-def _count_bytes(value: Any) -> int:
-    """Return the size in bytes of a tensor, or of all tensors in a list, a tuple or an object."""
-    if isinstance(value, Tensor):
-        return value.nbytes
-    if not isinstance(value, list | tuple):
-        value = vars(value).values() if hasattr(value, "__dict__") else ()
-    return sum(map(_count_bytes, value))

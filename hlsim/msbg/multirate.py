@@ -116,11 +116,6 @@ class MultirateBank:
     bands: tuple[RateBand, ...]
     lowpass: Tensor
 
-    @property
-    def nbytes(self) -> int:
-        """Size in bytes of the low-passes and responses, the largest tensors."""
-        return self.lowpass.nbytes + sum(band.response.nbytes for band in self.bands)
-
 
 def _rate_and_detector(
     centre: float, top: float, is_wide: bool, rate_divisor: int, highest: float

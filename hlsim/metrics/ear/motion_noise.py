@@ -25,11 +25,6 @@ class MotionNoise(NamedTuple):
     signals: Tensor
     state: Any
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the noise in bytes."""
-        return self.signals.nbytes
-
 
 @compute_once  # the conditions, the ears and the scores of an item have the same noise
 def draw_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> MotionNoise:

@@ -90,11 +90,6 @@ class Recursion(NamedTuple):
         # These are the largest tensors of a score, therefore the addition is in place.
         return (blocks @ self.through).add_(before @ self.outward)
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the matrices in bytes."""
-        return sum(matrix.nbytes for matrix in self[:4])
-
 
 def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
     """Compute the state of a filter after each block.
