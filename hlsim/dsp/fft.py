@@ -93,6 +93,26 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
     return min(length for length in lengths if length >= minimum)
 
 
+def cross_correlation(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
+    """Compute the correlation of two real signals at all lags, as ``scipy.signal.correlate`` does.
+
+    Args:
+        first: Signal, (time,).
+        second: Signal, (other time,).
+
+    Returns:
+        Correlations, (time + other time - 1,). The one at which both signals begin together has the
+        index ``len(second) - 1``. Earlier ones belong to lags at which the first signal is earlier.
+
+    >>> cross_correlation(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0])).round(6) + 0.0
+    array([0., 0., 0., 1.])
+    """
+    points = fft_length(len(first) + len(second) - 1)
+    spectrum = np.fft.rfft(first, points) * np.fft.rfft(second, points).conj()
+    correlation = np.fft.irfft(spectrum, points)
+    return np.concatenate((correlation[points - len(second) + 1 :], correlation[: len(first)]))
+
+
 def power(spectrum: Tensor) -> Tensor:
     """Compute squared magnitudes of complex numbers, with a faster backward pass than autograd's.
 

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -27,7 +26,7 @@ def frequency_sampling_fir(
     taps: int,
     frequencies: NDArray[np.float64],
     gains: NDArray[np.float64],
-    window: str | tuple[str, float] = "hamming",
+    kaiser_beta: float | None = None,
 ) -> NDArray[np.float64]:
     """Design a linear-phase FIR filter from gains at some frequencies, as MATLAB's ``fir2`` does.
 
@@ -41,12 +40,13 @@ def frequency_sampling_fir(
             samples.
         frequencies: Ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
         gains: Linear gain at each frequency.
-        window: Window by which the coefficients are multiplied, as in ``scipy.signal.get_window``.
+        kaiser_beta: Parameter of the Kaiser window by which the coefficients are multiplied; by
+            default it is a Hamming window.
 
     Returns:
         Coefficients of the filter, (taps,).
 
-    >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), "boxcar")
+    >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), 0.0)
     >>> print(abs(flat).round(6))
     [0. 2. 0.]
     """
@@ -62,7 +62,27 @@ def frequency_sampling_fir(
     intervals = _GRID_POINTS - 1
     delay = np.exp(-0.5j * (taps - 1) * np.pi * np.arange(_GRID_POINTS) / intervals)
     impulse_response = np.fft.irfft(grid_gains * delay, 2 * intervals)
-    return impulse_response[:taps] * scipy.signal.get_window(window, taps, fftbins=False)
+    window = np.hamming(taps) if kaiser_beta is None else np.kaiser(taps, kaiser_beta)
+    return np.asarray(impulse_response[:taps] * window)
+
+
+def lowpass_fir(taps: int, cutoff: float, kaiser_beta: float) -> NDArray[np.float64]:
+    """Design a linear-phase low-pass, a sine cardinal in a Kaiser window, as ``firwin`` of scipy.
+
+    Args:
+        taps: Number of coefficients. The filter delays by (taps - 1) / 2 samples.
+        cutoff: Frequency at which the gain is one half, where 1 is the Nyquist frequency.
+        kaiser_beta: Parameter of the window. The gain at 0 Hz is 1.
+
+    Returns:
+        Coefficients of the filter, (taps,).
+
+    >>> lowpass_fir(3, cutoff=0.5, kaiser_beta=0.0).round(2)
+    array([0.28, 0.44, 0.28])
+    """
+    times = np.arange(taps) - 0.5 * (taps - 1)
+    coefficients = np.sinc(cutoff * times) * np.kaiser(taps, kaiser_beta)
+    return np.asarray(coefficients / coefficients.sum())
 
 
 def filters_with_gains(

@@ -10,13 +10,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.checks import check_names, loud_outputs
+from hlsim.dsp.fft import cross_correlation
 from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
@@ -286,7 +286,7 @@ def correlate(output: Tensor, clean: Tensor) -> tuple[int, float]:
     (32, 1.0)
     """
     signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
-    correlation = np.abs(scipy.signal.correlate(*signals, method="fft"))
+    correlation = np.abs(cross_correlation(*signals))
     peak = int(correlation.argmax())
     scale = np.prod([np.linalg.norm(signal) for signal in signals])
     return peak - (len(clean) - 1), float(correlation[peak] / scale) if scale else 0.0

@@ -5,10 +5,9 @@ cochlea. Its inverse turns the output of the cochlea back into sound, and a low-
 """
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
-from hlsim.dsp.fir import frequency_sampling_fir
+from hlsim.dsp.fir import frequency_sampling_fir, lowpass_fir
 
 MSBG_RATE = 44100
 """Sample rate in Hz at which MSBG is defined."""
@@ -60,7 +59,7 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     # 23 ms, so that the gain is accurate down to about 100 Hz
     taps = 2 * EAR_DELAY + 1
     gains = 10.0 ** (gain_db / 20.0)
-    return frequency_sampling_fir(taps, hz / nyquist, gains, ("kaiser", 4.0))
+    return frequency_sampling_fir(taps, hz / nyquist, gains, kaiser_beta=4.0)
 
 
 def lowpass_filter() -> NDArray[np.float64]:
@@ -72,4 +71,4 @@ def lowpass_filter() -> NDArray[np.float64]:
     >>> lowpass_filter().shape
     (133,)
     """
-    return scipy.signal.firwin(133, 18000.0, window=("kaiser", 8.0), fs=MSBG_RATE)
+    return lowpass_fir(133, 18000.0 / (MSBG_RATE / 2.0), kaiser_beta=8.0)

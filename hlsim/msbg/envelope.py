@@ -14,13 +14,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power, rfft
+from hlsim.dsp.iir import ELLIPTIC, coefficients, digital_filter
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filter_bank import FilterBank
 from hlsim.torchtools import constant
@@ -247,7 +247,7 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
     """
     widths = erb(np.array(bank.centre_frequencies))
     cutoffs = 0.75 * np.minimum(100.0, widths)
-    return [scipy.signal.ellip(2, 0.25, 35.0, cutoff, fs=MSBG_RATE) for cutoff in cutoffs]
+    return [coefficients(digital_filter(ELLIPTIC, cutoff, MSBG_RATE)) for cutoff in cutoffs]
 
 
 @constant

@@ -14,7 +14,6 @@ the last 50 ms by up to 1e-2 of the whole signal.
 from functools import lru_cache
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
@@ -129,11 +128,14 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
     units = np.eye(2 + 1 + _PADDING)
     state, newest = units[:2], units[2:]
     padding = 2.0 * newest[0] - newest[1:]
-    outputs, _ = scipy.signal.lfilter(numerator, denominator, padding, axis=0, zi=state)
-    state_of_constant = scipy.signal.lfilter_zi(numerator, denominator)[:, None]
-    _, backward_state = scipy.signal.lfilter(
-        numerator, denominator, outputs[::-1], axis=0, zi=state_of_constant * outputs[-1]
-    )
+    outputs = []
+    for sample in padding:
+        outputs.append(state[0] + numerator[0] * sample)
+        state = transition @ state + np.outer(input_vector, sample)
+    state_of_constant = np.linalg.solve(np.eye(2) - transition, input_vector)
+    backward_state = np.outer(state_of_constant, outputs[-1])
+    for output in reversed(outputs):
+        backward_state = transition @ backward_state + np.outer(input_vector, output)
 
     # If silence follows, the forward pass goes through the states z, transition z, ... The backward
     # pass then ends in the state S z, where S = input_vector [1 0] + transition S transition.

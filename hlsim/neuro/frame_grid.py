@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal import firwin
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.calibration import NEURO_RATE
 from hlsim.dsp.fft import fade_out_weights, fft_length, rfft
+from hlsim.dsp.fir import lowpass_fir
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filter_bank import BANKS, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
@@ -304,7 +304,7 @@ def _conversion(units: int, advance: int) -> NDArray[np.complex128]:
     length = 2 * _LOWPASS_HALF_LENGTH + 1
     cutoff = (NEURO_RATE / 2.0 + nyquist) / 2.0
     # The beta is that of an attenuation by 250 dB.
-    taps = firwin(length, cutoff, window=("kaiser", 26.6), fs=MSBG_RATE)
+    taps = lowpass_fir(length, cutoff / (MSBG_RATE / 2.0), kaiser_beta=26.6)
     response = _fourier_transform(taps, units)
     points = units * _UNIT_AT_MSBG_RATE
     bins = np.arange(len(response))

@@ -1,10 +1,12 @@
 """The real transform and the power have the values and gradients of torch's functions."""
 
+import numpy as np
 import pytest
 import torch
+from scipy import signal
 from torch import Tensor
 
-from hlsim.dsp.fft import power, rfft
+from hlsim.dsp.fft import cross_correlation, power, rfft
 
 
 def assert_equal_gradients(ours: Tensor, theirs: Tensor, source: Tensor) -> None:
@@ -26,6 +28,13 @@ def test_power_and_its_gradient_equal_the_squared_modulus() -> None:
     assert_equal_gradients(power(spectrum), spectrum.abs().square(), spectrum)
     silence = torch.zeros(3, dtype=torch.complex128, requires_grad=True)
     assert not bool(torch.autograd.grad(power(silence).sum(), silence)[0].any())
+
+
+@pytest.mark.parametrize(("time", "other_time"), [(1, 1), (5, 3), (3, 5), (20, 20)])
+def test_the_cross_correlation_is_that_of_scipy(time: int, other_time: int) -> None:
+    generator = np.random.default_rng(0)
+    signals = generator.standard_normal(time), generator.standard_normal(other_time)
+    np.testing.assert_allclose(cross_correlation(*signals), signal.correlate(*signals), atol=1e-12)
 
 
 def test_second_derivatives() -> None:

@@ -71,6 +71,6 @@ def test_outer_and_middle_ear_filter_as_pyclarity(backward: bool) -> None:
 def test_frequency_sampling_equals_pyclaritys_firwin2(taps: int) -> None:
     frequencies = np.array([0.0, 0.02, 0.1, 0.101, 0.3, 0.55, 1.0])
     gains = np.array([0.1, 1.0, 3.0, 2.5, 0.2, 1.7, 0.05])
-    ours = frequency_sampling_fir(taps, frequencies, gains, ("kaiser", 4.0))
+    ours = frequency_sampling_fir(taps, frequencies, gains, kaiser_beta=4.0)
     theirs = msbg_utils.firwin2(taps, frequencies.copy(), gains.copy(), window=("kaiser", 4))
     np.testing.assert_allclose(ours, theirs, atol=1e-14)

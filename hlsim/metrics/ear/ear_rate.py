@@ -6,13 +6,14 @@ Signals are resampled to 24 kHz, and silence before and after the clean signal i
 import math
 
 import numpy as np
-import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
+from hlsim.dsp.fir import lowpass_fir
+from hlsim.dsp.iir import chebyshev2, digital_filter, frequency_response
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
@@ -111,9 +112,7 @@ def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
         Matrix, (inputs, periods * up).
     """
     half = ZERO_CROSSINGS * max(up, down)
-    taps = up * scipy.signal.firwin(
-        2 * half + 1, 1.0 / max(up, down), window=("kaiser", KAISER_BETA)
-    )
+    taps = up * lowpass_fir(2 * half + 1, 1.0 / max(up, down), KAISER_BETA)
     output = np.arange(periods * up)
     inputs = 2 * _reach(up, down) + down * periods
     # On the grid that both rates share, input j lies at (j - reach) * up and output k at k * down.
@@ -135,8 +134,8 @@ def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
 
 @constant
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
-    sections = scipy.signal.cheby2(7, 30, 21000.0 / rate, output="sos")
-    return scipy.signal.sosfreqz(sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points)[1]
+    lowpass = digital_filter(chebyshev2(7, 30.0), 10500.0, rate)
+    return frequency_response(lowpass, 2.0 * np.pi * np.arange(points // 2 + 1) / points)
 
 
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,16 +9,17 @@ the exact output of the filter and differentiable, and its computation is fast o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.dsp.iir import butterworth, coefficients, digital_filter
 from hlsim.torchtools import as_tensor, compute_once, constant
 
 BLOCK = 64
@@ -141,8 +142,8 @@ def _recursion(
     """
     # Balancing makes each state as easily reached as observed. Otherwise a large and a small state
     # of a slow filter, such as adaptation, would cancel in single precision.
-    root = scipy.linalg.cholesky(scipy.linalg.solve_discrete_lyapunov(a, b @ b.T), lower=True)
-    observability = scipy.linalg.solve_discrete_lyapunov(a.T, c.T @ c)
+    root = np.linalg.cholesky(_gramian(a, b))
+    observability = _gramian(a.T, c.T)
     rotation, singular_values, _ = np.linalg.svd(root.T @ observability @ root)
     basis = root @ rotation / singular_values**0.25
     a, b, c = np.linalg.solve(basis, a @ basis), np.linalg.solve(basis, b), c @ basis
@@ -160,6 +161,22 @@ def _recursion(
     return Recursion._make([*(as_tensor(matrix, dtype, device) for matrix in matrices), memory])
 
 
+def _gramian(a: Array, b: Array) -> Array:
+    """Return the matrix x with x = a x a^T + b b^T: how strongly an input excites each state."""
+    states = len(a)
+    gramian = np.linalg.solve(np.eye(states**2) - np.kron(a, a), (b @ b.T).ravel())
+    return np.asarray(gramian.reshape(states, states))
+
+
+def _state_space(numerator: Array, denominator: Array) -> tuple[Array, Array, Array, float]:
+    """Return a, b, c and d of ``_recursion`` for a filter with the first denominator 1."""
+    order = len(denominator) - 1
+    a = np.eye(order, k=-1)
+    a[0] = -denominator[1:]
+    c = numerator[None, 1:] - numerator[0] * denominator[None, 1:]
+    return a, np.eye(order, 1), c, float(numerator[0])
+
+
 @compute_once
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
@@ -172,10 +189,10 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     >>> middle_ear(torch.device("cpu"), torch.float32).step.shape
     torch.Size([3, 3])
     """
-    low = scipy.signal.butter(1, 5000 / (RATE / 2))
-    high = scipy.signal.butter(2, 350 / (RATE / 2), "high")
-    a, b, c, d = scipy.signal.tf2ss(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
-    return _recursion(a, b, c, float(d[0, 0]), 2048, device, dtype)
+    low = coefficients(digital_filter(butterworth(1), 5000.0, RATE))
+    high = coefficients(digital_filter(butterworth(2), 350.0, RATE, highpass=True))
+    a, b, c, d = _state_space(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
+    return _recursion(a, b, c, d, 2048, device, dtype)
 
 
 @compute_once
@@ -188,8 +205,8 @@ def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     >>> gain_lowpass(torch.device("cpu"), torch.float32).step.shape
     torch.Size([1, 1])
     """
-    a, b, c, d = scipy.signal.tf2ss(*scipy.signal.butter(1, 800 / (RATE / 2)))
-    return _recursion(a, b, c, float(d[0, 0]), 192, device, dtype)
+    a, b, c, d = _state_space(*coefficients(digital_filter(butterworth(1), 800.0, RATE)))
+    return _recursion(a, b, c, d, 192, device, dtype)
 
 
 ONSET_RATIO = 2.0
@@ -234,8 +251,8 @@ def _binomials() -> Array:
     They expand the powers (x + 1)^d of a distance x, in blocks, that grows by one block. Shape:
     (4, 4).
     """
-    orders = np.arange(GAMMATONE_ORDER)
-    return scipy.special.comb(orders[None, :], orders[:, None])
+    orders = range(GAMMATONE_ORDER)
+    return np.array([[float(math.comb(d, e)) for d in orders] for e in orders])
 
 
 def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> Recursion:
