@@ -8,7 +8,7 @@
   Cambridge formula of Moore and Glasberg 1998, British Journal of Audiology 32(5).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from hlsim.audiogram.published import (
     CAMBRIDGE_INTERCEPTS,
     FREE_FIELD_THRESHOLD_SPL,
-    NALRP_CORRECTIONS,
+    PRESCRIPTION_TABLES,
 )
 from hlsim.audiogram.scale import FREQUENCIES
 from hlsim.torchtools import constant
@@ -81,19 +81,13 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     losses = torch.cat((thresholds[..., :4], thresholds[..., 5:7]), -1)  # without 3 and 8 kHz
     three_frequency_sum = losses[..., 1:4].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
     common = _common_gain(three_frequency_sum)
-    bias = _bias(like=losses)
+    bias = _table("nalr_bias", like=losses)
     gains = (common + 0.31 * losses + bias).clamp_min(0.0)
     low, high = gains[..., :4], gains[..., 4:]
     at_3_khz = 0.5 * (low[..., -1:] + high[..., :1])
     all_gains = torch.cat((low, at_3_khz, high, high[..., -1:]), -1)
     has_no_loss = (losses <= 0.0).all(-1, keepdim=True)
     return torch.where(has_no_loss, 0.0, all_gains)
-
-
-@constant
-def _bias() -> list[float]:
-    """Return the constants in dB of NAL-R's formula at 250, 500, 1000, 2000, 4000 and 6000 Hz."""
-    return [-17.0, -8.0, 1.0, -1.0, -2.0, -2.0]
 
 
 def nalrp_gains_db(
@@ -124,11 +118,11 @@ def nalrp_gains_db(
     three_frequency_sum = losses[..., [1, 2, 4]].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
     common = _common_gain(three_frequency_sum)
     at_2_khz = losses[..., 4:5]
-    table = _profound_corrections(like=losses)
+    table = _table("nalrp_corrections", like=losses)
     row = (at_2_khz - PROFOUND_FROM) / 5.0 - torch.arange(len(table)).to(losses)
     weights = (1.0 - row.abs()).clamp_min(0.0)
     correction = (weights.unsqueeze(-1) * table).sum(-2)
-    gains = (common + 0.31 * losses + _nalrp_bias(like=losses) + correction).clamp_min(0.0)
+    gains = (common + 0.31 * losses + _table("nalrp_bias", like=losses) + correction).clamp_min(0.0)
     gains = torch.where((losses <= 0.0).all(-1, keepdim=True), 0.0, gains)
     gains = torch.cat((gains, torch.zeros_like(at_2_khz)), -1)
     return _interpolate_over_log(gains, (*NALRP_FREQUENCIES, NALRP_END), points)
@@ -252,15 +246,10 @@ def _log_weights(grid: Frequencies, points: Frequencies) -> NDArray[np.float64]:
 
 
 @constant
-def _nalrp_bias() -> list[float]:
-    """Return the constants in dB of NAL-RP's formula at ``NALRP_FREQUENCIES``."""
-    return [-17.0, -8.0, 1.0, 1.0, -1.0, -2.0, -2.0, -2.0]
-
-
-@constant
-def _profound_corrections() -> list[list[float]]:
-    """Return NAL-RP's corrections in dB for profound losses. Shape: (7, 8)."""
-    return NALRP_CORRECTIONS
+def _table(name: str) -> list[Any]:
+    """Return one of the ``PRESCRIPTION_TABLES``, so that tensors of it are stored."""
+    table: list[Any] = PRESCRIPTION_TABLES[name]
+    return table
 
 
 @constant

@@ -35,10 +35,12 @@ FREE_FIELD_THRESHOLD_SPL = _over_frequency("free_field_threshold")
 CAMBRIDGE_INTERCEPTS = _over_frequency("cambridge_intercepts")
 """Constant of the Cambridge formula in dB; above 5 kHz it stays the same."""
 
-NALRP_CORRECTIONS = _TABLES["nalrp_corrections"]
-"""NAL-RP's corrections in dB for profound losses (1991, Figure 9).
+PRESCRIPTION_TABLES = _TABLES["prescriptions"]
+"""Constants in dB of NAL-R and NAL-RP, by name.
 
-The rows are thresholds of 90, 95, ... 120 dB HL at 2 kHz, the columns ``NALRP_FREQUENCIES``.
+``nalr_bias`` belongs to the formula at 250, 500, 1000, 2000, 4000 and 6000 Hz, ``nalrp_bias`` to
+that at ``NALRP_FREQUENCIES``. ``nalrp_corrections`` are those for profound losses (1991, Figure 9):
+the rows are thresholds of 90, 95, ... 120 dB HL at 2 kHz, the columns ``NALRP_FREQUENCIES``.
 """
 
 SII_TABLE = _over_frequency("sii")
