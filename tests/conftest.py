@@ -13,6 +13,8 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +51,13 @@ LONGEST = (
 A long test that began last would keep one core busy and let the others wait.
 """
 
+SECOND_HALF = ("sympy", "scipy.stats", "pandas", "matplotlib.pyplot")
+"""Packages that every second worker imports before torch.
+
+In a new environment, where no module is compiled yet, two workers that import the same modules at
+the same time both compile all of them.
+"""
+
 NEW_OUTPUTS = pytest.StashKey[dict[str, Any]]()
 
 
@@ -72,6 +81,10 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(SignOfLife(config))
         return
     gc.disable()  # until all modules are imported
+    if os.environ.get("PYTEST_XDIST_WORKER", "gw0")[-1] in "13579":
+        for name in SECOND_HALF:
+            if find_spec(name.partition(".")[0]):
+                import_module(name)
     import torch
 
     torch.set_num_threads(1)
