@@ -133,11 +133,11 @@ def test_the_baseline_has_the_scores_of_the_challenge(tmp_path: Path) -> None:
     pytest.importorskip("clarity")
     folder = make_scenes(tmp_path / "clarity", RATE)
     aids = {"baseline": f"{__name__}:Baseline"}
-    study = evaluate_scenes(aids, out=tmp_path / "out", **options(folder, stride=2))
-    assert study.failures.empty and study.table.item.nunique() == 2
-    for row in study.table[study.table.condition == "baseline"].itertuples():
-        for measure, expected in score_by_pyclarity(folder, row.utterance, row.listener).items():
-            assert getattr(row, measure) == pytest.approx(expected, abs=1e-3), (row.name, measure)
+    study = evaluate_scenes(aids, out=tmp_path / "out", **options(folder, stride=3))
+    assert study.failures.empty
+    (row,) = study.table[study.table.condition == "baseline"].itertuples()
+    for measure, expected in score_by_pyclarity(folder, row.utterance, row.listener).items():
+        assert getattr(row, measure) == pytest.approx(expected, abs=1e-3), measure
     look_ahead = study.details["look_ahead_ms"]
     assert look_ahead["baseline"] == 0.0, "2.5 ms late, but never early"
     assert 2.0 < look_ahead["NAL-R"] <= 5.0
