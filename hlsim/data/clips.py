@@ -67,6 +67,7 @@ class Clips:
     Attributes:
         files: Paths of the recordings.
         samples: Length of a clip in samples.
+        left_out: Indices of the recordings that were drawn so far and cannot be used.
 
     Raises:
         ValueError: There are no files, or the folder does not exist.
@@ -93,6 +94,7 @@ class Clips:
         self.sample_rate = sample_rate
         self.repeat = repeat
         self.samples = round(seconds * sample_rate)
+        self.left_out: set[int] = set()
         self._recordings: dict[int, Tensor] = {}  # 16-bit samples by index of the file
 
     def __len__(self) -> int:
@@ -111,7 +113,9 @@ class Clips:
             try:
                 waveform = self._decode(index)
             except ValueError as error:
-                warnings.warn(f"left out: {error}", stacklevel=4)
+                if index not in self.left_out:
+                    warnings.warn(f"left out: {error}", stacklevel=4)
+                self.left_out.add(index)
                 waveform = torch.zeros(1)
             peak = max(float(waveform.abs().max()), _LOWEST_PEAK)
             self._recordings[index] = (waveform / peak * 32767.0).round().to(torch.int16)

@@ -96,9 +96,15 @@ class SceneFiles(NamedTuple):
         time = min(waveform.shape[-1] for waveform in waveforms)
         longest = max(waveform.shape[-1] for waveform in waveforms)
         if len({*rates}) > 1 or longest - time > _LARGEST_DIFFERENCE * rates[0]:
+            sizes = [
+                f"{path.name} with {rate} Hz and {waveform.shape[-1]} samples"
+                for path, rate, waveform in zip(
+                    (self.clean, *self.microphones), rates, waveforms, strict=True
+                )
+            ]
             raise ValueError(
-                f"{self.clean}: expected the sample rate and the length of its noisy version, "
-                f"{self.microphones[0]}; replace the files"
+                f"{self.clean}: expected the sample rate of its noisy version and its length "
+                f"within {_LARGEST_DIFFERENCE:g} s, got {', '.join(sizes)}; replace the files"
             )
         clean, *noisy = (waveform[:, :time] for waveform in waveforms)
         channels = torch.cat(noisy)

@@ -205,7 +205,18 @@ def draw_scene_items(
         signals = gain * clean[0], gain * signal
         drawn.append(Item(f"item {number}", *signals, ear, seed=item_seed, facts=facts))
     _warn_of_silence(drawn)
+    _warn_of_unusable("scenes", scenes)
     return drawn
+
+
+def _warn_of_unusable(noun: str, clips: Clips) -> None:
+    """Warn, with their number, of recordings that were drawn and cannot be used."""
+    if clips.left_out:
+        warnings.warn(
+            f"{len(clips.left_out)} of {len(clips)} {noun} were drawn and left out, because they "
+            "cannot be used; the items come from the others. Replace or remove these files",
+            stacklevel=3,
+        )
 
 
 def _warn_of_silence(items: Sequence[Item]) -> None:
@@ -336,6 +347,9 @@ def _draw_clips(
         clean = clips.draw(1, generator)[0]
         is_noisy = noises is not None and number % 2 == 1
         yield number, clean, noises.draw(1, generator)[0] if noises and is_noisy else None
+    _warn_of_unusable("recordings of speech", clips)
+    if noises is not None:
+        _warn_of_unusable("recordings of noise", noises)
 
 
 def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float, float, int]:

@@ -148,3 +148,15 @@ def test_silence_after_short_recordings_causes_a_warning(tmp_path: Path) -> None
     draw_aid_items(tmp_path, None, ears, seconds=0.5, **settings)
     with pytest.warns(UserWarning, match="1 of 1 items end in silence"):
         draw_aid_items(tmp_path, None, ears, seconds=1.0, **settings)
+
+
+def test_recordings_that_are_left_out_are_counted(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_audio(tmp_path / f"{name}.wav", 0.1 * torch.randn(8000), 16000)
+    (tmp_path / "broken.wav").write_text("no audio")
+    settings: dict[str, Any] = {"items": 20, "seconds": 0.2, "seed": 0}
+    with pytest.warns(UserWarning) as warned:
+        draw_aid_items(tmp_path, None, read_ears(None), **settings)
+    texts = [str(warning.message) for warning in warned]
+    assert sum("left out: " in text and "broken.wav" in text for text in texts) == 1
+    assert any("1 of 4 recordings of speech were drawn and left out" in text for text in texts)

@@ -155,7 +155,10 @@ def verify(
     if not bool(output.any()):
         raise ValueError("output is silent; pass the sound that the aid produced")
     if min(len(input_), len(output)) < MIN_SECONDS * rate:
-        raise ValueError("expected at least 1 s of sound; 15 s of speech and more are better")
+        raise ValueError(
+            f"expected at least 1 s of sound, got {len(input_) / rate:.2g} s of input and "
+            f"{len(output) / rate:.2g} s of output; 15 s of speech and more are better"
+        )
     if abs(len(input_) - len(output)) > rate:
         raise ValueError(
             f"input and output differ in length by more than 1 s, {len(input_)} and "
