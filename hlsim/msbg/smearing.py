@@ -54,6 +54,12 @@ _MAX_POWER_RATIO = 1e30
 _DIVISION_EPS = 1e-36
 """Power in Pa^2 that keeps divisors away from 0."""
 
+_PHASE_FLOOR = 1.2e-6
+"""Amplitude over the RMS of its frame below which a frequency has no usable phase.
+
+It is ten times the rounding error of float32.
+"""
+
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
     """Compute the auditory filters of an ear: how much of each frequency each filter passes.
@@ -213,8 +219,13 @@ class _SmearSpectrum(torch.autograd.Function):
     complex factor with f^2 = s / p, which is imaginary where s < 0, and z = f x the smeared
     spectrum. Let g be the gradient with respect to z times the conjugate of f. Then, with
     e = Re(conj(x) g), the gradient with respect to x is g + x (A^T (e / s) - e / p), because the
-    power of one frequency changes the factors of others. The gradient grows without limit where s
-    is near 0 or f is large. The matrix is a constant and has no gradient.
+    power of one frequency changes the factors of others. The first part, g - x e / p, is the
+    gradient with respect to the phase of x. It grows as f, without limit where power spreads to a
+    frequency that has hardly any of its own. Where |x| is below ``_PHASE_FLOOR``, this part is
+    reduced in proportion to p, because the phase of x is then that of rounding errors. A single x
+    that a Fourier transform rounds to 0 would otherwise decide the gradient of the whole signal.
+    The second part grows without limit where s is near 0. The matrix is a constant and has no
+    gradient.
     """
 
     @staticmethod
@@ -235,6 +246,8 @@ class _SmearSpectrum(torch.autograd.Function):
         smeared_power, real, imaginary, spectrum_power = outputs
         eps = smeared_power.new_full((), _DIVISION_EPS)
         divisor = smeared_power + torch.copysign(eps, smeared_power)
+        floor_power = spectrum_power.mean(-1, keepdim=True) * _PHASE_FLOOR**2
+        reduction = (spectrum_power / floor_power).clamp(max=1.0)
 
         # g = gradient * conj(f), e = Re(conj(x) g), then the gradient. Real and imaginary parts are
         # computed separately, because torch would first convert the real factors of a complex
@@ -242,10 +255,10 @@ class _SmearSpectrum(torch.autograd.Function):
         g_real = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
         g_imag = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
         e = torch.addcmul(spectrum.real * g_real, spectrum.imag, g_imag)
-        weight = (e / divisor) @ matrix - e / spectrum_power
+        weight = (e / divisor) @ matrix - reduction * (e / spectrum_power)
         spectrum_gradient = torch.complex(
-            torch.addcmul(g_real, spectrum.real, weight),
-            torch.addcmul(g_imag, spectrum.imag, weight),
+            torch.addcmul(reduction * g_real, spectrum.real, weight),
+            torch.addcmul(reduction * g_imag, spectrum.imag, weight),
         )
         return spectrum_gradient, None
 

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from hlsim.dsp.fft import rfft
+from hlsim.msbg import smearing
 from hlsim.msbg.smearing import BROADENING, HOP, smear, smearing_matrix
 
 clarity = pytest.importorskip("clarity.evaluator.msbg.smearing")
@@ -61,3 +63,25 @@ def test_gradients_are_exact(severity: str) -> None:
     matrix = torch.from_numpy(smearing_matrix(severity))
     assert torch.autograd.gradcheck(lambda w: smear(w, matrix), wave, fast_mode=True)
     assert torch.autograd.gradgradcheck(lambda w: smear(w, matrix), wave, fast_mode=True)
+
+
+def test_a_frequency_that_is_rounded_to_zero_does_not_decide_the_gradient(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    wave, direction = torch.randn(2, 2048, generator=generator)
+    matrix = torch.from_numpy(smearing_matrix("severe")).float()
+
+    def compute_gradient() -> torch.Tensor:
+        variable = wave.clone().requires_grad_()
+        smeared = smear(variable, matrix)[: len(wave)]
+        return torch.autograd.grad(smeared @ direction, variable)[0]
+
+    def rfft_with_rounding(frames: torch.Tensor) -> torch.Tensor:
+        spectrum = rfft(frames)
+        rounded = spectrum.detach().index_fill(-1, torch.tensor([40]), 0.0)
+        return spectrum + (rounded - spectrum).detach()
+
+    expected = compute_gradient()
+    monkeypatch.setattr(smearing, "rfft", rfft_with_rounding)
+    assert float((compute_gradient() - expected).norm()) < 0.5 * float(expected.norm())
