@@ -57,8 +57,10 @@ COMMITTED_FILE = Path(__file__).with_name("golden.npz")
 LOCAL_FILE = Path(os.environ["HLSIM_GOLDEN"]) if os.environ.get("HLSIM_GOLDEN") else None
 
 # Largest differences on another machine or with another version of torch, relative to the peak of
-# the array. Each is two to ten times the largest difference that was measured between AVX-512, AVX2
-# and no vector instructions of torch, and the SSE kernels of oneDNN, MKL and OpenBLAS.
+# the array. Each is two to ten times the largest difference that was measured between an AMD and an
+# Intel processor, the AVX-512, AVX2 and SSE kernels of MKL, and those of torch and oneDNN. Networks
+# are computed in float64, because gradients of those with a phase are up to 0.1 of the peak away
+# from the exact ones in float32.
 EXACT = 1e-6
 RESAMPLED_NETWORK = 5e-5  # a network between two resamplings
 SINGLE_PRECISION = (
@@ -289,24 +291,30 @@ def msbg_delay() -> Arrays:
 Load = Callable[..., Any]
 
 
-def network(load: Load, name: str, rate: int = 16000) -> Arrays:
+def network(load: Load, name: str) -> Arrays:
+    model, ears = load(name).double(), thresholds("N3", "S2").double()
+    return with_gradient(lambda x: model(x, ears), two_signals(0.4).double())
+
+
+def network_at_another_rate(load: Load, name: str, rate: int) -> Arrays:
     model, ears = load(name, sample_rate=rate), thresholds("N3", "S2")
     return with_gradient(lambda x: model(x, ears), two_signals(0.4, rate))
 
 
 def network_training(load: Load, name: str) -> Arrays:
-    model = load(name).requires_grad_(True)
-    output = model(noisy_speech(0.3), ear("N4"))
+    model = load(name).double().requires_grad_(True)
+    output = model(noisy_speech(0.3).double(), ear("N4"))
     return {"gradient of the parameters": parameter_gradient(model, output)}
 
 
 def random_compensator(kind: str) -> Arrays:
-    model, ears = getattr(compensators, kind)(), thresholds("N3", "S2")
+    model, ears = getattr(compensators, kind)(), thresholds("N3", "S2").double()
     random = np.random.RandomState(3)
     with torch.no_grad():
         for _, parameter in sorted(model.named_parameters()):
             parameter.copy_(torch.from_numpy(0.05 * random.standard_normal(parameter.shape)))
-    signals = two_signals(0.3)
+    model.double()
+    signals = two_signals(0.3).double()
     results = with_gradient(lambda x: model(x, ears), signals)
     gradient = parameter_gradient(model, model(signals, ears))
     return {**results, "gradient of the parameters": gradient}
@@ -445,7 +453,7 @@ def binaural(rate: int) -> Arrays:
 # Resampling and statistics
 
 
-def resampled(source_rate: int, target_rate: int, dtype: torch.dtype = torch.float32) -> Arrays:
+def resampled(source_rate: int, target_rate: int, dtype: torch.dtype = torch.float64) -> Arrays:
     signal = noisy_speech(0.3, source_rate).to(dtype)
     return with_gradient(lambda x: resample(x, source_rate, target_rate), signal)
 
@@ -502,12 +510,12 @@ def network_cases() -> dict[str, Case]:
         name = f"neuro-msbg{kind}"
         cases[f"checkpoint {name}"] = Case(partial(network, load_pretrained, name))
     for rate in (22050, 44100, 48000):
-        function = partial(network, load_pretrained, "neuro-msbg", rate)
+        function = partial(network_at_another_rate, load_pretrained, "neuro-msbg", rate)
         cases[f"checkpoint neuro-msbg at {rate} Hz"] = resampled_case(function)
     for name in ("compensator-general", "hearing-aid"):
-        function = partial(network, load_compensator, name)
-        cases[f"checkpoint {name}"] = Case(function)
-        cases[f"checkpoint {name} at 44100 Hz"] = resampled_case(partial(function, 44100))
+        cases[f"checkpoint {name}"] = Case(partial(network, load_compensator, name))
+        function = partial(network_at_another_rate, load_compensator, name, 44100)
+        cases[f"checkpoint {name} at 44100 Hz"] = resampled_case(function)
     for name, load in (
         ("compensator-general", load_compensator),
         ("hearing-aid", load_compensator),
@@ -576,8 +584,8 @@ def metric_cases() -> dict[str, Case]:
 
 
 def resampling_cases() -> dict[str, Case]:
-    in_double = partial(resampled, 44100, 16000, torch.float64)
-    cases = {"resample 44100 to 16000 Hz, float64": Case(in_double)}
+    in_single = partial(resampled, 44100, 16000, torch.float32)
+    cases = {"resample 44100 to 16000 Hz, float32": Case(in_single, tolerance=SINGLE_PRECISION)}
     upwards = ((16000, 44100), (16000, 48000), (16000, 24000))
     for source, target in (*upwards, (44100, 16000), (48000, 16000), (22050, 16000)):
         cases[f"resample {source} to {target} Hz"] = Case(partial(resampled, source, target))

@@ -63,14 +63,16 @@ def test_both_ears_in_one_call_are_each_ear_alone(name: str, scene: Tensor) -> N
 
 @pytest.mark.parametrize("kind", mostly_slow([HearingLossLoss, HASPILoss], [HearingLossLoss]))
 def test_the_loss_is_the_mean_over_both_ears_and_reaches_both(kind: Any, scene: Tensor) -> None:
-    loss, output = kind(), (0.5 * scene).requires_grad_()
+    # In float32, the value depends on the size of the batch, by up to 2e-4 on some processors.
+    scene = scene.double()
+    loss, output = kind().double(), (0.5 * scene).requires_grad_()
     value = loss(output[None], scene[None], BOTH)
     left = loss(output[:1], scene[:1], LEFT).detach()
     right = loss(output[1:], scene[1:], RIGHT).detach()
-    assert float(value.detach()) == pytest.approx(float(left + right) / 2.0, rel=1e-4)
+    assert float(value.detach()) == pytest.approx(float(left + right) / 2.0, rel=1e-6)
     (gradient,) = torch.autograd.grad(value, output)
     assert bool(gradient.isfinite().all()) and bool(gradient.any(-1).all())
-    stored = kind(BOTH)(output[None], scene[None]).detach()
+    stored = kind(BOTH).double()(output[None], scene[None]).detach()
     assert float(stored) == pytest.approx(float(value.detach()), rel=1e-5)
     for mono in (loss, kind(BOTH)):
         with pytest.raises(ValueError):

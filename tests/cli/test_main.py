@@ -346,7 +346,8 @@ def test_measured_uncomfortable_levels_of_one_ear(tmp_path: Path, utterance: Pat
     gain = 10.0 ** ((80.0 - float(level_spl(scene[0]))) / 20.0)
     aid = load_compensator("wdrc", sample_rate=rate, limit_to_ear=True)
     ear = Audiogram.standard("N3", ucl={500: 60, 1000: 65})
-    check_output(out, aid(gain * scene, ear) / gain)
+    # In float32, the resampled output depends on the number of threads and on the processor.
+    check_output(out, aid(gain * scene, ear) / gain, atol=1e-5)
 
 
 @pytest.mark.parametrize(("ear", "warnings"), [("N4", 0), ("N3", 1)])
