@@ -38,7 +38,7 @@ def mix(
         Noisy speech, of the type and shape of ``speech``.
 
     Raises:
-        ValueError: The shapes do not fit, the noise is silent or shorter than the speech, samples
+        ValueError: The shapes do not fit, also that of the SNR, the noise is silent or shorter than the speech, samples
             are NaN or infinite, the SNR is NaN, or the sample rate is out of range.
 
     Example:
@@ -80,6 +80,14 @@ def mix(
         power = (10.0 ** ((level - loudest) / 10.0)).mean(-1)
         level = loudest.squeeze(-1) + 10.0 * power.log10()
         masker = masker.flatten(-2)
+    # Fewer dimensions would broadcast: two ratios for two stereo items would be those of the ears.
+    sizes = zip(ratio.shape, level.shape, strict=False)
+    if ratio.ndim not in (0, level.ndim) or any(size not in (1, items) for size, items in sizes):
+        unit = "recording" if channels else "signal"
+        raise ValueError(
+            f"expected one SNR, or one per {unit} in the shape {tuple(level.shape)}, got the shape "
+            f"{tuple(ratio.shape)}; reshape it"
+        )
     noise_level = (level - ratio).clamp_min(-200.0)  # the level of silence
     scaled = set_level(masker, noise_level, full_scale_spl=0.0)
     return as_type_of(speech, signal + scaled.reshape(signal.shape))

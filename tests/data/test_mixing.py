@@ -50,6 +50,9 @@ def test_arrays_give_arrays_and_longer_noise_is_cut() -> None:
     torch.testing.assert_close(torch.from_numpy(noisy), mix(speech, noise[:64320], 0.0))
 
 
+STEREO = {"speech": torch.ones(2, 2, 1000), "noise": torch.ones(2, 2, 1000)}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -62,7 +65,12 @@ def test_arrays_give_arrays_and_longer_noise_is_cut() -> None:
         ({"noise": torch.full((1000,), torch.inf)}, "noise has samples that are NaN"),
         ({"speech": torch.full((1000,), torch.nan)}, "speech has samples that are NaN"),
         ({"snr": float("nan")}, "expected an SNR in dB"),
-        ({"snr": torch.zeros(2)}, "broadcast"),
+        ({"snr": torch.zeros(2)}, r"one per signal in the shape \(\), got the shape \(2,\)"),
+        ({**STEREO, "snr": torch.zeros(2)}, r"one per signal in the shape \(2, 2\)"),
+        (
+            {**STEREO, "snr": torch.zeros(3), "channels": True},
+            r"one per recording in the shape \(2",
+        ),
         ({"sample_rate": 8000}, "8000"),
     ],
 )
