@@ -507,7 +507,7 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
         steps = estimate_steps(rows, name)
         low, high = recruitment.bootstrap(rows, lambda part, name=name: estimate_steps(part, name))
         for limit, *values in zip(SEVERITY_LIMITS, steps, low, high, strict=True):
-            row[f"at {limit:g} dB HL"] = "{:.1f} [{:.1f}, {:.1f}]".format(*values)
+            row[f"at {limit:g} dB HL"] = "{:z.1f} [{:z.1f}, {:z.1f}]".format(*values)
         table.append(row)
     print_table("Step of the tuning depth at a mean loss, in dB", pd.DataFrame(table))
 
