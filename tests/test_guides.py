@@ -51,7 +51,8 @@ NOT_RUN = {
 """Texts in commands and programs that are not run, with the reason."""
 
 SHORTER = {
-    "hlsim train-": "--recipe.steps 2 --recipe.batch 2 --recipe.validation_items 2",
+    "hlsim train-": "--recipe.steps 2 --recipe.batch 2 --recipe.seconds 1 "
+    "--recipe.validation_items 2",
     "hlsim evaluate-": "--items 2 --seconds 1 --jobs 1",
     "hlsim haspi-report": "--jobs 1",
     "hlsim clarity": "--jobs 1",

@@ -23,6 +23,8 @@ EXAMPLE = FIGURES / "mbstoi_parity.py"
 # Directions of speech and noise in degrees, and the SNR in dB.
 SCENES = ((0.0, 90.0, -8.0), (-40.0, 30.0, 0.0), (70.0, 160.0, 8.0))
 
+RATES = (16000, 44100, 48000)
+
 
 @pytest.fixture(scope="module")
 def scenes(speech_dir: Path) -> tuple[Tensor, Tensor]:
@@ -47,18 +49,25 @@ def scenes(speech_dir: Path) -> tuple[Tensor, Tensor]:
     return clean, noisy
 
 
-@pytest.mark.parametrize("rate", [16000, 44100, 48000])
+@pytest.mark.parametrize("rate", RATES)
 def test_equals_pyclarity(
     scenes: tuple[Tensor, Tensor], pyclarity: PyclarityOutputs, rate: int
 ) -> None:
+    """Compare with the stored scores, which pyclarity reproduces for one scene at each rate."""
     clean, noisy = (
         torch.from_numpy(resample_poly(signal.numpy(), rate // 100, 160, axis=-1))
         for signal in scenes
     )
-    expected = [
-        float(pyclarity(f"mbstoi, scene {i}, {rate} Hz", reference.mbstoi, x, y, rate))
-        for i, (x, y) in enumerate(zip(clean.numpy(), noisy.numpy(), strict=True))
-    ]
+    is_one_enough = pyclarity.computed and pyclarity.new_outputs is None
+    numbers = [RATES.index(rate)] if is_one_enough else range(len(SCENES))
+    expected = []
+    for i in numbers:
+        arguments = clean[i].numpy(), noisy[i].numpy(), rate
+        expected.append(
+            float(pyclarity(f"mbstoi, scene {i}, {rate} Hz", reference.mbstoi, *arguments))
+        )
+    if pyclarity.computed:
+        return
     assert max(expected) - min(expected) > 0.1
     assert mbstoi(noisy, clean, sample_rate=rate).tolist() == pytest.approx(expected, abs=1e-9)
     single = mbstoi(noisy.float(), clean.float(), sample_rate=rate)
