@@ -38,8 +38,9 @@ def mix(
         Noisy speech, of the type and shape of ``speech``.
 
     Raises:
-        ValueError: The shapes do not fit, also that of the SNR, the noise is silent or shorter than the speech, samples
-            are NaN or infinite, the SNR is NaN, or the sample rate is out of range.
+        ValueError: The shapes do not fit, also that of the SNR, the noise is silent or shorter than
+            the speech, samples are NaN or infinite, the SNR is NaN, or the sample rate is out of
+            range.
 
     Example:
         >>> import hlsim
