@@ -185,3 +185,16 @@ def test_the_phase_factor_equals_its_formula_and_has_exact_gradients() -> None:
     undefined = torch.stack((-torch.ones(1, 3, 3), torch.zeros(1, 3, 3)), 1).requires_grad_()
     phase_factor(undefined, torch.zeros(1, 3, 3)).abs().sum().backward()
     assert undefined.grad is not None and undefined.grad.isfinite().all()
+
+
+@pytest.mark.slow
+def test_a_compiled_network_has_the_same_output_and_gradient(
+    trained: NeuroMSBG, clips: Tensor
+) -> None:
+    results = []
+    for model in (trained, torch.compile(trained, backend="aot_eager")):
+        signal = clips[:1, :4000].clone().requires_grad_()
+        output = model(signal, N3)
+        results.append((output.detach(), *torch.autograd.grad(output.square().sum(), signal)))
+    for expected, actual in zip(*results, strict=True):
+        assert float((actual - expected).norm() / expected.norm()) < 1e-4
