@@ -13,7 +13,7 @@ def demo(parser: Parser) -> None:
     parser.set_command(_demo, "", "--audiogram S2 --steps 1000 --out s2")
     parser.option("--out", Path, "folder for the page and the checkpoint", Path("hlsim-demo"))
     parser.audiogram("N4")
-    parser.option("--steps", count, "training steps", 3000)
+    parser.option("--steps", count, "training steps", 1000)
 
 
 def _demo(options: argparse.Namespace) -> None:
