@@ -99,7 +99,10 @@ def pyclarity_simulator_rows(signal: Tensor, reference: str, device: str) -> lis
 
 
 def loss_rows(options: argparse.Namespace) -> list[Row]:
-    """The loss through each simulator, without the network that it trains."""
+    """The loss through each simulator, and a loss of auraloss, without the network that they
+    train."""
+    from auraloss.freq import MultiResolutionSTFTLoss
+
     clean = noise_like_speech(16000, options.seconds, options.batch).to(options.device)
     output = noise_like_speech(16000, options.seconds, options.batch, seed=1).to(options.device)
     output.requires_grad_()
@@ -107,6 +110,9 @@ def loss_rows(options: argparse.Namespace) -> list[Row]:
     for simulator in LOSS_SIMULATORS:
         loss = HearingLossLoss(EAR, simulator=simulator).to(options.device)
         rows.append(Row(f"HearingLossLoss ({simulator})", lambda f=loss: f(output, clean), ""))
+    spectral = MultiResolutionSTFTLoss().to(options.device)
+    pair = (output.unsqueeze(1), clean.unsqueeze(1))
+    rows.append(Row("auraloss, MultiResolutionSTFTLoss", lambda: spectral(*pair), ""))
     return rows
 
 
