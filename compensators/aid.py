@@ -102,7 +102,8 @@ class Aid(nn.Module):
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Measure the insertion gains for noise with the spectrum of average speech.
 
-        Noise reduction is off, and the limit of the output is not applied.
+        The limit of the output is not applied, and noise reduction is off in aids that have a
+        slider for it.
 
         Args:
             audiogram: One or more ears, by default those of the constructor.
@@ -160,9 +161,10 @@ class Aid(nn.Module):
         )
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Return the output for signals in pascals at 16 kHz, without noise reduction and limit.
+        """Return the output in pascals for signals in pascals at 16 kHz.
 
-        The output may be late by the delay of the aid's filters.
+        It is neither limited to a peak nor to the ear, and noise reduction is off in aids that have
+        a slider for it. The output may be late by the delay of the aid's filters.
 
         Shape: (items, time), (items, 8) in dB HL -> (items, time).
         """

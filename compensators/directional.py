@@ -363,11 +363,13 @@ class DirectionalAid(nn.Module):
     """A directional front end, followed by an aid of two ears.
 
     Args:
-        front_end: Module from (..., microphones, ears, time) to (..., ears, time).
+        front_end: Combination of microphones, (..., microphones, ears, time) to (..., ears, time),
+            such as ``BinauralMVDR()``.
         aid: Aid of two ears, such as those of ``load_compensator``, at the same sample rate.
 
     Raises:
-        ValueError: One of them is not a module, or the aid was built for another sample rate.
+        ValueError: The front end is no ``FilterAndSum``, the aid is no module, or the aid was built
+            for another sample rate.
 
     >>> from compensators import NALR
     >>> aid = DirectionalAid(DifferentialMicrophone(), NALR())
@@ -383,7 +385,7 @@ class DirectionalAid(nn.Module):
 
     def __init__(self, front_end: FilterAndSum, aid: nn.Module) -> None:
         super().__init__()
-        if not isinstance(front_end, nn.Module):
+        if not isinstance(front_end, FilterAndSum):
             raise ValueError(f"expected a front end, got {front_end!r}; write BinauralMVDR()")
         if not isinstance(aid, nn.Module):
             raise ValueError(f"expected an aid, got {aid!r}; load it by hlsim.load_compensator")

@@ -45,8 +45,8 @@ class WDRC(Wearable):
     NAL-R. The gain is smaller if the band is louder, and larger if it is softer, down to 20 dB
     below average speech: the output changes by 1 dB if the input changes by as many dB as the
     compression ratio. The ratio is 1 up to a loss of 10 dB HL, rises by 1 per 40 dB of loss, and is
-    3 at most. With CAMFIT, ratio and range are those of ``CAMFIT``. Gains are 0 dB or more. The
-    delay is 4 ms.
+    3 at most. With CAMFIT, ratio and range are those of ``CAMFIT``. Gains are 0 dB or more,
+    unless ``limit_to_ear`` lowers them. The delay of a stream is 4 ms.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.

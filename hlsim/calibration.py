@@ -114,8 +114,8 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
     Args:
         waveform: Samples.
         spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
-            dimensions, from the level of silence (-106 at the default scale) to 140 dB SPL. A
-            tensor on a GPU is not validated, because that would synchronise with the GPU.
+            dimensions, from the level of silence (-106 at the default scale) to 140 dB SPL. For
+            a waveform on a GPU, it is not validated, because that would synchronise with the GPU.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:

@@ -364,7 +364,7 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
 
 
 def _decode(data: bytes) -> str:
-    """Decode the text of a file, in UTF-8 or in an encoding that spreadsheets write."""
+    """Decode the text of a file: UTF-16 if it begins with its mark, UTF-8, or else cp1252."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
     try:

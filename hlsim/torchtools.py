@@ -529,7 +529,7 @@ class _Store:
 
 
 def _count_bytes(value: Any) -> int:
-    """Return the bytes of a tensor or an array, or of all those in a sequence or an object."""
+    """Return the bytes of a tensor or an array, or of all in a list, a tuple or an object."""
     if isinstance(value, Tensor | np.ndarray):
         return value.nbytes
     if not isinstance(value, list | tuple):

@@ -69,19 +69,20 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     case, perhaps with an ear, as in ``L250``, ``right_250`` or ``250 Hz (R)``. Columns such as
     ``hl_250_masked`` are remarks on ``hl_250``. Columns with another word before a frequency of
     audiometry, such as ``aided 250``, ``bone 250`` and ``masked left 250``, and those of
-    extrapolated levels, are left out with a warning that names them. Columns that do not look like
-    thresholds are left out without a warning.
+    extrapolated levels at such a frequency, are left out with a warning that names them. With
+    ``Hz``, as in ``masked 250 Hz``, they are remarks, and numbers in them are an error. Columns
+    that do not look like thresholds are left out without a warning.
 
     Args:
         columns: Names of all columns.
 
     Returns:
-        The meaning of each column of thresholds or remarks, by its name.
+        The meaning of each column of thresholds, uncomfortable levels or remarks, by its name.
 
     Raises:
         ValueError: A name looks like that of thresholds, but is not understood or has a frequency
-            below 100 or above 20000 Hz; a remark has no column of thresholds; or two columns have
-            the same frequency and ear.
+            below 100 or above 20000 Hz; a remark has no column of thresholds of its frequency; or
+            two columns of thresholds, or of uncomfortable levels, have the same frequency and ear.
 
     >>> threshold_columns(["name", "R 1k"])
     {'R 1k': ThresholdColumn(ear='right', hz=1000.0, is_remark=False, is_ucl=False)}

@@ -194,10 +194,10 @@ def compressed_gains_db(
 
 
 def highest_band_levels(uncomfortable_levels: Tensor, points: Frequencies) -> Tensor:
-    """Convert uncomfortable levels of an ear to the highest comfortable levels of bands in dB SPL.
+    """Convert uncomfortable levels of an ear in dB HL to levels of bands in dB SPL.
 
-    They are levels in a free field, as all signals of hlsim: the reference of headphones (ISO
-    389-8), by which an audiometer shows dB HL, cancels.
+    The results are levels in a free field, as those of all signals of hlsim: the level in dB HL,
+    interpolated over log frequency, plus the free-field level of 0 dB HL (ISO 389-7).
 
     Args:
         uncomfortable_levels: Levels in dB HL at ``FREQUENCIES``.

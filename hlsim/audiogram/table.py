@@ -240,7 +240,7 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
 
 
 def _without_units(column: str) -> str:
-    """Return the words of a column's name in lower case, without units."""
+    """Return the words of a column's name in lower case, without Hz, dB and HL."""
     words = re.findall("[a-z]+", column.lower())
     return " ".join(word for word in words if word not in ("hz", "db", "hl"))
 

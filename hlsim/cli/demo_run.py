@@ -20,7 +20,9 @@ from hlsim.training.recipes import CompensatorRecipe
 
 
 class DurationEstimate(Callback):
-    """Callback that prints the expected duration of the demo, from the pace of steps 10 to 60.
+    """Callback that prints, at step 60, how much longer the demo takes.
+
+    The pace is that of steps 10 to 60. A training of fewer steps prints nothing.
 
     >>> DurationEstimate().last_step
     60

@@ -149,14 +149,15 @@ class Clips:
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw clips at random positions of random recordings, and redraw silent clips.
 
-        A clip is silent if its RMS is at least 70 dB below the peak of its recording.
+        A clip is silent if its RMS is at least 70 dB below the peak of its recording. Of a subclass
+        with several channels, those of ``judged_part`` count.
 
         Args:
             count: Number of clips.
             generator: Source of the random numbers.
 
         Returns:
-            Clips with shape (count, time).
+            Clips with shape (count, time), or (count, channels, time) in a subclass.
 
         Raises:
             ValueError: 10,000 draws in a row gave only silent clips and files that cannot be used.

@@ -266,9 +266,10 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
 
 
 def _read_clarity_scenes(files: Sequence[str]) -> list[Utterance]:
-    """Convert the paths of Clarity's scenes to utterances, whose reference is microphone 1.
+    """Convert the paths of Clarity's scenes to utterances, one per scene.
 
-    The interferers and other files are not used.
+    The clean speech is the anechoic target. The files of all microphones are the noisy recording,
+    whose reference is microphone 1 at both ears. Interferers and other files are not used.
 
     Raises:
         ValueError: A scene lacks its clean speech, or its first microphone.

@@ -284,6 +284,8 @@ def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
 def _check_same_speech(first: RecordedItem, second: RecordedItem) -> None:
     """Raise ValueError if the two ears of an utterance have clean files with different speech.
 
+    The same speech with more than 2 ms between the ears is different speech, too.
+
     Nothing is raised if both share one file, or if a file cannot be read, because its item then
     becomes a failure of the study.
     """

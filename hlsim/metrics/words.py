@@ -221,10 +221,11 @@ def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> l
     """Simulate the proportion of words that listeners understand with each of several aids.
 
     The same 4000 listeners, whose random numbers are fixed, are simulated with every aid, so the
-    arrays can be subtracted.
+    arrays can be subtracted. They differ by the uncertainty of the curve, by the test, and by the
+    chance with which words are understood; aids differ from the curve, too.
 
     Args:
-        curve: Parameters of the model.
+        curve: Parameters of the model, from ``load_curve``.
         aids: One pair per aid: the HASPI of its sentences, (items,), and the aid's mean HASPI.
 
     Returns:

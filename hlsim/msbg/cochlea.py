@@ -200,13 +200,13 @@ def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tenso
 def simulate_delayed_cochlea(
     signals: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, is_last: bool
 ) -> Tensor:
-    """Simulate the cochlea for output that is not aligned, sample by sample as pyclarity does.
+    """Simulate the cochlea so that each sample is close to pyclarity's, for output with its delay.
 
-    The delay of the filters and of smearing is already in the input, and stays there. If the
-    signals end here, their last samples are computed with all channels at 44.1 kHz and with
-    pyclarity's treatment of the end.
+    The delay of the middle ear's filters and of smearing is already in the input, and stays there.
+    If the signals end here, their last samples (or all, if they are short or have not been smeared)
+    are computed with all channels at 44.1 kHz and with pyclarity's treatment of the end.
 
-    Shape: (items, time), (items, channels) -> (items, time).
+    Shape: (items, time), (items, channels) -> (items, time) in Pa.
 
     Args:
         signals: Input of the cochlea at 44.1 kHz in Pa.

@@ -134,9 +134,9 @@ class EarNetwork(nn.Module):
         return None if field is None else (self.config.step, field + self._additional_field)
 
     def process_items(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Process signals in pascals at 16 kHz for ears with thresholds in dB HL.
+        """Compute the output in pascals for signals in pascals at 16 kHz and ears in dB HL.
 
-        Subclasses implement this method.
+        A simulator's output is what the ear perceives. Subclasses implement this method.
 
         Shape: (items, time), (items, 8) -> (items, time).
         """
