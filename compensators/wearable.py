@@ -52,6 +52,7 @@ from hlsim.torchtools import (
     as_type_of,
     broadcast_shape,
     flatten_items,
+    not_compiled,
     on_device,
 )
 
@@ -287,6 +288,7 @@ class Wearable(Aid):
             gains.append(block_gains)
         return torch.cat(outputs, -1), torch.cat(gains, -1), state
 
+    @not_compiled  # tracing unrolls the loops over hops, which takes many minutes
     def process_block(
         self,
         waveform: Tensor,

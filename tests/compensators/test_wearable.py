@@ -1,5 +1,6 @@
 """Both wearable aids: look-ahead, streams, blocks, other rates, recovery and linked ears."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -159,3 +160,17 @@ def test_linked_gains_keep_the_level_difference_between_the_ears(name: str, nois
     torch.testing.assert_close(output[:, linked.latency :], outputs[0], atol=1e-5, rtol=0.0)
     with pytest.raises(ValueError):
         linked(noise[0], EAR)
+
+
+@both_aids
+def test_a_compiled_program_runs_the_aid_eagerly(name: str) -> None:
+    # Tracing would unroll the loops over hops.
+    graphs = []
+
+    def count(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Any]:
+        graphs.append(graph)
+        return graph.forward
+
+    aid, signal = build_wearable(name), 0.02 * torch.randn(1, 4000)
+    torch.testing.assert_close(torch.compile(aid, backend=count)(signal, EAR), aid(signal, EAR))
+    assert not graphs
