@@ -310,7 +310,7 @@ def test_aids_with_several_microphones_are_compared_in_recorded_scenes(
     conditions = {condition.name: condition for condition in study.conditions}
     items: Any = study.items
     for item in items:
-        assert item.signal.shape == (2, 2, 6400)
+        assert item.signal.shape == (2, 2, 11200)
         output = conditions["mine"].output(item)  # the sum, in which there is no noise
         torch.testing.assert_close(output, 2.0 * item.clean, atol=1e-4, rtol=1e-3)
         assert torch.equal(conditions["unaided"].output(item), item.reference_signal)
