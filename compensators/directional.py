@@ -368,7 +368,7 @@ class DirectionalAid(nn.Module):
         aid: Aid of two ears, such as those of ``load_compensator``, at the same sample rate.
 
     Raises:
-        ValueError: The front end is no ``FilterAndSum``, the aid is no module, or the aid was built
+        ValueError: The front end is not a ``FilterAndSum``, the aid is not a module, or was built
             for another sample rate.
 
     >>> from compensators import NALR

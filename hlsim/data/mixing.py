@@ -38,7 +38,7 @@ def mix(
         Noisy speech, of the type and shape of ``speech``.
 
     Raises:
-        ValueError: The shapes do not fit, also that of the SNR, the noise is silent or shorter than
+        ValueError: The shapes, or that of the SNR, do not fit; the noise is silent or shorter than
             the speech, samples are NaN or infinite, the SNR is NaN, or the sample rate is out of
             range.
 
