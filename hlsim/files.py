@@ -9,7 +9,7 @@ import json
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -294,6 +294,27 @@ def read_table(
     if not rows:
         raise ValueError(f"{source}: expected a table with rows, got no rows; add them")
     return rows
+
+
+def check_spellings(rows: Iterable[tuple[str, Mapping[str, str]]], column: str) -> None:
+    """Raise ValueError if two names in a column differ only in case, and may mean the same.
+
+    Args:
+        rows: Rows of a table, as ``read_table`` returns them. Those without the column are passed
+            over.
+        column: Name of the column.
+
+    >>> check_spellings([("line 2", {"listener": "A"}), ("line 3", {"listener": "B"})], "listener")
+    """
+    spellings: dict[str, str] = {}
+    for place, row in rows:
+        name = row.get(column, "")
+        spelling = spellings.setdefault(name.casefold(), name)
+        if spelling != name:
+            raise ValueError(
+                f"{place}: the {column} {name!r} differs from {spelling!r} only in case; write the "
+                "same name in all places, or give one of the two another name"
+            )
 
 
 def warn_of_unused(columns: Collection[str], contents: str, known_columns: Collection[str]) -> None:

@@ -12,7 +12,7 @@ from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.published import STANDARD
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, EarName
 from hlsim.audiogram.value import Audiogram, ears_in_row
-from hlsim.files import convert_at, read_json, read_table
+from hlsim.files import check_spellings, convert_at, read_json, read_table
 
 _Builders = Mapping[str, Callable[[], Listener]]
 """Functions without arguments that build listeners, under the names of the listeners."""
@@ -46,9 +46,9 @@ def read_audiograms(
 
     Raises:
         ValueError: The file cannot be read, has no rows, a row is not an audiogram, columns
-            contradict each other, an ear has two thresholds at one frequency, or a column looks
-            like thresholds and is not understood. The message names the file, and the line or row
-            and the column where there is one.
+            contradict each other, the names of two listeners differ only in case, an ear has two
+            thresholds at one frequency, or a column looks like thresholds and is not understood.
+            The message names the file, and the line or row and the column where there is one.
 
     Example:
         >>> import hlsim
@@ -85,9 +85,9 @@ def read_listeners(
         Listeners, each under its name.
 
     Raises:
-        ValueError: The file cannot be read, has no listener of a name, or an ear is not valid, is
-            neither left nor right, or occurs twice. The message names the file and the line or the
-            listener.
+        ValueError: The file cannot be read, has no listener of a name, the names of two listeners
+            differ only in case, or an ear is not valid, is neither left nor right, or occurs twice.
+            The message names the file and the line or the listener.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -112,12 +112,13 @@ def _read_entries(path: str | Path) -> _Builders:
     The functions raise ValueError if an ear is missing or not valid.
 
     Raises:
-        ValueError: The file does not exist, is no JSON, has a key twice, or is not an object with
-            entries.
+        ValueError: The file does not exist, is no JSON, has a key twice, is not an object with
+            entries, or the names of two listeners differ only in case.
     """
     entries = read_json(path)
     if not isinstance(entries, Mapping) or not entries:
         raise ValueError(f"{path}: expected one entry per listener, as in Clarity's listeners.json")
+    check_spellings([(str(path), {"listener": name}) for name in entries], "listener")
     return {
         name: partial(convert_at, f"{path}, listener {name}", Listener.from_clarity, entry)
         for name, entry in entries.items()
@@ -212,10 +213,11 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
         Rows with one or two ears each.
 
     Raises:
-        ValueError: The table cannot be read, its columns contradict each other, or a row is not
-            valid, see ``_widen``.
+        ValueError: The table cannot be read, its columns contradict each other, the names of two
+            listeners differ only in case, or a row is not valid, see ``_widen``.
     """
     rows = read_table(table, "audiograms", ("listener", "ear"))
+    check_spellings(rows, "listener")
     columns: dict[str, str] = {}
     for column in rows[0][1]:
         if re.search(r"\d", column):  # "threshold 500" is a column of a wide table

@@ -157,3 +157,7 @@ def make_parser(command: str) -> Parser:
     declare = getattr(import_module(f"hlsim.cli.{module}"), command.replace("-", "_"))
     declare(parser)
     return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -40,6 +40,7 @@ from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.running.parallel import (
     CRASH,
     Crash,
+    check_scheduler,
     describe_error,
     run_parallel,
 )
@@ -171,6 +172,7 @@ def evaluate_scenes(
             be scored.
         MissingExtraError: A package is not installed.
     """
+    check_scheduler(running.get("dask"))
     names = ["haspi", "hasqi", *measures]
     find_measures(names)
     all_pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)

@@ -50,6 +50,7 @@ from hlsim.evaluation.items import (
 )
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.running.parallel import check_scheduler
 from hlsim.evaluation.sounds import perceive_items
 from hlsim.evaluation.study import Condition
 from hlsim.metrics.pair import SHORTEST_SECONDS
@@ -162,6 +163,7 @@ def evaluate_compensators(
     >>> evaluation.names[:3], evaluation.names[3:]
     (['unaided', 'NAL-R', 'WDRC'], ["NAL-R at mine's level", "equaliser at mine's level", 'mine'])
     """
+    check_scheduler(running.get("dask"))
     loudness = check_loudness(loudness)
     check_number("seconds", seconds, SHORTEST_SECONDS)
     scores = find_measures(["haspi", "hasqi", *measures], precision)

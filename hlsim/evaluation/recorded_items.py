@@ -35,7 +35,14 @@ from hlsim.audiogram.value import ears_in_row
 from hlsim.calibration import full_scale_at
 from hlsim.evaluation.running.fingerprint import value_hash
 from hlsim.evaluation.study import Item
-from hlsim.files import convert_at, path_below, read_table, sha256, warn_of_unused
+from hlsim.files import (
+    check_spellings,
+    convert_at,
+    path_below,
+    read_table,
+    sha256,
+    warn_of_unused,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -347,8 +354,9 @@ def read_recordings(
 
     Raises:
         ValueError: A file cannot be read, a required column is missing, there is a column ``spl``
-            (pass the argument ``spl`` instead), a listener is unknown, or a row is not valid; for a
-            row, the message names the line.
+            (pass the argument ``spl`` instead), the names of two listeners or conditions differ
+            only in case, a listener is unknown, or a row is not valid; for a row, the message names
+            the line.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -373,6 +381,8 @@ def read_recordings(
             )
     known = [column for column in _COLUMNS if column != "spl"]
     warn_of_unused({*columns} - {*known, *threshold_columns(columns)}, "the manifest", known)
+    for column in ("listener", "condition"):
+        check_spellings(rows, column)
     listeners: dict[str, Listener] = {}
     if audiograms is not None:
         listeners = read_listeners(audiograms, {row.get("listener", "") for _, row in rows})

@@ -23,6 +23,7 @@ from hlsim.evaluation.recorded_items import (
     read_recordings,
 )
 from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.running.parallel import check_scheduler
 from hlsim.evaluation.sounds import perceive_items
 from hlsim.evaluation.study import Condition
 
@@ -115,6 +116,7 @@ def haspi_report(
     >>> round(float(report.table["stoi"].mean()), 3)
     1.0
     """
+    check_scheduler(running.get("dask"))
     settings: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl, "seed": seed}
     if conditions and (before is not None or after is not None):
         raise ValueError(

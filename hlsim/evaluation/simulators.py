@@ -22,6 +22,7 @@ from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simu
 from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.evaluation.running.fingerprint import fingerprint
+from hlsim.evaluation.running.parallel import check_scheduler
 from hlsim.evaluation.sounds import try_conditions
 from hlsim.evaluation.study import Condition, Item, Measure, Values
 from hlsim.extras import is_installed
@@ -98,6 +99,7 @@ def evaluate_simulators(
     >>> evaluation.table["snr"].tolist()  # the teacher itself
     [200.0]
     """
+    check_scheduler(running.get("dask"))
     inputs = list(dict.fromkeys(inputs))
     settings: dict[str, Any] = {
         "items": items,

@@ -26,6 +26,7 @@ from hlsim.evaluation.running.parallel import (
     CRASH,
     Crash,
     Progress,
+    check_scheduler,
     describe_error,
     run_parallel,
 )
@@ -333,6 +334,7 @@ def run_measures(
     ['count']
     """
     pandas = require("pandas", "eval")
+    check_scheduler(running.get("dask"))
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
     facts = {fact for source in items for fact in source.facts}

@@ -2,6 +2,7 @@
 
 import copy
 import io
+import json
 import logging
 import math
 import sys
@@ -32,6 +33,12 @@ _EXPECTED_WARNINGS = (
     "many workers|directory .* exists|not used|before the epoch ended|logging interval|LeafSpec"
 )
 """Pattern of Lightning's warnings about choices that hlsim makes on purpose."""
+
+STATE = "last.ckpt"
+"""Name of the file with Lightning's state, from which a training continues."""
+
+_RESULTS = {"start_validation", "minutes", "validation"}
+"""Entries about the results of a training in its description, beside the steps taken."""
 
 
 class BestCheckpoint(L.Callback):
@@ -210,7 +217,7 @@ def train_network(
     folder = Path(out)
     start = {"start_sha256": read_record(recipe.start)["sha256"]} if recipe.start else {}
     record = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about}
-    state = folder / "last.ckpt"
+    state = folder / STATE
     duration = None if max_minutes is None else timedelta(minutes=max_minutes)
     last = ModelCheckpoint(
         dirpath=folder,
@@ -249,7 +256,7 @@ def train_network(
         record["devices"] = trainer.world_size
         is_resumption = state.exists()
         if not is_resumption:
-            _check_no_network(best.folder)
+            _check_no_network(best.folder, record)
         else:
             step = _check_state(state, record, best.folder)
             if step >= recipe.steps:
@@ -266,16 +273,44 @@ def train_network(
     return best.folder
 
 
-def _check_no_network(folder: Path) -> None:
-    """Raise ValueError if a folder has the network of another training, which would be replaced.
+def _check_no_network(folder: Path, record: Mapping[str, Any]) -> None:
+    """Raise ValueError if a folder without a state has a network that would be replaced.
 
     A network with 0 steps may be replaced: a training that ended before its first state leaves it.
+
+    Args:
+        folder: Folder of the best network.
+        record: Description of the training that should begin.
     """
-    if (folder / CONFIG).exists() and read_record(folder).get("about", {}).get("steps") != 0:
+    if not (folder / CONFIG).exists():
+        return
+    about = read_record(folder).get("about", {})
+    steps = about.get("steps")
+    if steps == 0:
+        return
+    is_same = isinstance(about.get("recipe"), Mapping)
+    if is_same and not _differences(json.loads(json.dumps(record)), about):
         raise ValueError(
-            f"{folder}: the network of another training would be replaced; move it, or choose "
-            "another output folder"
+            f"{folder}: this training has saved its network after {steps} steps, but there is no "
+            f"state ({STATE}) from which it could continue, because it ended before its first "
+            "state was saved, or the state was removed; remove the folder to begin again, or "
+            "choose another output folder"
         )
+    raise ValueError(
+        f"{folder}: the network of another training would be replaced; move it, or choose "
+        "another output folder"
+    )
+
+
+def _differences(record: Mapping[str, Any], actual: Mapping[str, Any]) -> list[str]:
+    """Return the names of the settings in which the descriptions of two trainings differ.
+
+    Entries about the results of a training are not compared. The steps are those of the recipes.
+    """
+    settings = {**record, **record["recipe"]}
+    actual_settings = {**actual, **actual["recipe"]}
+    names = sorted({*settings, *actual_settings} - {"recipe", *_RESULTS})
+    return [name for name in names if settings.get(name) != actual_settings.get(name)]
 
 
 def _check_state(path: Path, record: Mapping[str, Any], best_folder: Path) -> int:
@@ -301,10 +336,7 @@ def _check_state(path: Path, record: Mapping[str, Any], best_folder: Path) -> in
             f"{path}: cannot be read as the state of a training; restore it, or choose another "
             "output folder"
         ) from error
-    settings = {**record, **record["recipe"]}
-    actual_settings = {**actual, **actual["recipe"]}
-    names = sorted({*settings, *actual_settings} - {"recipe", "start_validation"})
-    differences = [name for name in names if settings.get(name) != actual_settings.get(name)]
+    differences = _differences(record, actual)
     if differences:
         raise ValueError(
             f"{path}: the state belongs to a training that differs in {', '.join(differences)}; "

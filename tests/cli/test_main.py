@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +49,13 @@ def run(*arguments: object) -> int:
     except SystemExit as end:
         assert isinstance(end.code, int)
         return end.code
+
+
+@pytest.mark.parametrize("module", ["hlsim", "hlsim.cli.main"])
+def test_the_program_runs_as_a_module(module: str) -> None:
+    command = [sys.executable, "-m", module, "simulat"]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.returncode == 2 and "did you mean simulate?" in ended.stderr
 
 
 def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

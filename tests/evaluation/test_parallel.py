@@ -2,13 +2,20 @@
 
 import os
 import signal
+import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import pytest
 
+from hlsim.evaluation import haspi_report, run_study
+from hlsim.evaluation.clarity import evaluate_scenes
+from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.running.parallel import Crash, run_parallel
+from hlsim.evaluation.simulators import evaluate_simulators
+from hlsim.extras import MissingExtraError
 
 pytest.importorskip("joblib")
 
@@ -77,3 +84,19 @@ def test_an_address_without_a_scheduler_is_rejected(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("hlsim.evaluation.running.parallel.CONNECTION_TIMEOUT", 0.2)
     with pytest.raises(ValueError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         list(run_parallel(abs, [1], dask="tcp://127.0.0.1:9"))
+
+
+def test_an_evaluation_looks_for_its_scheduler_before_anything_else() -> None:
+    """The other arguments are wrong, and would be an error when they are read."""
+    evaluations: list[Callable[..., Any]] = [
+        partial(evaluate_scenes, {}, scenes="gone", listeners="gone", out="gone"),
+        partial(evaluate_compensators, {"gone": "gone"}, speech="gone"),
+        partial(evaluate_simulators, {"gone": "gone"}, speech="gone", audiograms="gone"),
+        partial(haspi_report, "gone", after="gone"),
+        partial(run_study, [], [], []),
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "distributed", None)
+        for evaluate in evaluations:
+            with pytest.raises(MissingExtraError, match="distributed is not installed"):
+                evaluate(dask="tcp://127.0.0.1:9")

@@ -210,6 +210,12 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         ),
         ("L1,left,aided", "L1,left,", "line 3: expected a value in the column condition"),
         ("N3\nL2", "N4\nL2", "line 3: expected the audiogram of earlier rows of L1 left"),
+        (
+            "L1,left,aided",
+            "l1,left,aided",
+            "line 3: the listener 'l1' differs from 'L1' only in case",
+        ),
+        ("left,aided", "left,Aided", "line 5: the condition 'aided' differs from 'Aided' only"),
         (",snr,", ",spl,", "expected no column spl, .* pass the option --spl"),
         (",5,N3", ",x,N3", "line 2: expected a number in dB in the column snr, .* got 'x'"),
         (",5,N3", ",-inf,N3", "line 2: expected a number in dB in the column snr"),

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -206,6 +207,22 @@ def test_a_training_that_ended_before_its_first_state_starts_again(tmp_path: Pat
     assert not (tmp_path / "last.ckpt").exists() and saved_step(tmp_path) == 0
     run(VectorTraining(), tmp_path)
     assert saved_step(tmp_path) == 0 and last_state(tmp_path)["global_step"] == 9
+
+
+def test_a_training_that_ended_while_its_first_state_was_saved_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network of the first validation is saved before the state."""
+    scores = {0: 0.0, 2: 1.0}
+    with monkeypatch.context() as patch:
+        patch.setattr("torch.save", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run(VectorTraining(scores=scores), tmp_path)
+    assert not (tmp_path / "last.ckpt").exists() and saved_step(tmp_path) == 2
+    with pytest.raises(ValueError, match=r"this training .* after 2 steps, .* remove the folder"):
+        run(VectorTraining(), tmp_path)
+    with pytest.raises(ValueError, match="another training"):
+        run(VectorTraining(steps=20), tmp_path)
 
 
 def test_a_training_does_not_resume_with_another_number_of_devices(tmp_path: Path) -> None:

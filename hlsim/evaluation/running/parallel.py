@@ -119,6 +119,24 @@ def run_parallel(
                 alone -= 1
 
 
+def check_scheduler(address: str | None) -> None:
+    """Connect with a Dask scheduler once, so that an evaluation fails before it computes anything.
+
+    Args:
+        address: Address of the scheduler; None, for an evaluation without one, is accepted.
+
+    Raises:
+        ValueError: No scheduler answers.
+        MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not
+            installed.
+
+    >>> check_scheduler(None)
+    """
+    if address is not None:
+        require("joblib", "eval")
+        _connect(address).close()
+
+
 def _record_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[str]]:
     """Return the result of a function for a task, and the texts of its warnings for users."""
     with warnings.catch_warnings(record=True) as caught:
