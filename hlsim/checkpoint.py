@@ -31,15 +31,13 @@ Settings = Mapping[str, Any]
 WEIGHTS = "model.safetensors"
 OLDER_WEIGHTS = "model.older.safetensors"
 CONFIG = "config.json"
+CARD = "README.md"
 
 _WITHOUT_CHECKPOINT = (
     *("msbg", "msbg-unsmeared", "attenuation"),
     *("nalr", "nalrp", "wdrc", "camfit"),
 )
 """Names of simulators and aids that have no checkpoint."""
-CARD = "README.md"
-
-"""Hint for an error message, by name of a checkpoint that existed in an earlier version."""
 
 SIMULATOR = "neuro-msbg"
 """Kind of the checkpoints of simulators."""
@@ -87,7 +85,8 @@ def read_checkpoint(name: str | Path, classes: Sequence[Any], **options: Any) ->
         options: Further arguments of the class of the checkpoint.
 
     Raises:
-        ValueError: There is no such checkpoint, it is damaged, or its kind is not accepted.
+        ValueError: There is no such checkpoint, it is damaged, its kind is not accepted, or an
+            option is not valid.
 
     >>> from hlsim.neuro import NeuroMSBG
     >>> read_checkpoint("neuro-msbg", [NeuroMSBG]).config.blocks
@@ -115,7 +114,9 @@ def read_checkpoint(name: str | Path, classes: Sequence[Any], **options: Any) ->
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, ValueError, RuntimeError, safetensors.SafetensorError) as error:
         reason = str(error).splitlines()[0]
-        raise ValueError(f"{folder}: weights and configuration do not fit: {reason}") from error
+        raise ValueError(
+            f"{folder}: weights, configuration and arguments do not fit: {reason}"
+        ) from error
     model.eval().requires_grad_(False)
     device = torch.get_default_device()
     if device.type == "meta":
@@ -379,7 +380,7 @@ class HubModel:
         """Load a model in evaluation mode, whose weights do not require a gradient.
 
         Args:
-            name: Folder of a checkpoint or of a training, name of a checkpoint that ships with
+            name: Folder of a checkpoint or of a training run, name of a checkpoint that ships with
                 hlsim, or ``user/name`` of a repository of the Hub, which is downloaded unless it is
                 in the cache.
             revision: Branch, tag or commit of the repository.

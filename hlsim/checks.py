@@ -1,7 +1,7 @@
 """Validation of settings, sample rates, waveforms and lengths.
 
-Each function raises ValueError with what is wrong, what was expected and, where there is one, the
-fix. Functions that return something return the validated value.
+Functions named ``check_...`` raise ValueError with what is wrong, what was expected and, where
+there is one, the fix. Those that return something return the validated value.
 """
 
 import difflib
@@ -142,7 +142,7 @@ def check_number(
         value: Value to validate.
         lowest: Smallest accepted number.
         highest: Largest accepted number.
-        whole: Whether only integers are accepted.
+        whole: Whether only integers of Python are accepted, which can be written as JSON.
 
     >>> check_number("bands", 20, 4, 40, whole=True)
     """
@@ -153,7 +153,9 @@ def check_number(
     limits = "" if lowest == -math.inf else f" from {lowest:g}"
     if highest < math.inf:
         limits += f" to {highest:g}"
-    raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}")
+    is_other_type = accepted and int(value) == value  # such as 3.0 and NumPy's integers
+    fix = f"; convert it: {int(value)}" if is_other_type else ""
+    raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}{fix}")
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -330,14 +332,18 @@ def check_device(module: nn.Module, device: torch.device | None = None) -> None:
 def loud_outputs() -> Iterator[None]:
     """Suppress, inside a ``with`` block, the warning of ``check_waveform`` that a signal is loud.
 
-    Outputs of aids may be loud on purpose.
+    Outputs of aids may be loud on purpose. A loud waveform after the block still causes a warning.
 
     >>> with loud_outputs():
     ...     _ = check_waveform(torch.full((10,), 1000.0), full_scale_spl=94.0)
     """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*did you forget calibration")
+    global _has_warned_of_level
+    has_warned = _has_warned_of_level
+    _has_warned_of_level = True
+    try:
         yield
+    finally:
+        _has_warned_of_level = has_warned
 
 
 _has_warned_of_level = False
@@ -416,14 +422,18 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
     tensor([ 50, 100])
     """
     *items, time = shape
-    ends = torch.as_tensor(lengths, device="cpu")
+    try:
+        ends = torch.as_tensor(lengths, device="cpu")
+    except (TypeError, ValueError, RuntimeError):
+        ends = torch.tensor(False)  # no numbers, which is rejected below
     if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
         ends = ends.unsqueeze(-1)
     is_float = ends.is_floating_point()
     is_whole = not is_float and not ends.is_complex() and ends.dtype != torch.bool
-    samples = ends.long()
-    if is_whole and ends.shape == shape[:-1] and bool(((samples >= 1) & (samples <= time)).all()):
-        return samples
+    if is_whole and ends.shape == shape[:-1]:
+        samples = ends.long()
+        if bool(((samples >= 1) & (samples <= time)).all()):
+            return samples
     fix = ""
     if is_float:
         fix = "; convert them by .long()"

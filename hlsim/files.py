@@ -248,12 +248,12 @@ def read_table(
         known_columns: Names in lower case of columns that may have capitals in the table.
 
     Returns:
-        A list with two members per row: its place for messages, and its texts by column, without
-        surrounding blanks. Missing values are empty. Rows without any value are left out.
+        One pair per row: its place for messages, and its texts by column, without surrounding
+        blanks. Missing values are empty. Rows without any value are left out.
 
     Raises:
-        ValueError: The file cannot be read, there are no rows, a column appears twice, or a row has
-            too many or too few values.
+        ValueError: The file cannot be read, the value is neither a file nor a data frame, there
+            are no rows, a column appears twice, or a row has too many or too few values.
 
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_atomically(f"{folder}/ears.csv", "Name;500 Hz\\nA;20\\n")
@@ -264,6 +264,11 @@ def read_table(
         source, unit = str(table), "line"
         names, lines = _read_csv(Path(table), contents)
     else:
+        if not hasattr(table, "columns"):
+            raise ValueError(
+                f"expected a CSV file or a pandas DataFrame for {contents}, got "
+                f"{type(table).__name__}; pass the path of a file or a data frame"
+            )
         source, unit = contents, "row"
         names = [str(column).strip() for column in table.columns]
         cells = table.astype(object).where(table.notna(), "").astype(str)
@@ -353,7 +358,7 @@ def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, lis
             lines = [(reader.line_num, texts) for texts in reader if texts]
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path}: {contents} must be a CSV file in UTF-8 or cp1252 ({error})"
+            f"{path}: {contents} must be a CSV file in UTF-8, UTF-16 or cp1252 ({error})"
         ) from error
     except (OSError, csv.Error) as error:
         raise ValueError(f"{path}: cannot read {contents}: {error}") from error

@@ -110,6 +110,24 @@ def test_the_warning_follows_full_scale_spl(monkeypatch: pytest.MonkeyPatch) -> 
         NALR("N3", full_scale_spl=180.0)(speech)
 
 
+def test_loud_outputs_leave_the_warning_to_the_next_waveform(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(checks, "_has_warned_of_level", False)
+    loud = torch.full((10,), 1000.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with checks.loud_outputs():
+            check_waveform(loud, full_scale_spl=94.0)
+    with pytest.warns(UserWarning, match="did you forget calibration"):
+        check_waveform(loud, full_scale_spl=94.0)
+
+
+def test_a_number_of_another_type_is_to_be_converted() -> None:
+    with pytest.raises(ValueError, match=r"a whole number from 0 to 5, got .*3.*; convert it: 3"):
+        checks.check_number("seed", np.int64(3), 0, 5, whole=True)
+
+
 @pytest.mark.parametrize("call", [level_spl, lambda wave: mbstoi(wave, wave)])
 def test_measures_reject_time_first(call: Callable[[Tensor], object]) -> None:
     with pytest.raises(ValueError, match=r"transpose it: x\.T"):
@@ -150,7 +168,9 @@ def test_error_about_an_array_names_the_fix() -> None:
             call(array)
 
 
-@pytest.mark.parametrize("lengths", [[0, 3], [3, 11], [0.5, 1.0], [3], [True, True]])
+@pytest.mark.parametrize(
+    "lengths", [[0, 3], [3, 11], [0.5, 1.0], [3], [True, True], ["3", "10"], [[3], [3, 10]], {3}]
+)
 def test_bad_lengths_raise_value_error(lengths: Any) -> None:
     with pytest.raises(ValueError, match=r"expected lengths to be whole numbers from 1 to 10"):
         check_lengths(lengths, torch.Size((2, 10)))

@@ -66,6 +66,11 @@ def test_tables_that_cannot_be_read_are_named(tmp_path: Path, data: bytes | None
         read_table(tmp_path / "t.csv", "a table")
 
 
+def test_what_is_no_table_is_named() -> None:
+    with pytest.raises(ValueError, match="CSV file or a pandas DataFrame for the ears, got list"):
+        read_table([["A", 20]], "the ears")
+
+
 def test_a_row_with_fewer_fields_than_the_header_is_named(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("a,b,c,\n1,2,3\n4,,\n5,6\n")

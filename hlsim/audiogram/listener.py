@@ -83,5 +83,11 @@ class Listener:
         if isinstance(source, Mapping):
             frequencies: Any = source.get("audiogram_cfs")
             levels: list[Any] = [source.get(f"audiogram_levels_{side}") for side in ("l", "r")]
+            if frequencies is None or None in levels:
+                names = ", ".join(map(str, source)) or "none"
+                raise ValueError(
+                    "expected an entry with audiogram_cfs, audiogram_levels_l and "
+                    f"audiogram_levels_r, got {names}; add both ears"
+                )
             return cls(*(Audiogram(ear_levels, frequencies) for ear_levels in levels))
         return cls(*(getattr(source, f"audiogram_{name}", None) for name in EARS))
