@@ -187,7 +187,8 @@ def predict_words(scores: ArrayLike) -> float:
     """
     array = np.asarray(scores, dtype=np.float64)
     haspi = array[~np.isnan(array)].clip(0.0, 1.0)
-    return words_change(haspi, haspi).before
+    [proportion] = simulate_proportions(load_curve(), [_check_scores("scores", haspi)])
+    return float(proportion.mean())
 
 
 def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
@@ -221,8 +222,9 @@ def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> l
     """Simulate the proportion of words that listeners understand with each of several aids.
 
     The same 4000 listeners, whose random numbers are fixed, are simulated with every aid, so the
-    arrays can be subtracted. They differ by the uncertainty of the curve, by the test, and by the
-    chance with which words are understood; aids differ from the curve, too.
+    arrays can be subtracted. Each listener has an intercept and a slope, and draws the uncertainty
+    of the curve and of the test. Each aid has an intercept for each listener, and the words that
+    are understood depend on chance.
 
     Args:
         curve: Parameters of the model, from ``load_curve``.

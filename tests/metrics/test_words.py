@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hlsim.metrics.words import load_curve, simulate_proportions, words_change
+from hlsim.metrics.words import load_curve, predict_words, simulate_proportions, words_change
 
 
 def _first_challenge() -> pd.DataFrame:
@@ -98,3 +98,9 @@ def test_equal_scores_give_no_change_on_average_and_more_of_them_narrow_the_inte
 def test_bad_scores_are_rejected(scores: list[float]) -> None:
     with pytest.raises(ValueError):
         words_change(scores, [0.5])
+
+
+def test_a_prediction_without_scores_names_them() -> None:
+    with pytest.raises(ValueError, match="expected scores to be HASPI scores"):
+        predict_words([float("nan")])
+    assert predict_words([0.3, 0.4, float("nan")]) == words_change([0.3, 0.4], [0.5]).before
