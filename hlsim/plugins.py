@@ -29,7 +29,8 @@ def load_plugin(name: str, kind: str) -> Any:
     """Import a function, a PyTorch module or another callable of your own code by its name.
 
     A class is called without arguments, and its object is returned. As a side effect, Python from
-    then on searches for modules in the working directory first, or for a file in its folder.
+    then on searches for modules in the working directory first, or, if the name is that of a file,
+    in its folder.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.

@@ -67,8 +67,8 @@ def read_points(ucl: UclLike | None) -> Points:
         ucl: Levels. A level that is None or NaN was not measured, and is left out.
 
     Raises:
-        ValueError: The value is no mapping of numbers, a frequency occurs twice or is not from 100
-            to 20000 Hz, or a level is not from 20 to 140 dB HL.
+        ValueError: The value is neither a mapping nor pairs of numbers, a frequency occurs twice or
+            is not from 100 to 20000 Hz, or a level is not from 20 to 140 dB HL.
 
     >>> read_points({1000: 95, 500: None})
     ((1000.0, 95.0),)
@@ -103,7 +103,7 @@ def uncomfortable_levels_at(
     frequencies: Sequence[float],
     thresholds: NDArray[np.float64],
 ) -> tuple[float, ...]:
-    """Return the uncomfortable levels of an ear, measured ones or else predicted ones.
+    """Return the uncomfortable levels of an ear in dB HL, measured ones or else predicted ones.
 
     The difference between measured and predicted levels is interpolated over log frequency, and
     constant beyond the lowest and the highest frequency that was measured. A measured level of 115

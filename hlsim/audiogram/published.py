@@ -24,7 +24,7 @@ The source is Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), 
 """
 
 SPEECH_SPECTRUM = _over_frequency("speech_spectrum")
-"""Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's.
+"""Level in dB SPL of each third of an octave in speech at 70 dB SPL, the mean of men and women.
 
 The source is Byrne et al. 1994, Journal of the Acoustical Society of America 96(4).
 """

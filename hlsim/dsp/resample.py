@@ -18,7 +18,6 @@ f = 1                  -61.6 dB      -61.6 dB
 f from 1.01            -90 dB        -90 dB
 f from 1.05            -103 dB       -145 dB
 =====================  ============  ============
-
 """
 
 import math
@@ -43,7 +42,7 @@ HIGHEST_RATE = 1_000_000
 """Highest accepted sample rate in Hz."""
 
 MAX_KERNEL_VALUES = 100_000_000
-"""Largest number of values of a kernel, 0.4 GB in float32.
+"""Largest number of values of a kernel without its margins, 0.4 GB in float32.
 
 To 16000 Hz, the kernel has 0.13 million values from 44100 Hz and 12 million from 44056 Hz. From
 44101 Hz it would have 710 million.

@@ -4,10 +4,13 @@ import torch
 from torch import Tensor
 
 from hlsim.dsp.fft import power
-from hlsim.metrics.interaural import POWER_FLOOR, spectra_of_ears
+from hlsim.metrics.interaural import spectra_of_ears
 
 HALF_WEIGHT_RATIO = 1e-4
 """Power of an octave relative to the loudest octave at which the octave has half its weight."""
+
+_POWER_FLOOR = 1e-12
+"""Power in Pa^2, -26 dB SPL, that is added to powers, so that the gradient of silence is finite."""
 
 
 def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
@@ -35,19 +38,19 @@ def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
     """
     left, right, cross, octaves = spectra_of_ears(output, sample_rate)
     clean_left, clean_right, clean_cross, _ = spectra_of_ears(clean, sample_rate)
-    left_level = torch.log10(left @ octaves + POWER_FLOOR)
-    right_level = torch.log10(right @ octaves + POWER_FLOOR)
-    clean_left_level = torch.log10(clean_left @ octaves + POWER_FLOOR)
-    clean_right_level = torch.log10(clean_right @ octaves + POWER_FLOOR)
+    left_level = torch.log10(left @ octaves + _POWER_FLOOR)
+    right_level = torch.log10(right @ octaves + _POWER_FLOOR)
+    clean_left_level = torch.log10(clean_left @ octaves + _POWER_FLOOR)
+    clean_right_level = torch.log10(clean_right @ octaves + _POWER_FLOOR)
     level_error = (left_level - right_level - clean_left_level + clean_right_level).abs()
     # The added power is proportional to those of the ears. With a constant instead, the phase of an
     # ear that is nearly silent would have a gradient of a million.
-    cross_floor = POWER_FLOOR * (left + right + POWER_FLOOR)
+    cross_floor = _POWER_FLOOR * (left + right + _POWER_FLOOR)
     phase = cross / (power(cross) + cross_floor).sqrt()
-    magnitude = (power(clean_cross) + POWER_FLOOR**2).sqrt() @ octaves
+    magnitude = (power(clean_cross) + _POWER_FLOOR**2).sqrt() @ octaves
     cosine = (phase * clean_cross.conj()).real @ octaves / magnitude
     clean_power = (clean_left + clean_right).detach() @ octaves
     power_of_half_weight = HALF_WEIGHT_RATIO * clean_power.amax(-1, keepdim=True)
-    weights = clean_power / (clean_power + power_of_half_weight + POWER_FLOOR)
+    weights = clean_power / (clean_power + power_of_half_weight + _POWER_FLOOR)
     error = level_error + 1.0 - cosine
-    return (weights * error).sum(-1) / (weights.sum(-1) + POWER_FLOOR)
+    return (weights * error).sum(-1) / (weights.sum(-1) + _POWER_FLOOR)

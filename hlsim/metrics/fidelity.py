@@ -1,6 +1,7 @@
-"""Errors and scores that compare two signals.
+"""Errors and scores of one signal against another.
 
-They show how closely a network reproduces the hearing-loss simulator from which it learned.
+SNR and errors show how closely a network reproduces the simulator from which it learned. STOI and
+PESQ score the output of an aid, or what a simulator makes of it, against clean speech.
 """
 
 import math
@@ -147,8 +148,8 @@ def stoi(output: Signal, clean: Signal, sample_rate: int) -> float:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The lengths differ, or STOI is not defined: a signal is silent, has a sample
-            that is not finite, or has less than 0.4 s of speech.
+        ValueError: The signals are not one-dimensional or differ in length, or STOI is not defined:
+            a signal is silent, has a sample that is not finite, or has less than 0.4 s of speech.
         MissingExtraError: pystoi is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
@@ -175,8 +176,8 @@ def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The lengths differ, or PESQ is not defined: a signal is silent, has a sample
-            that is not finite, or has no speech that pesq detects.
+        ValueError: The signals are not one-dimensional or differ in length, or PESQ is not defined:
+            a signal is silent, has a sample that is not finite, or has no speech that pesq detects.
         MissingExtraError: pesq is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)

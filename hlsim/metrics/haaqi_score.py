@@ -70,7 +70,8 @@ def haaqi(
     """Compute HAAQI version 1 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean music that NAL-R has amplified for the same impaired
-    ear, and is differentiable in ``output``. A delay of the output has no effect. Stereo signals
+    ear, and is differentiable in ``output``. The delay of an output is removed, to whole samples at
+    24 kHz. Stereo signals
     have one score per channel: take the better one by ``.amax(-1)`` or the mean by ``.mean(-1)``.
 
     Args:
@@ -149,8 +150,9 @@ class HaaqiReference(QualityReference):
     """Clean music that is prepared once for the HAAQI of many outputs in one impaired ear.
 
     Args:
-        clean: Clean music, not amplified unless ``equalisation`` is 2. The scores have its dtype
-            and its device. Its gradient is not computed. Shape: (..., time).
+        clean: Clean music, not amplified unless ``equalisation`` is 2. The scores are on its
+            device, and float64 if it is, otherwise float32. Its gradient is not computed. Shape:
+            (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.

@@ -60,8 +60,8 @@ def haspi(
     """Compute HASPI version 2 of each item: the intelligibility for an impaired ear, 0 to 1.
 
     The score compares the output of an aid in the impaired ear with clean speech in a normal ear.
-    A delay of the output has no effect. A silent output has the score of the ear's internal noise.
-    ``HaspiReference`` prepares clean speech once for many scores.
+    The delay of an output is removed, to whole samples at 24 kHz. A silent output has the score of
+    the ear's internal noise. ``HaspiReference`` prepares clean speech once for many scores.
 
     The score is differentiable in ``output``. The delays that align the output are constants for
     the gradient, and bands that are inaudible have no gradient.
@@ -93,8 +93,8 @@ def haspi(
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, or not finite;
-            clean speech that is silent or below 20 dB SPL; a rate, level, audiogram, length or seed
-            out of range; an unknown noise.
+            clean speech that is silent, below 20 dB SPL or inaudible to a normal ear; a rate,
+            level, audiogram, length or seed out of range; an unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -120,8 +120,8 @@ class HaspiReference(Reference):
     ``score``. In float32 the features of clean speech take about 4 MB per second.
 
     Args:
-        clean: Clean speech, not amplified. The scores have its dtype and its device. Its gradient
-            is not computed. Shape: (..., time).
+        clean: Clean speech, not amplified. The scores are on its device, and float64 if it is,
+            otherwise float32. Its gradient is not computed. Shape: (..., time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
@@ -187,7 +187,11 @@ class HaspiReference(Reference):
     def _compare(
         self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
     ) -> Tensor:
-        """Compute the ten features of HASPI, correlations, for each item. Shape: -> (items, 10)."""
+        """Compute the ten features of HASPI, correlations, for each item. Shape: -> (items, 10).
+
+        Raises:
+            UnscorableError: Clean speech is inaudible to a normal ear.
+        """
         extent, ear = batch.clean.audible, ears[0][batch.clean.items]
         contributions = [
             (clean.amplitude, clean.cepstrum, _cepstrum(clean, output, ear, extent))
@@ -224,8 +228,8 @@ class HaspiReference(Reference):
             Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
 
         Raises:
-            ValueError: Outputs of another shape, not finite or on another device; an audiogram or
-                seed out of range; an unknown noise.
+            ValueError: Outputs of another shape, not finite or on another device; clean speech that
+                a normal ear does not hear; an audiogram or seed out of range; an unknown noise.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
         return as_type_of(output, _intelligibility(self._compare_all(output, noise, seed, ears)))

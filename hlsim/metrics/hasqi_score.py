@@ -35,7 +35,8 @@ def hasqi(
     """Compute HASQI version 2 of each item: how good the output of an aid sounds, from 0 to 1.
 
     The score compares the output with clean speech that NAL-R has amplified for the same impaired
-    ear, and is differentiable in ``output``. A delay of the output has no effect.
+    ear, and is differentiable in ``output``. The delay of an output is removed, to whole samples at
+    24 kHz.
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
@@ -84,8 +85,9 @@ class HasqiReference(QualityReference):
     """Clean speech that is prepared once for the HASQI of many outputs in one impaired ear.
 
     Args:
-        clean: Clean speech, not amplified unless ``equalisation`` is 2. The scores have its dtype
-            and its device. Its gradient is not computed. Shape: (..., time).
+        clean: Clean speech, not amplified unless ``equalisation`` is 2. The scores are on its
+            device, and float64 if it is, otherwise float32. Its gradient is not computed. Shape:
+            (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.

@@ -24,9 +24,6 @@ OCTAVES = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
 MAX_DELAY_MICROSECONDS = 1000
 """Largest delay between the ears that is considered. A head causes about 700 microseconds."""
 
-POWER_FLOOR = 1e-12
-"""Power in Pa^2, -26 dB SPL, that is added to powers, so that the gradient of silence is finite."""
-
 
 class Interaural(NamedTuple):
     """Differences between the ears in each of five octaves, NaN where an ear is silent.

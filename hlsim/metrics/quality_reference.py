@@ -91,8 +91,9 @@ class QualityReference(Reference):
     Subclasses combine similarities of envelopes, fine structure and spectra into the score.
 
     Args:
-        clean: Clean signals, not amplified unless ``equalisation`` is 2. The scores have their
-            dtype and their device. Their gradient is not computed. Shape: (..., time).
+        clean: Clean signals, not amplified unless ``equalisation`` is 2. The scores are on their
+            device, and float64 if they are, otherwise float32. Their gradient is not computed.
+            Shape: (..., time).
         audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.

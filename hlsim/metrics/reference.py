@@ -54,8 +54,8 @@ class Reference(ABC):
     gradient is needed. The scores do not depend on the number of threads.
 
     Args:
-        clean: Clean signals. The scores have their dtype and their device. Their gradient is not
-            computed. Shape: (..., time).
+        clean: Clean signals. The scores are on their device, and float64 if they are, otherwise
+            float32. Their gradient is not computed. Shape: (..., time).
         audiogram: Ear that receives the clean signals; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
@@ -216,7 +216,8 @@ class Reference(ABC):
             ValueError: The noise is unknown, the seed is out of range, or outputs have another
                 shape than the clean signals, are not floating-point, finite and of at most 1e9, or
                 are on another device; or, if the clean side is prepared here (``keep=False``), a
-                clean signal is silent, too soft or too short.
+                clean signal is silent, too soft or too short. For HASPI also: clean speech is
+                inaudible to a normal ear.
         """
         check_choice("noise", noise, Noise)
         check_number("seed", seed, 0, 2**32 - 1, whole=True)

@@ -63,8 +63,8 @@ def _masking(speech: NDArray[np.float64], noise: NDArray[np.float64], hertz: NDA
     # Speech masks itself by a level 24 dB below its own.
     masker = np.maximum(noise, speech - 24.0)
     slope = -80.0 + 0.6 * (masker + 10.0 * np.log10(hertz) - 6.353)  # dB per octave
-    octaves = np.log10(0.89 * hertz[:, None] / hertz)  # from the upper edge of the masker
-    spread = 10.0 ** (0.1 * (masker + 3.32 * slope * octaves))
+    decades = np.log10(0.89 * hertz[:, None] / hertz)  # from the upper edge of the masker
+    spread = 10.0 ** (0.1 * (masker + 3.32 * slope * decades))
     from_lower_bands = np.tril(spread, -1).sum(1)
     total = 10.0 * np.log10(10.0 ** (0.1 * noise) + from_lower_bands)
     total[0] = masker[0]

@@ -291,8 +291,8 @@ class HASQI(_MeanScore):
     """Mean HASQI v2, the quality of outputs, over all items since the last ``reset``.
 
     The arguments and attributes are those of ``HASPI``. Outputs are compared with clean speech that
-    NAL-R has amplified. Noise, distortion and changes of the spectrum reduce the score, and a delay
-    has no effect. Scoring one second of audio takes about 0.2 s on a CPU.
+    NAL-R has amplified. Noise, distortion and changes of the spectrum reduce the score; a delay is
+    removed before. Scoring one second of audio takes about 0.2 s on a CPU.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASQI()

@@ -33,7 +33,8 @@ from hlsim.torchtools import constant
 _TAIL = 3200
 """Samples of zero-padding behind a signal, 73 ms.
 
-This is as long as the longest advance, and as the narrowest channel takes to decay by 80 dB.
+This is more than the longest advance (485 samples) and the time in which the narrowest channel
+decays by 80 dB (about 2500 samples) together.
 """
 
 _END_SAMPLES = 4096

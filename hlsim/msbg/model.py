@@ -69,7 +69,7 @@ class _Group(NamedTuple):
 
     Attributes:
         severity: Severity of the loss, one of ``SEVERITIES``.
-        no_loss: Whether all thresholds are 0 dB HL.
+        no_loss: Whether all thresholds are 0 dB HL, and need no gradient.
         frequencies: Frequencies of the thresholds in Hz.
     """
 

@@ -2,7 +2,8 @@
 
 An impaired ear does not perceive soft sounds, and perceives sounds of 105 dB SPL as loud as a
 normal ear does. Between these levels, its loudness grows faster than normal. The gain simulates
-this growth: it is 1 at 105 dB SPL and falls towards soft sounds.
+this growth: it is 1 at 105 dB SPL and falls towards soft sounds. (With a threshold below 0 dB HL,
+it rises towards soft sounds.)
 
 The envelope varies so slowly that it and the gain are computed once per *step* of 24 samples at
 44.1 kHz. The gain is interpolated between steps. Where a small envelope makes the gain change fast,
@@ -73,7 +74,8 @@ def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     The gain of a channel of the filter bank is (envelope / pressure at 105 dB SPL) ** (ratio - 1).
     It is computed once per step, a group of neighbouring samples with one value of the envelope.
-    Envelopes are limited to 2e-8 Pa to 105 dB SPL, so that gains are above 0 and at most 1.
+    Envelopes are limited to 2e-8 Pa to 105 dB SPL, so that gains stay above 0. They are at most 1,
+    except for ratios below 1, those of thresholds below 0 dB HL.
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
 

@@ -68,9 +68,9 @@ def apply_bank_phase(
 ) -> Tensor:
     """Shift the phase of signals as MSBG's filter bank for each ear does, and keep the magnitude.
 
-    Signals can then be compared with the output of MSBG for the ear. Where the response of the
-    filter bank is more than 20 dB below its maximum, the magnitude falls with it (unless ``normal``
-    is true).
+    Signals can then be compared with the output of MSBG for the ear. Where the response of MSBG
+    (``fixed_response``) is more than 20 dB below its maximum, the magnitude falls with it (unless
+    ``normal`` is true).
 
     Shape: (items, time), (items, 8) -> (items, time).
 

@@ -1,8 +1,8 @@
 """Clean speech or music as the reference of scores, and the alignment of outputs with it.
 
-Everything in a score that depends on the clean signal alone is computed here once: it is validated,
-resampled to the ear's rate of 24 kHz, and cut to its audible part. The output of an aid is then
-resampled to the same rate, shifted in time to match the clean signal, and cut to the same part.
+A clean signal is validated, resampled to the ear's rate of 24 kHz, and cut to its audible part. The
+output of an aid is then resampled to the same rate, shifted in time to match the clean signal, and
+cut to the same part.
 """
 
 import torch

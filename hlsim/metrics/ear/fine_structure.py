@@ -39,7 +39,7 @@ MAX_LAG = RATE // 1000
 """Largest delay in samples between the fine structures of two signals, 1 ms in each direction."""
 
 FFT_POINTS = 432
-"""Points of the Fourier transform of a segment, enough for its correlation at all lags."""
+"""Points of the Fourier transform of a segment, enough for correlations at delays of up to 1 ms."""
 
 SILENCE_DB = 2.5
 """Level in dB over threshold that a segment, and a channel in it, must exceed to count."""
@@ -305,7 +305,7 @@ def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor
     >>> synchrony(torch.full((1, 32, 5), 0.5), mean_square, Extent((5,)))
     tensor([0.5000])
     """
-    rms = mean_square.detach().sqrt()
+    rms = mean_square.detach().sqrt()  # a level in dB, because the envelope of the motion is one
     is_audible = _audible_segments(rms, counts)
     weights = _synchrony_weights(like=rms)[:, None]
     weights = weights * ((rms > SILENCE_DB) & is_audible[:, None])

@@ -140,8 +140,8 @@ def hair_cells(thresholds: Tensor) -> HairCells:
 
     The outer hair cells account for 80 % of the loss, up to the loss at which they no longer
     compress, and the inner hair cells for the rest. Thresholds are interpolated linearly in Hz to
-    the centre of each channel, and constant below 250 and above 6000 Hz. Those below 0 dB HL count
-    as 0. The result has no gradient.
+    the centre of each channel, and constant below 250 and above 6000 Hz. Interpolated thresholds
+    below 0 dB HL count as 0. The result has no gradient.
 
     Source: Moore et al. 1999, J. Acoust. Soc. Am. 106(5), 2761-2778.
 
