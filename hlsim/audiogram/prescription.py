@@ -60,7 +60,7 @@ class CompressiveGains(NamedTuple):
     """Gain in dB at the level of the band in average speech at 65 dB SPL."""
 
     slope: Tensor
-    """Change of the gain in dB per dB of the level, negative for compression."""
+    """Change of the gain in dB per dB of the level, 0 or less: negative for compression."""
 
 
 def nalr_gains_db(thresholds: Tensor) -> Tensor:
@@ -138,9 +138,9 @@ def camfit_gains(
 
     The line of a band goes through two points. A band of average speech at 65 dB SPL gets the gain
     of the Cambridge formula, 0.48 of the loss plus a constant, in dB. A band that is 38 dB softer
-    is amplified to the threshold. If the compression ratio would exceed 2.92, the line goes through
-    the second point only, with this ratio. ``compressed_gains_db`` computes the gain for a level,
-    and limits it.
+    is amplified to the threshold. If the compression ratio would be below 1 or above 2.92, the line
+    goes through the second point only, with the nearer of these ratios. ``compressed_gains_db``
+    computes the gain for a level, and limits it.
 
     Args:
         thresholds: Thresholds in dB HL, which are interpolated over log frequency.
@@ -159,7 +159,7 @@ def camfit_gains(
     softest = speech_levels - SPEECH_RANGE_DB
     gain_for_softest = losses + _free_field_threshold(points, like=losses) - softest
     middle_gain = (0.48 * losses + _cambridge_intercepts(points, like=losses)).clamp_min(0.0)
-    slope = ((middle_gain - gain_for_softest) / SPEECH_RANGE_DB).clamp_min(LOWEST_CAMFIT_SLOPE)
+    slope = ((middle_gain - gain_for_softest) / SPEECH_RANGE_DB).clamp(LOWEST_CAMFIT_SLOPE, 0.0)
     return CompressiveGains(gain_for_softest + slope * SPEECH_RANGE_DB, slope)
 
 

@@ -101,6 +101,13 @@ def test_camfit_gains_stop_rising_below_speech_and_never_attenuate() -> None:
     assert not compressed_gains_db(line, torch.full((9,), 110.0), speech).any()
 
 
+@pytest.mark.parametrize("name", ["NH", "N1", "N3"])
+def test_camfit_never_amplifies_louder_sounds_more(name: str) -> None:
+    """Where there is hardly a loss, the two points of a band lie on a line that rises."""
+    gains = [CAMFIT().gains(name, level) for level in (50.0, 65.0, 80.0, 90.0)]
+    assert float(torch.stack(gains).diff(dim=0).max()) < 0.1
+
+
 def test_nalrp_corrects_profound_losses_only() -> None:
     """The published rows for 95 to 120 dB HL are 5 dB apart; between them is a straight line."""
     ears = torch.full((4, 8), 80.0, dtype=torch.float64)
