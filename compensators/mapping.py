@@ -31,7 +31,7 @@ NEPER_DB = 20.0 / math.log(10.0)
 """One neper in dB."""
 
 POWER_FLOOR = 1e-9
-"""Power that is added to those of microphones, so that phases fade in silence."""
+"""Power of a point of a spectrogram below which the phase between microphones fades."""
 
 LOWEST_CENTRE = 100.0
 """Centre of the lowest band of the correction in Hz."""
@@ -69,7 +69,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         ears: Number of ears with several microphones.
 
     Raises:
-        ValueError: A rate or level is out of range.
+        ValueError: A rate or level is out of range, or an ear is not valid.
 
     >>> import hlsim
     >>> model = MappingCompensator("N3", MappingConfig(channels=8, blocks=1))
@@ -184,7 +184,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
             warnings.warn(
                 f"gains of an aid with {self.microphones} microphones are measured with the same "
                 "signal at all of them; its gains for recordings depend on where sounds come from",
-                stacklevel=3,
+                stacklevel=4,  # the caller of ``gains``, which is decorated
             )
             signals = signals.unsqueeze(1).expand(-1, self.microphones, -1)
         return self.process_items(signals, ears)

@@ -88,5 +88,6 @@ def test_several_microphones_are_filtered_and_added(
     assert float(model(signals[:1].expand(*shape, -1), ears).detach().abs().max()) < 1e-6
     with pytest.raises(ValueError, match=r"3 microphones per ear, .* the reference first"):
         model(signals[:2], ears)
-    with pytest.warns(UserWarning, match="with 3 microphones are measured with the same signal"):
+    with pytest.warns(UserWarning, match="microphones are measured with the same signal") as record:
         model.gains("N3")
+    assert record[0].filename == __file__
