@@ -10,7 +10,8 @@ from compensators.hearing_aid import LOUDNESS_RANGE, HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR, NALRP
 from compensators.wdrc import CAMFIT, WDRC
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import Audiogram, as_audiogram
+from hlsim.audiogram.value import EarLike
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import read_checkpoint, read_record
 from hlsim.checks import check_flag, check_number, check_rate
@@ -47,14 +48,15 @@ def load_compensator(
     Args:
         name: A prescription, ``"nalr"``, ``"nalrp"`` (for profound losses) or ``"camfit"`` (with
             compression); ``"wdrc"``, NAL-R with compression; a checkpoint that ships with hlsim,
-            such as ``"hearing-aid"``; or the folder of a checkpoint. If an aid was trained for one
-            ear, ``trained_for`` returns this ear.
+            such as ``"hearing-aid"``; or the folder of a checkpoint or of a training run. If an aid
+            was trained for one ear, ``trained_for`` returns this ear.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
-            in level between them stay. ``WDRC`` and ``HearingAid`` support this.
-        limit_to_ear: Limit the level of the output in each band to the uncomfortable level of the
-            ear, see ``HearingAid``, in the same aids.
+            in level between them stay if their audiograms are equal. ``WDRC``, ``CAMFIT`` and
+            ``HearingAid`` support this, also behind a front end.
+        limit_to_ear: Limit the level of the output in each band below the uncomfortable level of
+            the ear, see ``HearingAid``, in the same aids.
         loudness: Loudness of the output of a ``HearingAid`` for the ear, in dB relative to a normal
             ear, -40 to 0.
 
@@ -91,24 +93,23 @@ def load_compensator(
     return compensator
 
 
-def save_compensator(
-    model: Trained, folder: str | Path, audiogram: Audiogram | None = None
-) -> None:
+def save_compensator(model: Trained, folder: str | Path, audiogram: EarLike | None = None) -> None:
     """Save a trained compensator as a folder, which ``load_compensator`` loads.
 
     A checkpoint that is already there is replaced. A card, README.md, is written too, unless the
-    folder has one that hlsim did not write. The sample rate, ``full_scale_spl``, ``limit_to_ear``
-    and ``loudness`` are not saved; pass them to ``load_compensator``. A loudness other than 0
-    causes a warning, because the loaded aid will be louder.
+    folder has one that hlsim did not write. The sample rate, ``full_scale_spl``, ``linked``,
+    ``limit_to_ear`` and ``loudness`` are not saved; pass them to ``load_compensator``. A loudness
+    other than 0 causes a warning, because the loaded aid will be louder.
 
     Args:
         model: Compensator to save.
         folder: Folder of the checkpoint.
-        audiogram: Ear for which the compensator was trained; None if it was trained for all ears.
+        audiogram: Ear for which the compensator was trained, such as ``"N3"``; None if it was
+            trained for all ears.
 
     Raises:
         ValueError: The model is no ``MappingCompensator``, ``HearingAid`` or ``BeamformingAid``, a
-            weight is NaN or infinite, or the folder cannot be written.
+            weight is NaN or infinite, the ear is not valid, or the folder cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -126,7 +127,7 @@ def save_compensator(
             f"the loudness of {loudness:g} dB is not saved; pass it to load_compensator",
             stacklevel=2,
         )
-    ear = None if audiogram is None else audiogram.to_dict()
+    ear = None if audiogram is None else as_audiogram(audiogram).to_dict()
     model.save_pretrained(folder, about={"audiogram": ear})
 
 
@@ -137,7 +138,8 @@ def trained_for(name: str | Path) -> Audiogram | None:
         name: Name or folder, as in ``load_compensator``.
 
     Raises:
-        ValueError: There is no such checkpoint, or its record of the ear is not valid.
+        ValueError: There is no such checkpoint, its ``config.json`` cannot be read, or the record
+            of the ear is not valid.
 
     >>> trained_for("hearing-aid") is None
     True

@@ -18,6 +18,7 @@ from compensators import (
     save_compensator,
     trained_for,
 )
+from hlsim.audiogram import Audiogram
 from hlsim.checkpoint import save_checkpoint
 from tests.compensators.aids import EAR, SMALL
 
@@ -39,6 +40,8 @@ def test_a_checkpoint_names_the_ear_that_it_was_trained_for(tmp_path: Path) -> N
     assert [trained_for(tmp_path / name) for name in records] == [EAR, None, None]
     save_compensator(model, tmp_path / "all", EAR)
     assert trained_for(tmp_path / "all") == EAR
+    save_compensator(model, tmp_path / "all", "n3")
+    assert trained_for(tmp_path / "all") == Audiogram.standard("N3")
     assert trained_for("nalr") is trained_for("compensator-general") is None
 
 
