@@ -41,6 +41,9 @@ class Aid(nn.Module):
         thresholds: Thresholds in dB HL of the ears that calls without an audiogram use, (..., 8);
             None if there are none.
 
+    Raises:
+        ValueError: A rate or level is out of range, or an ear is not valid.
+
     >>> from compensators import WDRC
     >>> isinstance(WDRC(), Aid)
     True
@@ -87,12 +90,13 @@ class Aid(nn.Module):
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (120 for
-                NAL-R), shapes do not fit, or the waveform is on another device than the weights.
+                NAL-R and NAL-RP), shapes do not fit, or the waveform is not a floating-point tensor
+                with time last or is on another device than the weights.
         """
         raise NotImplementedError
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> Any:
-        """Raise ValueError, because only ``WDRC`` and ``HearingAid`` process a signal in chunks."""
+        """Raise ValueError, because only a ``Wearable`` aid processes a signal in chunks."""
         raise ValueError(
             f"{type(self).__name__} processes whole signals only; load wdrc or hearing-aid for a "
             "signal that arrives in chunks"

@@ -23,7 +23,7 @@ from compensators.hearing_aid import HearingAid
 from compensators.smoothing import exponential_average, weight_of_past
 from compensators.wearable import State
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals
+from hlsim.calibration import NEURO_RATE, PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checkpoint import HubModel
 from hlsim.checks import check_settings
 from hlsim.dsp.resample import resample
@@ -56,24 +56,25 @@ term, speech in quiet would be cancelled.
 
 
 class AdaptiveBeamformer(FilterAndSum):
-    """A trained adaptive beamformer to the front, with at most 1 ms of look-ahead.
+    """A trained adaptive beamformer to the front, with 1 ms of look-ahead at 16 kHz.
 
-    For each ear, fixed filters compute a beam to the front, that of ``BinauralMVDR``, and two
-    signals from which sound from the front is removed. Every 4 ms and in each band of the hearing
-    aid, weights are computed with which the two signals, subtracted from the beam, leave the least
-    power (generalised sidelobe canceller, Griffiths and Jim 1982). They come from averages over the
-    recent past. A small network decides in each band how much a frame counts in the averages, and
-    how large a power is added to those of the two signals (loading), which makes the weights
-    smaller. Before training, all frames count alike.
+    For each ear, fixed filters compute a beam to the front, that of ``BinauralMVDR`` with half of
+    its look-ahead, and two signals from which most of the sound from the front is removed. Every
+    4 ms and in each band of the hearing aid, weights are computed with which the two signals,
+    subtracted from the beam, leave the least power (generalised sidelobe canceller, Griffiths and
+    Jim 1982). They come from averages over the recent past. A small network decides in each band
+    how much a frame counts in the averages, and how large a power is added to those of the two
+    signals (loading), which makes the weights smaller. Before training, all frames count alike.
 
     Args:
         config: Sizes and choices, by default ``BeamformerConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Whole signals at other
-            rates than 16000 are resampled. Outputs contain the frequencies below 8 kHz only.
+            rates than 16000 are resampled, which adds 8.5 ms of look-ahead; streams need 16000.
+            Outputs contain the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: The rate is out of range.
+        ValueError: The rate or the level is out of range.
 
     >>> AdaptiveBeamformer()(torch.zeros(2, 2, 16000)).shape
     torch.Size([2, 16000])
@@ -94,7 +95,7 @@ class AdaptiveBeamformer(FilterAndSum):
         taps = np.concatenate((beams[None], blocking))
         super().__init__(taps.reshape(-1, *taps.shape[2:]), 2 * LOOK_AHEAD_SAMPLES, sample_rate)
         self.config = config
-        self.full_scale_spl = full_scale_spl
+        self.full_scale_spl = check_full_scale(full_scale_spl)
         decisions = nn.Linear(config.hidden, 2 * EARS * config.bands)
         self.decide = nn.Sequential(
             nn.Linear(2 * SIGNALS * EARS * config.bands, config.hidden),
@@ -203,7 +204,8 @@ class BeamformingAid(DirectionalAid, HubModel):
         highest_frequency: Highest frequency of outputs in Hz.
 
     Raises:
-        ValueError: The rate or the level is out of range.
+        ValueError: The rate, the level or a setting in ``config.aid`` is out of range, or an ear is
+            not valid.
 
     >>> BeamformingAid()(torch.zeros(2, 2, 16000), ["N2", "N4"]).shape
     torch.Size([2, 16000])

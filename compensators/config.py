@@ -1,4 +1,4 @@
-"""Settings of the two trainable compensators, which a checkpoint stores as JSON."""
+"""Settings of the three trainable compensators, which a checkpoint stores as JSON."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal

@@ -2,8 +2,8 @@
 
 Inputs have the shape (..., microphones, ears, time): at each side of the head, a front and a rear
 microphone, left side first. Outputs have the shape (..., ears, time), which any aid of two ears
-takes. Sounds from the front come out as the front microphone receives them; sounds from other
-directions are attenuated.
+takes. Sounds from the front come out nearly as the front microphone receives them; sounds from
+other directions are attenuated.
 """
 
 from __future__ import annotations
@@ -66,6 +66,9 @@ class FilterAndSum(nn.Module):
         latency: Delay of streams in samples, the look-ahead.
         takes_microphones: True, as for each aid that gets the signals of all microphones.
         ears: Number of ears with microphones, 2.
+
+    Raises:
+        ValueError: The rate is out of range.
 
     >>> mean = FilterAndSum(torch.eye(2).reshape(2, 1, 2, 1).repeat(1, 2, 1, 1) / 2)
     >>> mean(torch.ones(2, 2, 100)).shape
@@ -175,7 +178,9 @@ class FilterAndSum(nn.Module):
 class MicrophoneStream:
     """A front end for signals that arrive in chunks: a function from a chunk to the next output.
 
-    The output is that for the whole signal, delayed by ``latency`` samples, without gradients.
+    The output has no gradients, and is delayed by the ``latency`` of the front end and of the aid.
+    Without an aid, it is that for the whole signal. With an aid, the aid's gains change at other
+    times than for the whole signal, because the front end delays its input.
 
     Args:
         front_end: Front end with ``process`` and ``initial_state``.
@@ -201,7 +206,8 @@ class MicrophoneStream:
 
         Raises:
             ValueError: The chunk has another number of microphones or ears, other leading
-                dimensions than the first one, or a sample that is NaN or infinite.
+                dimensions than the first one, or a sample that is NaN or infinite; or the aid
+                rejects an ear or a slider.
         """
         signals = as_samples(chunk)
         self._front_end.check_microphones(signals)
@@ -223,7 +229,7 @@ class MicrophoneStream:
 
         The next chunk is then the beginning of another signal.
 
-        Shape: -> (..., ears, latency).
+        Shape: -> (..., ears, latency), where the latency includes that of the aid.
 
         Raises:
             ValueError: There was no chunk since the beginning of the signal.
@@ -286,7 +292,7 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
     algorithm instead of averages.
 
     Args:
-        seconds: Time constant of the averages in seconds.
+        seconds: Time constant of the averages in seconds, 0.001 to 10.
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         lowest: Frequency in Hz, 20 to 2000, at which sound from the front is 3 dB softer.
         sample_rate: Sample rate in Hz, 16000 to 48000.
@@ -339,8 +345,8 @@ class BinauralMVDR(FilterAndSum):
 
     Args:
         loading: Power of each microphone's own noise, relative to the diffuse noise, for which the
-            filters are designed. The larger it is, the less they amplify this noise.
-        spacing: Distance between the two microphones of a side in m.
+            filters are designed, 1e-6 to 1. The larger it is, the less they amplify this noise.
+        spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
@@ -415,7 +421,7 @@ class DirectionalAid(nn.Module):
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Measure the insertion gains of the aid behind the front end, see ``Aid.gains``.
 
-        They hold for sound from the front, which comes out of the front end as it was received.
+        They hold for sound from the front, which passes the front end nearly unchanged.
         """
         gains: Tensor = self.aid.gains(audiogram, level)
         return gains
@@ -427,9 +433,6 @@ class DirectionalAid(nn.Module):
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> MicrophoneStream:
         """Return a stream, which processes signals that arrive in chunks.
-
-        The gains of the aid change at other times than for the whole signal, because the front end
-        delays its input.
 
         Args:
             audiogram: Ears of the listener, by default those of the aid.
@@ -572,7 +575,7 @@ def front_blocking_taps(
     """Design filters at 16 kHz from whose outputs sound from the front is removed.
 
     They are, at each side, a cardioid to the rear, and the difference of the beam and a cardioid to
-    the front. Both have exact nulls in front of a sphere.
+    the front. In front of a sphere, about -40 dB remain of both, and up to -28 dB near 8 kHz.
 
     Args:
         beams: Impulse responses of beams to the front, from ``mvdr_taps``.
@@ -609,9 +612,15 @@ def _impulse_responses(
     before: int | None = None,
     length: int | None = None,
 ) -> NDArray[np.float64]:
-    """Convert frequency responses to impulse responses that begin ``LOOK_AHEAD`` before time 0.
+    """Convert frequency responses to impulse responses that begin before time 0.
 
-    The highest eighth of the frequencies fades out, so that little of the responses lies before.
+    The highest eighth of the frequencies fades out, so that little of the responses is cut off.
+
+    Args:
+        responses: Responses at ``design_frequencies``.
+        sample_rate: Sample rate in Hz.
+        before: Number of samples before time 0, by default ``look_ahead_samples(sample_rate)``.
+        length: Number of samples of the result, by default ``filter_length(sample_rate)``.
 
     Shape: (..., frequencies) -> (..., length).
     """

@@ -56,7 +56,7 @@ class HearingAid(Wearable, HubModel):
         amplification * (restoring gain + correction) - noise_reduction * attenuation,
 
     where ``amplification`` and ``noise_reduction`` are sliders from 0 to 1 that the wearer sets. If
-    both are 0, nothing but the peaks of the input changes. The terms are:
+    both are 0, the input passes unchanged up to the limits. The terms are:
 
     - The restoring gain makes the band about as loud for the impaired ear as for a normal one. It
       inverts the formula by which MSBG simulates the growth of loudness. ``loudness`` lowers it.
@@ -80,10 +80,12 @@ class HearingAid(Wearable, HubModel):
             a margin (``hlsim.audiogram.discomfort.predict_limits``). A tensor of thresholds has
             predicted levels. The limit of the peaks stays.
         loudness: Loudness of the output for the impaired ear, in dB relative to a normal ear, -40
-            to 0. Most people prefer less than 0 (docs/guide/levels.md). No gain becomes negative.
+            to 0. Most people prefer less than 0 (docs/guide/levels.md). The sum of restoring gain
+            and correction stays 0 dB or more.
 
     Raises:
-        ValueError: A rate or level is out of range.
+        ValueError: A rate or level is out of range, ``linked`` or ``limit_to_ear`` is neither True
+            nor False, or an ear is not valid.
 
     >>> import hlsim
     >>> aid = HearingAid().eval()
@@ -246,8 +248,8 @@ class HearingAid(Wearable, HubModel):
         reach = config.reach_db * positive_loss / (positive_loss + 10.0)
         features = torch.cat((ear, (levels - 40.0) / 20.0, (present - level) / 10.0), -1)
         correction = reach.unsqueeze(1) * torch.tanh(self.correct(features))
-        # The inverse of MSBG's recruitment: at a level of 105 dB SPL - loss, the ear perceives 0 dB
-        # SPL, and at 105 dB SPL it perceives the same as a normal ear.
+        # The inverse of MSBG's recruitment, by which an ear perceives 0 dB SPL of a sound whose
+        # level in dB SPL is the loss, and of one at 105 dB SPL the same as a normal ear.
         below_no_gain = (NO_GAIN_SPL - level.clamp_min(SOFTEST_SPL)).clamp_min(0.0)
         share = (positive_loss / CATCH_UP_SPL).unsqueeze(1)
         # With recruitment, 1 dB less of output lowers the perceived level by 1 / (1 - share) dB.

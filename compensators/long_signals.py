@@ -45,10 +45,11 @@ def process_blocks(
         sliders: Value from 0 to 1 under each slider's name; by default those of ``SLIDERS``.
 
     Yields:
-        Parts of the output, (..., time), of about 10 s.
+        Parts of the output, (..., time), of about 10 s, the last one of 5 to 15 s. A signal of up
+        to 15 s is one part.
 
     Raises:
-        ValueError: The audiogram or a slider is not valid.
+        ValueError: The signal, the audiogram or a slider is not valid.
 
     >>> from compensators import WDRC
     >>> import torch

@@ -34,7 +34,7 @@ class NALR(Aid):
             signals. It does not change the output.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A rate or level is out of range, or an ear is not valid.
 
     >>> import hlsim
     >>> from hlsim.calibration import level_spl
@@ -96,11 +96,12 @@ class NALRP(NALR):
     """The prescription NAL-RP, NAL-R for severe and profound losses, as a filter.
 
     Where the threshold at 2 kHz is above 90 dB HL, NAL-RP gives low frequencies more gain and high
-    ones less than ``NALR``, which has NAL-RP's gain for severe losses already. See
-    ``hlsim.audiogram.prescription.nalrp_gains_db`` for the formula, its sources, and its gain above
-    6 kHz, which falls. The filter, arguments and errors are those of ``NALR``.
+    ones less than ``NALR``. For other ears, the two differ only between 2 and 4 kHz, where NAL-RP
+    uses the threshold at 3 kHz, and above 6 kHz, where its gain falls. See
+    ``hlsim.audiogram.prescription.nalrp_gains_db`` for the formula and its sources. The filter and
+    its errors are those of ``NALR``.
 
-    The gains equal those of openMHA at all levels.
+    The prescribed gains are openMHA's within 0.01 dB.
 
     >>> import hlsim
     >>> NALRP("N6").gains().round()

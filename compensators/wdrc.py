@@ -65,7 +65,8 @@ class WDRC(Wearable):
             predicted levels. The limit of the peaks stays.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A value is out of range, a flag is neither True nor False, the prescription is
+            unknown, or an ear is not valid.
 
     >>> import hlsim
     >>> WDRC("N3")(hlsim.example_speech()).shape
@@ -135,17 +136,17 @@ class CAMFIT(WDRC):
     """The compressive prescription CAMFIT, in the bands of ``WDRC``.
 
     See ``hlsim.audiogram.prescription.camfit_gains`` for the rule and its sources. The attack and
-    release times, which the prescription leaves open, are those of ``WDRC``, whose arguments and
-    errors it has.
+    release times, which the prescription leaves open, are those of ``WDRC``, whose arguments
+    except ``prescription``, and whose errors it has.
 
     The rule is published for 125 to 6000 Hz. As in openMHA, it continues above, with high gains,
     because normal thresholds rise there and speech has little power.
 
-    The gains for steady sounds of 40 to 90 dB SPL per band are openMHA's within 0.1 dB. They differ
-    elsewhere: openMHA's gain rises without end towards soft sounds, while here a band that is more
-    than 38 dB softer than in average speech gets no more gain, because no part of speech is softer;
-    and openMHA attenuates a band above 100 dB SPL to this level, while here such a band passes
-    unchanged up to ``limit_spl``.
+    In equal bands, the prescribed gains for levels of 40 to 90 dB SPL are openMHA's within 0.1 dB.
+    They differ beyond: openMHA's gain rises without end towards soft sounds, while here a band that
+    is more than 38 dB softer than in average speech gets no more gain, because no part of speech is
+    softer; and openMHA attenuates a band above 100 dB SPL to this level, while here such a band
+    passes unchanged up to ``limit_spl``.
 
     >>> CAMFIT().gains("N3").round()
     tensor([ 9.,  8., 17., 23., 25., 29., 44., 53.])

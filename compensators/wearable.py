@@ -103,7 +103,8 @@ class Wearable(Aid):
         latency: Delay of a stream in samples at 16 kHz.
 
     Raises:
-        ValueError: A rate or level is out of range, or an ear is not valid.
+        ValueError: A rate or level is out of range, ``linked`` or ``limit_to_ear`` is neither True
+            nor False, or an ear is not valid.
 
     >>> from compensators import WDRC
     >>> aid = WDRC()
@@ -222,7 +223,7 @@ class Wearable(Aid):
     def process_hops(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Compute the output, before its limit, for some hops of 64 samples (4 ms) of the input.
+        """Compute the output, before its peaks are limited, for some hops of 64 samples (4 ms).
 
         Args:
             samples: Input in pascals at 16 kHz.
@@ -367,7 +368,8 @@ class Wearable(Aid):
             items, and the parameters from ``fit_with_limits``, (items, n).
 
         Raises:
-            ValueError: An ear is not valid, or shapes do not fit.
+            ValueError: There is no ear, an ear is not valid, shapes do not fit, or the waveform is
+                on another device than the weights.
         """
         check_device(self, waveform.device)
         thresholds = self.resolve_thresholds(waveform, audiogram)
@@ -431,9 +433,9 @@ class Stream:
     samples. It is that of the aid for the whole signal, without gradients.
 
     Sliders of the aid, such as ``noise_reduction``, may be set at any time. They take 0.1 s from 0
-    to 1, so that nothing clicks. For more than eight items, a chunk needs at least nine samples,
-    because a smaller one looks like an array with time first. At the end of a signal, ``flush``
-    returns the last ``aid.latency`` samples of its output.
+    to 1, so that nothing clicks. If the dimension before time is larger than eight, a chunk needs
+    at least nine samples, because a smaller one looks like an array with time first. At the end of
+    a signal, ``flush`` returns the last ``aid.latency`` samples of its output.
 
     Chunks are tensors or NumPy arrays, and so are the outputs; ``flush`` returns a tensor.
 
@@ -551,7 +553,7 @@ class Stream:
     def _process_piece(self, samples: Tensor) -> Tensor:
         """Process either whole hops, or a piece that lies within one hop.
 
-        Shape: (items, time) -> (items, time) in pascals, without the limit.
+        Shape: (items, time) -> (items, time) in pascals, before the peaks are limited.
         """
         position, time, state = self._partial_hop.shape[-1], samples.shape[-1], self._state
         self._partial_hop = hops = torch.cat((self._partial_hop, samples), -1)

@@ -263,3 +263,5 @@ def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
         AdaptiveDifferentialMicrophone(spacing=1.0)
     with pytest.raises(ValueError, match="loading"):
         BinauralMVDR(loading=0.0)
+    with pytest.raises(ValueError, match="full_scale_spl"):
+        AdaptiveBeamformer(full_scale_spl=300.0)
