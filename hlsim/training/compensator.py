@@ -1,6 +1,7 @@
 """Training of a compensator through ``HearingLossLoss``, for one ear or for all."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,9 +30,10 @@ class CompensatorTraining(TrainingModule):
 
     A ``HearingAid`` has two parts, noise reduction and amplification. The criteria ``"denoising"``
     and ``"intelligibility"`` train the noise reduction, those of ``HearingLossLoss`` the
-    amplification; a part without criteria in the recipe is frozen. If the parts shared criteria,
-    those of noise reduction would change the amplification, because HASPI rises with gain, and
-    those of amplification would weaken the noise reduction, because it lowers the level.
+    amplification; a part without criteria in the recipe is frozen. No criterion has a gradient for
+    the other part: criteria of noise reduction would change the amplification, because HASPI rises
+    with gain, and those of amplification would weaken the noise reduction, because it lowers the
+    level.
 
     Args:
         recipe: Settings of the network and of the training.
@@ -91,7 +93,8 @@ class CompensatorTraining(TrainingModule):
             error = attenuation_error(self.network, signal, clean)
             loss = loss + self.denoising * error.mean()
         if self.intelligibility:
-            missing = missing_intelligibility(self.network, signal, clean, ears)
+            with _freeze(self.network.correct):
+                missing = missing_intelligibility(self.network, signal, clean, ears)
             loss = loss + self.intelligibility * missing.mean()
         if not self.trains_amplification:
             return loss
@@ -103,7 +106,9 @@ class CompensatorTraining(TrainingModule):
         slider = batch["noise_reduction"]
         # An ear without noise reduction should perceive the noisy speech.
         reference = torch.lerp(signal, clean, slider.unsqueeze(-1))
-        return loss + self.loss(self.network(signal, ears, slider), reference, ears)
+        with _freeze(self.network.noise_reduction_network):
+            output = self.network(signal, ears, slider)
+        return loss + self.loss(output, reference, ears)
 
     def summarise(self, values: Tensor) -> dict[str, float]:
         """Compute ``valid_loss``, the mean loss of validation batches, and ``score``, its negative.
@@ -113,6 +118,19 @@ class CompensatorTraining(TrainingModule):
         """
         mean = float(values.double().mean())
         return {"score": -mean, "valid_loss": mean}
+
+
+@contextmanager
+def _freeze(part: nn.Module) -> Iterator[None]:
+    """Freeze the weights of a part of a network inside a ``with`` block."""
+    trained = [weight for weight in part.parameters() if weight.requires_grad]
+    for weight in trained:
+        weight.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for weight in trained:
+            weight.requires_grad_(True)
 
 
 def _load_beamforming_aid(config: BeamformerConfig, name: str) -> nn.Module:
@@ -148,8 +166,8 @@ def train_compensator(
         The folder that ``load_compensator`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: The data, the recipe or the simulator is invalid, or there is an ``audiogram``
-            although the data have ears.
+        ValueError: The data, the recipe or the simulator is invalid, there is an ``audiogram``
+            although the data have ears, or the training fails, see ``train_network``.
 
     >>> def train_and_load(speech: str, out: str) -> nn.Module:
     ...     data, recipe = TrainingData(Path(speech)), CompensatorRecipe(steps=1000)

@@ -216,6 +216,21 @@ def test_parts_of_a_hearing_aid_without_a_criterion_are_frozen(
     assert len(trained) == 4
 
 
+def test_criteria_of_one_part_have_no_gradient_for_the_other(noisy: TrainingData) -> None:
+    both = {"coherent-bands": 1.0, "intelligibility": 1.0}
+    gradients = []
+    for weights in (both, *({name: weight} for name, weight in both.items())):
+        recipe = replace(SMALL_AID, seconds=0.8, noisy=1.0, weights=weights)
+        module = CompensatorTraining(recipe, simulator="msbg")
+        for weight in module.network.parameters():
+            weight.data += 0.01 * torch.sin(torch.arange(weight.numel())).view_as(weight)
+        module.compute_loss(draw(recipe, noisy, 2)).backward()
+        gradients.append({name: part.grad for name, part in module.network.named_parameters()})
+    for name, gradient in gradients[0].items():
+        alone = gradients[1 if name.startswith("correct") else 2][name]
+        assert alone is not None and torch.allclose(gradient, alone, rtol=1e-4, atol=1e-9), name
+
+
 @pytest.mark.slow
 def test_a_front_end_is_trained_in_scenes_before_an_aid(
     noisy: TrainingData, tmp_path: Path
