@@ -127,7 +127,7 @@ class FrozenSimulator:
         ears = flatten_items(thresholds, batch, thresholds.dtype)
         outputs = []
         for item, ear, end in zip(items, ears, lengths.expand(batch).flatten(), strict=True):
-            perceived = self.simulator(item[:end], ear)
+            perceived = check_shape(self.simulator(item[:end], ear), "simulator", (int(end),))
             outputs.append(functional.pad(perceived, (0, time - int(end))))
         return torch.stack(outputs).reshape(*batch, time)
 

@@ -601,6 +601,8 @@ def test_bad_settings_calls_and_outputs_raise_value_error() -> None:
     for function in BAD_OUTPUTS:
         with pytest.raises(ValueError, match="the simulator to return a floating"):
             HearingLossLoss(N3, simulator=Function(function))(SIGNAL, SIGNAL)
+        with pytest.raises(ValueError, match="the simulator to return a floating"):
+            HearingLossLoss(N3, simulator=Msbg(function))(SIGNAL, SIGNAL, lengths=[900, 1000])
     for result in (torch.zeros(()), torch.zeros(3), nn.L1Loss()):
         with pytest.raises(ValueError, match=r"the criterion to return .* of shape \(2,\)"):
             HearingLossLoss(N3, criterion=lambda *_, result=result: result)(SIGNAL, SIGNAL)
