@@ -99,8 +99,8 @@ class Attenuation(nn.Module):
                 constructor.
 
         Raises:
-            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, or shapes do
-                not broadcast.
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
+                not broadcast, or the waveform is not a floating-point signal with time last.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         ears = resolve_thresholds(self.thresholds, audiogram, waveform, two_ears=self._two_ears)
@@ -141,7 +141,8 @@ class PluginSimulator(nn.Module):
 
     Raises:
         ValueError: There is no such simulator, its attribute ``full_scale_spl`` is not 94, or its
-            output for half a second of noise has another shape, is delayed, silent or not finite.
+            output for half a second of noise has another shape, is shifted by more than 2 ms,
+            silent or not finite; or the rate or the level is out of range.
 
     >>> simulator = PluginSimulator("hlsim:MSBG")
     >>> simulator(torch.randn(1, 16000), "N3").shape
@@ -190,7 +191,8 @@ class PluginSimulator(nn.Module):
                 broadcast over the leading dimensions of the waveform.
 
         Raises:
-            ValueError: A threshold is outside -10 to 100 dB HL, shapes do not broadcast, or your
+            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
+                not broadcast, the waveform is not a floating-point signal with time last, or your
                 simulator fails.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
@@ -222,8 +224,9 @@ def load_simulator(
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: There is no such simulator, the rate or the level is out of range, or the module
-            was built for another rate or level, or with ``aligned=False``.
+        ValueError: There is no such simulator, the rate or the level is out of range, the module
+            was built for another rate or level, or with ``aligned=False``, or a simulator of your
+            own is not valid (see ``PluginSimulator``).
 
     >>> load_simulator("msbg")
     MSBG(sample_rate=16000, full_scale_spl=94, aligned=True, rescale_active=False, smearing=True)

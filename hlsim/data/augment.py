@@ -16,7 +16,7 @@ from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.data.mixing import mix
 
 HIGHEST_LEVEL = 115.0
-"""Highest RMS level of a training signal in dB SPL."""
+"""Highest RMS level in dB SPL of a signal that was equalised and amplified."""
 
 _EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
 """Frequencies in Hz for which the random equaliser has gains."""

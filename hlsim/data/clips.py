@@ -70,7 +70,7 @@ class Clips:
         left_out: Indices of the recordings that were drawn so far and cannot be used.
 
     Raises:
-        ValueError: There are no files, or the folder does not exist.
+        ValueError: There are no files, or the folder does not exist or contains no audio.
 
     >>> from hlsim.data.bundled import SPEECH
     >>> clips = Clips(SPEECH, sample_rate=16000, seconds=0.5)

@@ -105,8 +105,8 @@ def prepare(
 
     Raises:
         ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
-            file, a scene lacks one of the microphones, the share is not from 0 to below 1, or the
-            manifest cannot be written.
+            file, a scene lacks one of the microphones, the share is not from 0 to below 1 or cannot
+            be moved (see ``hold_out_speakers``), or the manifest cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

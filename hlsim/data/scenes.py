@@ -59,7 +59,7 @@ def make_scene(
 ) -> Scene:
     """Place a talker, maskers and diffuse noise around a listener with two microphones a side.
 
-    All sounds come as plane waves from the horizontal plane to a rigid sphere, see
+    Talker and maskers are plane waves from the horizontal plane to a rigid sphere, see
     ``hlsim.dsp.sphere``; there is no room. Diffuse noise comes from 64 directions that are evenly
     spread over the sphere, with another part of the recording from each.
 
@@ -72,7 +72,7 @@ def make_scene(
         snr: Signal-to-noise ratio at the microphones in dB: the active level of the target minus
             the level of all other sounds, with the powers of all microphones averaged.
         target_azimuth: Azimuth of the target in degrees.
-        spacing: Distance between the two microphones of a side in m.
+        spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         sample_rate: Sample rate of all signals in Hz, 16000 to 48000.
         seed: Seed of the parts of the recording for diffuse noise, 0 or more.
 
@@ -139,9 +139,10 @@ def draw_scenes(
 ) -> Scene:
     """Draw random scenes at 16 kHz for training, see ``make_scene``.
 
-    The target comes from up to 10 degrees beside the front. Up to three maskers come from random
-    directions, each with the same probability the voice of another item or noise, and half of the
-    scenes have diffuse noise, too. Scenes without noise have one to three voices.
+    The target comes from up to 10 degrees beside the front. If there is ``noise``, up to three
+    maskers come from random directions, each with the same probability the voice or the noise of
+    another item, and half of the scenes have diffuse noise, too; the others have at least one
+    masker. Otherwise, one to three voices of other items come from random directions.
 
     Args:
         targets: Speech at its level, (items, time).
@@ -157,7 +158,8 @@ def draw_scenes(
         alone.
 
     Raises:
-        ValueError: There is only one item, which would be its own masker.
+        ValueError: There is only one item, which would be its own masker, or ``make_scene`` rejects
+            a signal.
 
     >>> voices = torch.randn(2, 8000)
     >>> scenes = draw_scenes(voices, voices, None, torch.zeros(2), torch.Generator())
@@ -256,7 +258,9 @@ def _filter_sounds(signals: Tensor, responses: NDArray[np.float64], sample_rate:
 
 @compute_once
 def diffuse_impulse_responses(spacing: float, sample_rate: int) -> NDArray[np.float64]:
-    """Compute impulse responses from the directions of diffuse noise, with a sum of powers of 1.
+    """Compute impulse responses from the directions of diffuse noise.
+
+    They are scaled so that the sounds from all directions have the power of one recording.
 
     Args:
         spacing: Distance between the two microphones of a side in m.

@@ -79,7 +79,7 @@ PRODUCT_FLOOR = 1e-36
 """Value added to products of two powers in Pa^2, far below those of audible bands."""
 
 _WEIGHT_FLOOR = 1e-9
-"""Smallest sum of weights by which a part is divided: that of a reference at about -160 dB SPL."""
+"""Smallest sum of weights by which a part is divided: that of speech at about -100 dB SPL."""
 
 
 def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> dict[str, Tensor]:

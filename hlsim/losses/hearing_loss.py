@@ -90,7 +90,7 @@ class HearingLossLoss(nn.Module):
       (``hlsim.losses.score_loss``). They do not penalise loudness, so combine them with another
       criterion.
     - ``"interaural"``: change of the differences between the ears of a listener
-      (``hlsim.metrics.interaural``), to be combined with another criterion
+      (``hlsim.losses.interaural``), to be combined with another criterion
     - names of several of these with their weights, ``{"coherent-bands": 1.0, "haspi": 0.3}``
     - a function of the perceived speech and the reference, (items, time) each in pascals, that
       returns one value per item, (items,)
@@ -227,10 +227,11 @@ class HearingLossLoss(nn.Module):
             ``ears="better"`` the result has no dimension of ears.
 
         Raises:
-            ValueError: There is no audiogram, or one of two ears is missing; shapes do not fit,
-                thresholds are outside -10 to 100 dB HL, lengths are outside 1 to time, a simulator,
-                normal ear or criterion returns another shape than it should, or, with ``"haspi"``
-                or ``"hasqi"``, an item is shorter than 0.7 s.
+            ValueError: There is no audiogram, or one of two ears is missing; a signal is not a
+                floating-point tensor with time last, shapes do not fit, thresholds are outside -10
+                to 100 dB HL, lengths are outside 1 to time, a simulator, normal ear or criterion
+                returns another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, an item
+                is shorter than 0.7 s.
         """
         parts = self.parts(output, clean, audiogram, lengths)
         return weighted_sum(parts, self.weights)

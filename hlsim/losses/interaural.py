@@ -29,9 +29,6 @@ def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
     Returns:
         One loss per pair of ears, 0 for equal differences. Shape: (...).
 
-    Raises:
-        ValueError: A signal does not have two channels, or the rate is out of range.
-
     >>> noise = torch.randn(2, 16000)
     >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)
     True

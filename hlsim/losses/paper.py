@@ -34,11 +34,13 @@ The paper does not state its own.
 """
 
 POWER_FLOOR = 1e-12
+"""Squared magnitude that is added before the root, so that its gradient is finite."""
 
 FAINT_POWER = 8e-4
 """Squared magnitude of a tone of 20 dB SPL in the paper's transform."""
 
 SILENT_MAGNITUDE = 1e-7
+"""Sum of the magnitudes of real and imaginary part below which the phase is replaced by about 0."""
 
 
 def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:

@@ -12,8 +12,13 @@ from hlsim.losses.paper import PAPER_STFT
 from hlsim.metrics.band_levels import audibility_threshold, audibility_weights, band_levels
 
 POWER_FLOOR = 1e-20
+"""Power in Pa^2, -106 dB SPL, that is added to the powers of the error and of the target."""
+
 RELATIVE_FLOOR = 1e-6
+"""Power that is added to others, relative to the power of the target: -60 dB."""
+
 SPECTRAL_FLOOR = 1e-12
+"""Squared magnitude that is added to those of spectra, so that all levels are finite."""
 
 
 def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:

@@ -49,7 +49,10 @@ time).
 """
 
 MAX_DEVICES = 64
-"""Largest number of training devices. Each step has as many batches, and a device draws its own."""
+"""Largest number of training devices.
+
+Each step has this many numbers of batches, and each device draws the batch of its own number.
+"""
 
 _VALIDATION_SECONDS = 2.0
 """Duration in seconds of the clips for validation."""
@@ -342,7 +345,13 @@ class _CompensatorBatches(_RandomBatches):
     ) -> Batch:
         """Draw clips of recorded scenes, in which the clean speech has the recipe's levels.
 
-        A network with one microphone gets that of the reference. Each ear is then an item.
+        A network with one microphone gets that of the reference, and each ear is an item. A network
+        with several microphones of one ear, or of two, gets all of them.
+
+        Args:
+            scenes: Clips of recorded scenes.
+            count: Number of scenes.
+            generator: Source of the random numbers.
         """
         clean, signal = scenes.draw_scenes(count, generator)
         levels = draw_uniform(*self.recipe.levels, (count,), generator)
@@ -469,8 +478,9 @@ def make_data(
 ) -> BatchData:
     """Build the Lightning data module with the batches for a training.
 
-    Clips for validation last 2 s, and are not equalised, amplified or compressed. If the data have
-    speech for validation, none of its files may be used for training.
+    Clips for validation last 2 s, and are not equalised, amplified or compressed; those for a
+    simulator that is trained on treated clips have 50 to 80 dB SPL. If the data have speech for
+    validation, none of its files may be used for training.
 
     Args:
         data: Speech, noise and ears.

@@ -10,7 +10,7 @@ from hlsim.calibration import NEURO_RATE, PASCAL_SPL, level_spl, set_level
 from hlsim.losses.score_loss import score_loss
 
 _POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
-"""Power in Pa^2 (0 dB SPL) that is added to speech and noise, so that silence is not attenuated."""
+"""Power in Pa^2 (0 dB SPL) that is added to that of speech, so that silence is not attenuated."""
 
 _WIENER_EXPONENT = 0.6
 """Ratio of the target gain in dB to Wiener's gain in dB."""

@@ -137,7 +137,8 @@ def train_simulator(
         The folder that ``load_pretrained`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: The data, the recipe or the teacher is invalid.
+        ValueError: The data, the recipe or the teacher is invalid, or the training fails, see
+            ``train_network``.
 
     >>> from hlsim import load_pretrained
     >>> def train_and_load(speech: str, out: str) -> NeuroMSBG:

@@ -210,7 +210,8 @@ def train_network(
     Raises:
         ValueError: The folder contains another training, one with another number of devices, its
             network alone, or a broken state; another process is writing to it; there is no such
-            device; gradients would be accumulated; or the loss is not finite.
+            device; gradients would be accumulated; the loss is not finite; or a validation score is
+            NaN.
         KeyboardInterrupt: The training was interrupted. It resumes from its last validation.
     """
     recipe = module.recipe
