@@ -45,7 +45,9 @@ Values = Mapping[str, float | str]
 _Results = dict[tuple[int, str, str], Values | str]
 """Values, or the reason why there are none, under (number of the item, condition, measure)."""
 
-_RESERVED_COLUMNS = ("item", "name", "condition", "failure", "source", "gap", "combined")
+_RESERVED_COLUMNS = (
+    *("item", "name", "condition", "failure", "source", "gap", "combined", "level_over_nal_r"),
+)
 """Columns of the table that hlsim writes, so that a measure may not return them."""
 
 
@@ -131,10 +133,12 @@ class Item:
     def digest(self, condition: str) -> str:
         """Return a hash of samples, ear, sample rate, full scale and seed.
 
-        It is the same under every condition, because the input is.
+        If outputs were recorded, that of the condition is part of it. Otherwise, the hash is the
+        same under every condition, because the input is.
         """
         settings = [self.sample_rate, self.full_scale_spl, self.seed]
-        return value_hash([self.clean, self.signal, self.ear.to_dict(), settings])
+        output = [] if self.recorded is None else [self.recorded(condition)]
+        return value_hash([self.clean, self.signal, self.ear.to_dict(), settings, *output])
 
     def once(self, name: str, compute: Callable[[], Any]) -> Any:
         """Compute a value that is the same under all conditions, or return it from memory.
@@ -187,9 +191,18 @@ class Condition:
         return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
-        """Process the input of an item, or read its recorded output. Shape: (time,)."""
+        """Process the input of an item, or read its recorded output. Shape: (time,).
+
+        Raises:
+            ValueError: There is neither a function nor a recorded output. Functions of a user may
+                raise other errors.
+        """
         if self.process is None:
-            assert item.recorded is not None
+            if item.recorded is None:
+                raise ValueError(
+                    f"expected the condition {self.name} to have a function, or the item "
+                    f"{item.name} to have recorded outputs; pass process or recorded"
+                )
             return item.recorded(self.name)
         # A function that changes its input in place must not change the item.
         return self.process(item.signal.clone(), item.ear)
@@ -273,11 +286,12 @@ def run_study(
         conditions: Conditions that process each item.
         measures: Measures that score each output.
         store: Scores of earlier runs, to which new scores are added. A score is computed again only
-            if samples, ear, condition, measure or the code of hlsim have changed, if the measure
-            uses facts and these have changed, or if the fingerprint of the condition or of the
-            measure is unknown.
-        jobs: Number of processes; all cores by default. With 1, your own code runs in this process,
-            as debuggers need it, and a crash of its compiled parts ends the process.
+            if the item, the condition, the measure or the code of hlsim has changed, or if one of
+            them cannot be hashed (``fingerprint`` is None). The name and the facts of an item count
+            only for measures that use them.
+        jobs: Number of processes; all cores by default. With 1, everything runs in this process, as
+            debuggers need it, and a crash of your own compiled code ends the process. A study with
+            a measure that may crash, such as PESQ, runs in another process even then.
         dask: Address of a Dask scheduler, whose workers replace the processes.
         progress: Function that is called with the number of finished scores and the number of all
             scores. There is one for each combination of an item, a condition and a measure.
@@ -436,7 +450,7 @@ def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure])
     """
     try:
         digest = source.digest(condition.name)
-    except (OSError, ValueError):  # Loading the item or its output fails for the same reason.
+    except Exception:  # The output fails for the same reason, or a function computes it.
         return [""] * len(measures)
     keys = []
     for measure in measures:

@@ -203,7 +203,9 @@ def test_a_measure_without_a_value_for_one_item_is_a_failure_of_this_item(
 
 
 # A page would write PEAK for the columns peak and Peak.
-@pytest.mark.parametrize("column", ["failure", "condition", "gap", "peak", "Peak"])
+@pytest.mark.parametrize(
+    "column", ["failure", "condition", "gap", "level_over_nal_r", "peak", "Peak"]
+)
 def test_a_column_of_the_table_is_rejected_at_the_first_value(
     items: list[Item], column: str
 ) -> None:
@@ -307,6 +309,25 @@ def test_only_missing_values_are_computed(items: list[Item], tmp_path: Path) -> 
         CALLS.clear()
         run_study(*arguments, store=ScoreStore(path), jobs=1)
         assert CALLS.count("peak") == computed
+
+
+def test_scores_of_recorded_outputs_are_stored_by_the_output(items: list[Item]) -> None:
+    def find_recording(name: str) -> Tensor:
+        return {"before": items[0].clean, "after": 2.0 * items[0].clean}[name]
+
+    item = replace(items[0], recorded=find_recording)
+    conditions, store = [Condition("before"), Condition("after"), *gains(4)], ScoreStore()
+    measures = [replace(MEASURES[0], scores=["peak"])]
+    for calls in (3, 1):  # The output of a function is not stored beside recorded ones.
+        CALLS.clear()
+        table = run_study([item], conditions, measures, store=store, jobs=1)
+        assert table["peak"].tolist() == pytest.approx([0.1, 0.2, 0.8])
+        assert CALLS.count("peak") == calls
+
+
+def test_a_condition_without_a_function_needs_recorded_outputs(items: list[Item]) -> None:
+    table = run_study(items, [Condition("mine")], MEASURES, jobs=1)
+    assert table["failure"].str.contains("expected the condition mine to have a function").all()
 
 
 def test_values_without_a_fingerprint_are_not_stored(items: list[Item]) -> None:
