@@ -36,7 +36,8 @@ class ConditionComparison:
             not known.
         unit: Column of the table that several items share, such as ``"listener"``.
         unit_means: The same statistics over the mean scores of each unit, because items of one
-            listener are not independent; None if an item has no unit, or with fewer than two units.
+            listener are not independent; None if an item has no unit (an empty text, None or NaN),
+            or with fewer than two units.
         left_out: Number of items that lack one of the two scores.
         p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state, adjusted by Holm
             unless the comparison is planned; None if a test is not defined.
@@ -161,7 +162,10 @@ def _compare_pair(
         return None
     first, second = pairs.to_numpy(float).T
     rows = table.drop_duplicates("item").set_index("item").loc[pairs.index]
-    units = np.array(rows.get(unit, []))
+    units = np.array([])
+    if unit in rows:
+        column = rows[unit].astype(object)
+        units = column.where(column.notna(), "").to_numpy()
     level_change = math.nan
     if "level" in table:
         levels = table.pivot(index="item", columns="condition", values="level").loc[pairs.index]
@@ -195,7 +199,7 @@ def _compare_units(
         The comparison; None if an item has no unit, or if there are fewer than two units.
     """
     names = list(dict.fromkeys(units))
-    if not all(units) or len(names) < 2:
+    if "" in names or len(names) < 2:
         return None
     means = [[scores[units == name].mean() for name in names] for scores in (first, second)]
     return paired_comparison(*means)

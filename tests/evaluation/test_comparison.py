@@ -50,6 +50,20 @@ def test_groups_are_compared_by_their_items() -> None:
     assert compare_two(scores).unit_means is None
 
 
+def test_numbers_are_names_of_units_and_an_item_without_a_unit_prevents_their_test() -> None:
+    rows = table(draw(30, 0.1), listeners=5)
+    (expected,) = compare(rows, ["haspi"])
+    (numbered,) = compare(rows.assign(listener=rows["item"] % 5), ["haspi"])
+    assert numbered.unit_means == expected.unit_means is not None
+    for missing in ("", None, math.nan):
+        names = [
+            name if item else missing for item, name in zip(rows.item, rows.listener, strict=True)
+        ]
+        (comparison,) = compare(rows.assign(listener=names), ["haspi"])
+        assert comparison.unit_means is None
+        assert comparison.overall == expected.overall
+
+
 def test_the_p_values_of_all_but_planned_comparisons_are_adjusted() -> None:
     generator = np.random.default_rng(1)
     scores = {name: (0.3 + 0.1 * generator.normal(size=20)).tolist() for name in "abc"}
