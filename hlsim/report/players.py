@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import soundfile
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.evaluation.comparison import ConditionComparison
@@ -81,8 +82,9 @@ def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> S
 def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) -> Player:
     """Return a player that switches between sounds, with their spectrograms.
 
-    All sounds of a group have one gain, so that their loudness can be compared. Groups may have
+    All sounds of a group have one gain, so that their loudness can be compared. Groups have
     different gains, because the output of an aid is much louder than what the ear perceives of it.
+    The heading of a group says by how many dB it is played softer than the first one.
 
     Args:
         groups: Signals in pascals, as a dict from the heading of a group, which may be empty, to a
@@ -92,7 +94,7 @@ def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) ->
 
     Raises:
         ValueError: All signals of a group are silent.
-        MissingExtraError: matplotlib is not installed.
+        MissingExtraError: matplotlib or Pillow is not installed.
 
     >>> tone = torch.sin(torch.arange(16000) * 0.2)
     >>> player = make_player({"": {"tone": tone, "soft tone": 0.1 * tone}}, 16000)
@@ -192,7 +194,8 @@ def _full_scale(peak: float) -> float:
 def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     """Compute the spectrogram of a signal up to 8 kHz, in windows of 20 ms every 10 ms.
 
-    If there are several channels, their powers are averaged.
+    If there are several channels, their powers are averaged. Signals shorter than a window are
+    padded with silence.
 
     Args:
         signal: Signal in pascals. Shape: (time,) or (channels, time).
@@ -205,9 +208,9 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     """
     points = 2 * (sample_rate // 100)
     window = torch.hann_window(points)
-    spectrum = torch.stft(
-        signal.float().cpu(), points, points // 2, window=window, return_complex=True
-    )
+    padding = max(0, points - signal.shape[-1])
+    samples = functional.pad(signal.float().cpu(), (0, padding))
+    spectrum = torch.stft(samples, points, points // 2, window=window, return_complex=True)
     magnitude = spectrum.abs().reshape(-1, *spectrum.shape[-2:]).square().mean(0).sqrt()
     levels = 20.0 * torch.log10(magnitude * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
     return levels[: round(_HIGHEST_HZ * points / sample_rate) + 1]

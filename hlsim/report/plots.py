@@ -7,6 +7,7 @@ window, no global state and no notebook's backend is involved.
 import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import cycle
 from textwrap import fill
 from typing import Any
 
@@ -31,7 +32,7 @@ UNAIDED_COLOUR = "#7d828a"
 """Colour of the condition without an aid."""
 
 _LINE_STYLES = ("-", "--", ":", "-.")
-"""Styles of the curves of one aid, from the lowest level to the highest."""
+"""Styles of the curves of one aid, in the order of the levels."""
 
 _LINEAR_DB = 0.5
 """Largest difference in dB between gains at several levels that are drawn as one curve."""
@@ -195,7 +196,8 @@ def gain_picture(
 ) -> Picture:
     """Draw the gain of aids for one ear over frequency, with one curve per aid and level.
 
-    An aid whose gains at all levels differ by less than 0.5 dB has a single curve.
+    An aid whose gains at all levels differ by less than 0.5 dB has a single curve. With more than
+    four levels, the styles of the lines are used again.
 
     Args:
         title: Heading above the picture.
@@ -213,7 +215,7 @@ def gain_picture(
         names = [f"{aid}, {level:g}{_NO_BREAK}dB{_NO_BREAK}SPL" for level in row["levels"]]
         if float(np.ptp(gains, axis=0).max()) < _LINEAR_DB:
             gains, names = gains[:1], [aid]
-        for name, line, style in zip(names, gains.tolist(), _LINE_STYLES, strict=False):
+        for name, line, style in zip(names, gains.tolist(), cycle(_LINE_STYLES), strict=False):
             curves[name] = (row["frequencies"], line, {"color": colours[aid], "linestyle": style})
     return curves_picture(curves, title, "insertion gain (dB)")
 
@@ -230,7 +232,7 @@ def ears_picture(
         title: Heading above the picture.
         axis: Title of the vertical axis.
         values: Tuples (ear, aid, value), where the value has three numbers: the value itself, and
-            the lower and the upper limit of its interval.
+            the lower and the upper limit of its interval. Infinite ones are not drawn.
         colours: Colour of matplotlib for each aid.
 
     >>> values = [("N3", "mine", (-5.0, -6.0, -4.0)), ("N4", "mine", (2.0, 1.0, 3.0))]

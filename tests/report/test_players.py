@@ -62,6 +62,12 @@ def test_spectrograms_have_one_scale() -> None:
     assert ends.split() == [SPECTROGRAM_COLOURS[0], SPECTROGRAM_COLOURS[-1]]
 
 
+@pytest.mark.parametrize("samples", [1, 100])
+def test_a_sound_shorter_than_a_window_can_be_played(samples: int) -> None:
+    (sound,) = make_player({"": {"click": torch.ones(samples)}}, 16000).sounds
+    assert sound.level == pytest.approx(94.0)
+
+
 def test_silence_is_rejected() -> None:
     with pytest.raises(ValueError, match="silent"):
         make_player({"": {"silence": torch.zeros(1600)}}, 16000)

@@ -38,6 +38,14 @@ def test_a_linear_aid_has_one_gain_curve() -> None:
     assert text.count("compressor") == 2 and "80\N{NO-BREAK SPACE}dB" in text
 
 
+def test_each_level_has_a_gain_curve() -> None:
+    levels = [40.0, 50.0, 60.0, 70.0, 80.0]
+    gains = [[20 - place, 20 - place] for place in range(5)]
+    row = {"aid": "mine", "frequencies": [250, 4000], "levels": levels, "gain_db": gains}
+    text = gain_picture("Gain", [row], {"mine": "#2f7ed8"}).data.decode()
+    assert all(f"{level:g}\N{NO-BREAK SPACE}dB" in text for level in levels)
+
+
 def test_colours_of_conditions() -> None:
     conditions = [
         Condition("none", kind="unaided"),
