@@ -38,6 +38,20 @@ def test_export_without_onnx_names_the_extra(
         hlsim.export.export_onnx(simulator, tmp_path / "ear.onnx", seconds=0.1)
 
 
+def test_a_study_names_the_extra_of_stoi_before_it_begins(
+    speech_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pandas")
+    from hlsim.evaluation.measures import find_measures
+    from hlsim.evaluation.simulators import evaluate_simulators
+
+    monkeypatch.setitem(sys.modules, "pystoi", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'hlsim\[eval\]'"):
+        find_measures(["haspi", "stoi"])
+    with pytest.raises(MissingExtraError, match=r"pip install 'hlsim\[eval\]'"):
+        evaluate_simulators({"exact": "msbg"}, speech=speech_dir, audiograms="standard", items=1)
+
+
 def test_simulators_are_compared_without_pesq(
     speech_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -42,7 +42,7 @@ class Live:
         latency: Delay of the stream's output in samples, which is displayed.
 
     Attributes:
-        drop_outs: Number of blocks of which samples were lost, and of restarts of the devices.
+        drop_outs: Number of blocks of which samples were lost, plus the restarts of the devices.
         error: Message of an exception in the stream; empty if there was none.
 
     >>> from compensators import WDRC
@@ -111,7 +111,8 @@ class Live:
     def status(self) -> str:
         """Return a line of text with levels, sliders and drop-outs.
 
-        The levels are those since the last call, in dB SPL. Drop-outs are counted from the start.
+        The levels are those since the last call, in dB SPL, at least 0. Drop-outs are counted from
+        the start.
         """
         blocks = self._blocks
         self._blocks = []
@@ -163,19 +164,19 @@ def play(
         raise ValueError(
             f"PortAudio not found ({error}); install it (Debian: apt install libportaudio2)"
         ) from error
-    microphones = sounddevice.query_devices(devices[0], "input")["max_input_channels"]
     silence = torch.zeros(2, block) if live.ears == 2 else torch.zeros(block)
     for _ in range(WARM_UP_BLOCKS):
         live.stream(silence)
-    options = {
-        "samplerate": NEURO_RATE,
-        "blocksize": block,
-        "device": devices,
-        "channels": (min(live.ears, microphones), 2),
-        "dtype": "float32",
-        "latency": buffer,
-    }
     try:
+        microphones = sounddevice.query_devices(devices[0], "input")["max_input_channels"]
+        options = {
+            "samplerate": NEURO_RATE,
+            "blocksize": block,
+            "device": devices,
+            "channels": (min(live.ears, microphones), 2),
+            "dtype": "float32",
+            "latency": buffer,
+        }
         with (
             suppress(KeyboardInterrupt),
             _key_reader() as read_key,

@@ -190,8 +190,9 @@ def _process_file(
         )
     elif meter.peak > 1.0:
         text += f"; the peak is {meter.peak:.3g} times full scale, and most players will clip it"
-    if getattr(model, "highest_frequency", math.inf) < recording.sample_rate / 2:
-        text += "; the output has no band above 8 kHz"
+    highest_hz = getattr(model, "highest_frequency", math.inf)
+    if highest_hz < recording.sample_rate / 2:
+        text += f"; the output has no band above {highest_hz / 1000.0:g} kHz"
     return text
 
 

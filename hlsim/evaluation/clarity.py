@@ -21,6 +21,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
+from hlsim.checks import check_number
 from hlsim.data.layouts import CLARITY_REFERENCES
 from hlsim.data.recorded_scenes import file_with_room
 from hlsim.evaluation.aid_properties import measure_look_ahead
@@ -168,13 +169,14 @@ def evaluate_scenes(
 
     Raises:
         ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, an
-            aid, enhancer or measure does not exist, two conditions have one name, or nothing could
-            be scored.
+            aid, enhancer or measure does not exist, a number is out of range, two conditions have
+            one name, or nothing could be scored.
         MissingExtraError: A package is not installed.
     """
     check_scheduler(running.get("dask"))
     names = ["haspi", "hasqi", *measures]
-    find_measures(names)
+    find_measures(names, precision)
+    check_number("stride", stride, 1, whole=True)
     all_pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)
     pairs = all_pairs[::stride]
     microphones = [*dict.fromkeys(microphones)]
@@ -231,8 +233,9 @@ def _read_pairs(
     See ``evaluate_scenes`` for the files.
 
     Raises:
-        ValueError: There is no scene, a scene lacks its reference, a file is broken or names an
-            unknown scene or listener, or a listener who is used lacks an ear.
+        ValueError: There is no scene, or two files are one scene; a scene lacks its reference; a
+            file is broken, or names an unknown scene or listener; or a listener who is used lacks
+            an ear or has a name that cannot be that of a file.
     """
     mixes: dict[str, Path] = {}
     for ending in _MIX_ENDINGS:
@@ -362,8 +365,8 @@ def _make_conditions(
         levels: Arguments ``sample_rate`` and ``full_scale_spl`` of aids.
 
     Raises:
-        ValueError: An aid cannot be loaded, or the signals of two conditions would have the same
-            folder.
+        ValueError: An aid cannot be loaded, two aids have the same label, or the signals of two
+            conditions would have the same folder.
     """
     loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
     for label in (*aids, *folders):

@@ -144,7 +144,7 @@ def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
 
     Raises:
         ValueError: There is no such measure or precision, or your function cannot be loaded.
-        MissingExtraError: ``pesq`` is one of the names, and the package pesq is not installed.
+        MissingExtraError: The package of STOI or PESQ is needed, and is not installed.
 
     >>> [measure.name for measure in find_measures(["haspi", "hasqi"])]
     ['haspi', 'hasqi']
@@ -152,8 +152,9 @@ def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
     check_names([name for name in names if ":" not in name], MEASURES, "measures")
     if precision not in PRECISIONS:
         raise ValueError(f"expected precision 32 or 64 (bits), got {precision!r}; pass one of them")
-    if "pesq" in names:
-        require("pesq", "pesq")
+    for name, package, extra in (("stoi", "pystoi", "eval"), ("pesq", "pesq", "pesq")):
+        if name in names:
+            require(package, extra)
     measures = []
     for name in dict.fromkeys(names):
         measure = MEASURES[name] if name in MEASURES else load_measure(name)
@@ -327,10 +328,11 @@ def _measure_perception(item: Item, output: Tensor) -> Values:
 PERCEPTION = Measure("perception", _measure_perception, uses_facts=False, scores=())
 """Errors in dB of what an ear perceives of an output, by the exact MSBG, and the output's peak.
 
-``loudness_error`` is the level that the ear perceives of the output, minus the level that a normal
-ear perceives of the input with its noise. ``band_error`` and ``loss_msbg`` compare the perceived
-output with clean speech as a normal ear perceives it: ``band_error`` is the median over 24 bands
-and all frames of the absolute difference in level, ``loss_msbg`` the value of
+Items must be in pascals. ``loudness_error`` is the level that the ear perceives of the output,
+minus the level that a normal ear perceives of the input with its noise. ``band_error`` and
+``loss_msbg`` compare the perceived output with clean speech as a normal ear perceives it:
+``band_error`` is the median absolute difference in level over those frames and bands (of 24) in
+which the normal ear hears the clean speech, ``loss_msbg`` the value of
 ``HearingLossLoss(criterion="bands")``. ``peak`` is the largest magnitude of the output in dB
 relative to 20 micropascals.
 """

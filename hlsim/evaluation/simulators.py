@@ -25,7 +25,7 @@ from hlsim.evaluation.running.fingerprint import fingerprint
 from hlsim.evaluation.running.parallel import check_scheduler
 from hlsim.evaluation.sounds import try_conditions
 from hlsim.evaluation.study import Condition, Item, Measure, Values
-from hlsim.extras import is_installed
+from hlsim.extras import is_installed, require
 from hlsim.metrics import fidelity
 from hlsim.simulators import load_simulator
 
@@ -147,7 +147,9 @@ def _fidelity_to(teacher_name: str) -> Measure:
 
     Raises:
         ValueError: There is no such teacher.
+        MissingExtraError: pystoi is not installed.
     """
+    require("pystoi", "eval")
     teacher = load_simulator(teacher_name)
     packages = ["pystoi"]
     scores = {"stoi": fidelity.stoi}

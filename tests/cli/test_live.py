@@ -49,6 +49,8 @@ class Devices:
         self.options: dict[str, Any] = {}
 
     def query_devices(self, device: int | str | None, kind: str) -> Any:
+        if device == 99:
+            raise self.PortAudioError("Error querying device 99")
         if device not in (None, 0, "Loopback"):
             raise ValueError(f"No {kind} device matching {device!r}")
         return {"max_input_channels": self.recording.shape[1]}
@@ -221,6 +223,7 @@ def test_keys_are_read_from_a_terminal_whose_settings_are_restored(
     [
         ("--listener nosuch.csv", "nosuch.csv"),
         ("--audiogram N3 --input 7", "No input device matching 7"),
+        ("--audiogram N3 --input 99", "the devices cannot be used: Error querying device 99"),
         ("--audiogram N3 --output Phones", "Invalid sample rate [PaErrorCode -9997]; choose two"),
         ("--audiogram N3 --compensator nalr", "NALR processes whole signals only"),
         ("--audiogram N3 --simulate --amplification 1", "no effect with --simulate"),

@@ -440,6 +440,19 @@ def test_notes_about_clipping_and_a_missing_upper_band(
         assert (note in text) == (note == expected)
 
 
+def test_the_band_that_a_simulator_of_a_user_lacks_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = "def ear(waveform, audiogram): return 0.5 * waveform\near.sample_rate = 22050\n"
+    (tmp_path / "mine.py").write_text(code)
+    noise = 0.001 * np.random.default_rng(0).standard_normal(24000)
+    soundfile.write(tmp_path / "in.wav", noise, 48000, subtype="FLOAT")
+    simulator = f"{tmp_path / 'mine.py'}:ear"
+    files = tmp_path / "in.wav", tmp_path / "out.wav"
+    assert run("simulate", "--audiogram", "N3", "--simulator", simulator, *files) == 0
+    assert "no band above 11.025 kHz" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("call", "beginning"),
     [

@@ -16,6 +16,7 @@ from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
 from hlsim.cli.main import main
 from hlsim.data.bundled import DIGITS
+from hlsim.evaluation.digits import DigitTest
 from hlsim.evaluation.digits.material import (
     Triplets,
     draw_triplets,
@@ -216,6 +217,11 @@ def test_sliders_reach_the_aid() -> None:
 def test_invalid_arguments_are_rejected(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         reception_threshold(**{"audiogram": "N3", **QUICK, **settings})
+
+
+def test_a_test_has_enough_triplets_for_its_three_rounds() -> None:
+    with pytest.raises(ValueError, match="triplets to be a whole number from 30"):
+        DigitTest.draw(2, simulator="attenuation")
 
 
 def test_other_loaders_name_the_loader_of_a_listener() -> None:

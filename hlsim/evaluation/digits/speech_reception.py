@@ -84,7 +84,8 @@ class ReceptionThreshold:
             the errors of both thresholds as independent, although both come from the same triplets.
         pta: Pure-tone average in dB HL, the mean threshold at 500, 1000, 2000 and 4000 Hz.
         people: Unaided threshold of people with this mean loss, and the range of 95 % of them, in
-            the same noise of 65 dB SPL. The simulated listener differs from them (docs/digits.md).
+            noise of 65 dB SPL, whatever the level of the noise in the test was. The simulated
+            listener differs from them (docs/digits.md).
 
     >>> import hlsim
     >>> result = hlsim.reception_threshold("N2", simulator="attenuation", triplets=30)
@@ -135,8 +136,11 @@ class DigitTest:
             triplets, simulator, listener, noise_spl, seed: See ``reception_threshold``.
 
         Raises:
-            ValueError: There is no such simulator or listener.
+            ValueError: There is no such simulator or listener, or a number is out of range.
         """
+        check_number("noise_spl", noise_spl, 40.0, 90.0)
+        check_number("triplets", triplets, 30, 3000, whole=True)
+        check_number("seed", seed, 0, 2**32 - 1, whole=True)
         return cls(
             draw_triplets(triplets, torch.Generator().manual_seed(seed)),
             load_simulator(simulator),
@@ -287,9 +291,6 @@ def reception_threshold(
     >>> bool(result.unaided.low < result.unaided.value < result.unaided.high)
     True
     """
-    check_number("noise_spl", noise_spl, 40.0, 90.0)
-    check_number("triplets", triplets, 30, 3000, whole=True)
-    check_number("seed", seed, 0, 2**32 - 1, whole=True)
     if sliders and aid is None:
         names = ", ".join(sliders)
         raise ValueError(f"{names} has no effect without an aid; pass one, such as 'hearing-aid'")
