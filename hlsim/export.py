@@ -3,9 +3,10 @@
 An *item* is one signal for one ear. The program of a simulator processes a fixed number of items
 with a fixed length.
 
-The program of a wearable aid (``WDRC`` or ``HearingAid``) processes one *hop* of each item, 64
-samples or 4 ms at 16 kHz, or a fixed number of hops. The *state* of the aid, its memory of earlier
-calls, is passed in and returned as tensors. All tensors are float32.
+The program of a wearable aid (``WDRC``, ``CAMFIT`` or ``HearingAid``) processes one *hop* of each
+item, 64 samples or 4 ms at 16 kHz, or a fixed number of hops. The *state* of the aid, its memory of
+earlier calls, is passed in and returned as tensors. All tensors are float32, unless the weights of
+the aid have another type.
 
 Inputs and their names:
 
@@ -130,8 +131,9 @@ def export_onnx(
         items: Number of waveforms per call.
 
     Raises:
-        ValueError: The simulator is unsuitable, see ``export_program``; ONNX lacks an operation; or
-            the output of onnxruntime for noise at 64 dB SPL differs by more than 1e-4 of its peak.
+        ValueError: The simulator or a number is not valid, see ``export_program``; ONNX lacks an
+            operation; the output of onnxruntime for noise at 64 dB SPL differs by more than 1e-4 of
+            its peak; or the file cannot be written.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> import hlsim
@@ -165,8 +167,8 @@ def first_inputs(
         Dict of the input tensors, whose names and shapes the module's docstring lists.
 
     Raises:
-        ValueError: The aid is no ``WDRC`` or ``HearingAid`` at 16 kHz, it rejects the ear, or a
-            number is out of range.
+        ValueError: The aid is no ``WDRC``, ``CAMFIT`` or ``HearingAid`` at 16 kHz, it rejects the
+            ear, or a number is out of range.
 
     >>> from compensators import WDRC
     >>> print(*first_inputs(WDRC(), "N3"))
@@ -175,7 +177,9 @@ def first_inputs(
     _check_export(aid, items)
     check_number("hops", hops, 1, whole=True)
     if aid.sample_rate != RATE:
-        raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
+        raise ValueError(
+            f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz; load it at {RATE} Hz"
+        )
     weight = next(aid.parameters(), torch.empty(0))
     with torch.no_grad():
         samples = weight.new_zeros(items, hops * HOP)
@@ -203,7 +207,7 @@ def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export
         hops: Number of hops of 64 samples (4 ms) per call.
 
     Raises:
-        ValueError: The aid's sample rate is not 16000 Hz.
+        ValueError: The aid or a number is not valid, see ``first_inputs``.
 
     >>> from compensators import WDRC
     >>> program = hop_program(WDRC())
@@ -226,9 +230,9 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
         hops: Number of hops of 64 samples (4 ms) per call.
 
     Raises:
-        ValueError: The aid's sample rate is not 16000 Hz; ONNX lacks an operation; or an output or
-            state of onnxruntime differs by more than 1e-4 of its peak in the last of 16 calls with
-            noise at 64 dB SPL.
+        ValueError: The aid or a number is not valid, see ``first_inputs``; ONNX lacks an operation;
+            an output or state of onnxruntime differs by more than 1e-4 of its peak in the last of
+            16 calls with noise at 64 dB SPL; or the file cannot be written.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC
@@ -260,8 +264,9 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
         items: Number of ears per call.
 
     Raises:
-        ValueError: ONNX lacks an operation, or the output of onnxruntime differs from that of torch
-            by more than 1e-4 of its peak.
+        ValueError: The aid is not wearable, or the number of ears is below 1; ONNX lacks an
+            operation; the output of onnxruntime differs from that of torch by more than 1e-4 of its
+            peak; or the file cannot be written.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
 
     >>> from compensators import WDRC

@@ -197,7 +197,7 @@ def listen(
     Raises:
         ValueError: There is no signal, all signals are silent, one has another shape or samples
             that are NaN or infinite, or the sample rate or the level is not valid.
-        MissingExtraError: matplotlib is not installed.
+        MissingExtraError: matplotlib or Pillow is not installed.
 
     Example:
         >>> import hlsim

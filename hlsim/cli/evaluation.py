@@ -34,7 +34,7 @@ STORE = "scores.jsonl"
 """Name of the file of scores in the folder of the results."""
 
 _PLAYED_ITEMS = 3
-"""Number of items whose sounds a page plays."""
+"""Number of items whose sounds a page plays; the page about simulators plays one."""
 
 _CHECKPOINTS = "by name or folder; LABEL=FOLDER sets the name in the tables to LABEL"
 """End of the help text of arguments that name checkpoints."""

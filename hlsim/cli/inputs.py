@@ -58,7 +58,8 @@ def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
         The ear or the listener, or None if both options are missing.
 
     Raises:
-        ValueError: There is no such file or listener, or an ear is missing.
+        ValueError: There is no such file or listener, an audiogram is not valid, an ear is missing,
+            or the levels of ``--ucl`` are not valid or have no effect.
     """
     from hlsim.audiogram import as_audiogram
 
@@ -128,8 +129,8 @@ def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
         name "listener".
 
     Raises:
-        ValueError: There is no such file or listener, an audiogram is not valid, or two have the
-            same name.
+        ValueError: There is no such file or listener, an audiogram is not valid, two have the same
+            name, or the levels of ``--ucl`` are not valid or have no effect.
     """
     from hlsim.audiogram import as_audiogram
 
@@ -231,7 +232,8 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
         sample_rate: Sample rate in Hz of the signals to process.
 
     Raises:
-        ValueError: There is no such compensator, or it lacks a slider that is set.
+        ValueError: There is no such compensator, the sample rate is out of range, or the
+            compensator lacks a slider or a setting that is passed.
     """
     from compensators import load_compensator
     from compensators.directional import behind_front_end

@@ -36,7 +36,7 @@ class Meter:
         power: Mean square of all samples of all channels.
         peak: Largest magnitude of a sample.
 
-    Both hold once all parts have passed. A meter measures one signal.
+    Both are final once all parts have passed. A meter measures one signal.
 
     >>> import torch
     >>> meter = Meter()
@@ -79,8 +79,8 @@ def process_recording(
     The parts together are the output for the whole recording: for simulators at 16 kHz bit by bit,
     for MSBG above 20 kHz to 5e-4 of the peak (in frames that smearing leaves nearly empty, which
     depend on the last bits), otherwise to 2e-5. The memory does not depend on the length, except
-    for simulators of your own and networks with layers other than convolutions, whose output at any
-    time depends on the whole recording.
+    for directional aids, simulators of your own, and networks with layers other than convolutions,
+    which get the whole recording at once.
 
     Args:
         model: Simulator or aid at the sample rate of the recording.

@@ -104,7 +104,7 @@ def make_recipe(recipe: type[Recipe], file: Path | None, settings: Sequence[str]
     Raises:
         ValueError: The file cannot be read, or a setting is unknown, invalid or given twice.
         OSError: There is no such file.
-        MissingExtraError: jsonargparse or PyYAML is not installed, and there are settings.
+        MissingExtraError: jsonargparse or PyYAML is not installed, unless defaults are used alone.
     """
     arguments = [*settings] if file is None else [f"--recipe={file}", *settings]
     if not arguments:

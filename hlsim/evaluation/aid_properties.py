@@ -43,7 +43,10 @@ _SIDEBAND_DISTANCE_HZ = 20.0
 """Distance from a tone in Hz beyond which power counts as sidebands."""
 
 _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)
-"""Samples of the middle second of 2 s, which holds whole periods of each tone."""
+"""Samples without the first and the last half second.
+
+Of tones of 2 s, they are the middle second, which has whole periods of each tone.
+"""
 
 _POWER_FLOOR = 1e-30
 """Lowest power of a tone, which keeps ratios finite for JSON."""

@@ -1,9 +1,9 @@
 """Conditions of studies, each a way to process the input of an item, and their names.
 
 They are: no aid; an equaliser with the mean gain of an aid; an aid at the output level of another
-one; an aid behind noise reduction; and an aid of your own. The rival of an aid is the prescription
-with which it is compared, for all ears the same or by a rule for the ear. A hearing aid is a
-function or module ``(waveform, ear) -> waveform``.
+one; an aid for one or several microphones; an aid behind noise reduction; and an aid of your own.
+The rival of an aid is the prescription with which it is compared, for all ears the same or by a
+rule for the ear. A hearing aid is a function or module ``(waveform, ear) -> waveform``.
 """
 
 import uuid
@@ -48,7 +48,7 @@ BEFORE, AFTER = "before", "after"
 """Names of recorded speech before and after a treatment."""
 
 NAL_R_AT_LEVEL, TRAINED = "NAL-R, same level", "trained aid"
-"""Names of two conditions of the demo: the aid that it trains, and NAL-R at its output level."""
+"""Names of two conditions of the demo: NAL-R at the level of the trained aid, and this aid."""
 
 _EQUALISER_TAPS = 513
 """Number of taps of an equaliser, which gives it a resolution of 31 Hz at 16 kHz."""
@@ -93,7 +93,7 @@ class PrescriptionForEar(nn.Module):
     def is_measured(self, audiogram: Audiogram) -> bool:
         """Return whether the prescription for an ear is another one than NAL-R.
 
-        Otherwise, the measurements of NAL-R say the same.
+        ``measure_aids`` calls this method, and leaves out other ears, for which NAL-R is measured.
         """
         return is_profound(audiogram)
 
@@ -139,11 +139,11 @@ class OnMicrophones(nn.Module):
 
     An aid with the attribute ``takes_microphones`` gets all signals, as (microphones, time) or
     (microphones, 2, time), and another aid that of the reference, the first microphone of the first
-    ear. For two ears, the aid gets the same audiogram twice, and the output of the first ear is
+    ear. For two ears, the aid uses the one audiogram for both, and the output of the first ear is
     returned.
 
-    A single signal, (time,), goes to an aid without its directional front end, and to all
-    microphones of any other aid.
+    A single signal, (time,), goes to the aid behind a directional front end, or else to all
+    microphones of an aid.
 
     Args:
         aid: The aid.

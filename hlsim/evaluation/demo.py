@@ -62,8 +62,9 @@ def evaluate_trained_aid(
     Returns:
         The evaluation. Its ``details`` have ``gain_curves`` of NAL-R and the aid, see
         ``measure_aids``; ``perceived_levels``, by condition the levels that the ear perceives in
-        24 bands in dB SPL; and ``speech_levels_hl``, the levels of the input and of the aid's
-        output in these bands in dB HL. Its ``sounds`` are those of the last utterance.
+        24 bands in dB SPL, and under ``NORMAL_EAR`` those that a normal ear perceives of the
+        speech; and ``speech_levels_hl``, the levels of the input and of the aid's output in these
+        bands in dB HL. Its ``sounds`` are those of the last utterance.
 
     Raises:
         ValueError: The aid fails, or no output could be scored.

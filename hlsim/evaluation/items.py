@@ -36,7 +36,7 @@ _SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB through which noisy items cycle, as in the paper."""
 
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
-"""Bisgaard's standard audiograms that are part of every comparison of hearing aids."""
+"""Bisgaard's standard audiograms, with which hearing aids are compared unless one ear is passed."""
 
 
 def draw_simulator_items(
@@ -126,8 +126,8 @@ def draw_aid_items(
         levels: Levels of the clean speech in dB SPL, through which the items cycle.
 
     Returns: Items at 16 kHz, in pascals. Their facts are ``ear`` (its name), ``severity`` (degree
-        of loss), ``input_level`` (dB SPL), ``speech`` (clean or noisy), ``snr`` (dB, NaN if clean)
-        and ``audiogram`` (thresholds in dB HL at the eight frequencies).
+        of loss), ``input_level`` (of the clean speech, in dB SPL), ``speech`` (clean or noisy),
+        ``snr`` (dB, NaN if clean) and ``audiogram`` (thresholds in dB HL at the eight frequencies).
 
     Raises:
         ValueError: A folder cannot be read, or a number is out of range.
@@ -165,8 +165,8 @@ def draw_scene_items(
     """Draw items out of recorded scenes with several microphones, each for one of the ears.
 
     The items cycle through the ears, and the clean speech at the item's ear through the levels. Of
-    scenes for two ears, every second item of an ear is mirrored, so that its ear, the first one, is
-    the right ear of the scene.
+    scenes for two ears, half of the items of an ear are mirrored, so that their ear, the first one,
+    is the right ear of the scene.
 
     Args:
         scenes: Clips of the scenes at 16 kHz.
@@ -240,8 +240,8 @@ def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     """Return names and audiograms of the ears N2 to N6 and S1 to S3, and of those in a CSV file.
 
     The name of an ear in the file consists of its columns ``listener`` and ``ear``, and of the
-    number of its row if another ear has this name. A row with the name and the thresholds of an
-    earlier ear is left out.
+    number of its row if another ear has this name, or if both columns are empty. A row with the
+    name and the thresholds of an earlier ear is left out.
 
     Args:
         audiograms: CSV file of ears, see ``read_audiograms``, or None.
@@ -377,7 +377,7 @@ def _add_noise(clean: Tensor, noise: Tensor | None, snr: float) -> tuple[Tensor,
     """
     if noise is None:
         return clean, math.nan
-    # By RMS level. Trainings mix by active speech level, at which the same number is less noise.
+    # By RMS level. Trainings mix by active speech level, at which the same number is more noise.
     return mix(clean, noise, snr, sample_rate=None), snr
 
 
@@ -386,7 +386,7 @@ def _facts(ear: Audiogram, level: float, snr_column: str, snr: float) -> dict[st
 
     Args:
         ear: Audiogram of the ear.
-        level: Level of the input in dB SPL.
+        level: Level in dB SPL to state as ``input_level``.
         snr_column: Name of the fact with the SNR.
         snr: SNR in dB, or NaN for clean speech.
     """

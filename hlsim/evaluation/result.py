@@ -107,7 +107,7 @@ class Evaluation:
             store: File to which scores are written as they become known, and from which a repeated
                 run reads them; None stores nothing.
             settings: Settings to record in the evaluation, such as the seed, each under its name.
-                They change no score.
+                This method does not use them.
             running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
         Raises:
@@ -123,7 +123,7 @@ class Evaluation:
     def check_scores(self) -> None:
         """Raise ValueError if the table has no score at all.
 
-        The message has the reason for the first item.
+        The message has the reason of the first failure.
         """
         if self.table.reindex(columns=self.scores).isna().all(axis=None):
             if self.failures.empty:

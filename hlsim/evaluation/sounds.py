@@ -28,15 +28,16 @@ def perceive_items(
 
     Items are ranked by how much their score changes between the two conditions of
     ``evaluation.headline``, the largest rise first. The returned items are evenly spaced in this
-    ranking. The sounds of an item are what a normal ear perceives of the clean speech, and what the
-    impaired ear perceives of the output of each condition.
+    ranking. The sounds of an item, of at most 8 s, are what a normal ear perceives of the clean
+    speech, and what the impaired ear perceives of the output of each condition. A sound that
+    cannot be computed is missing; ``failures`` has the reason.
 
     Args:
         evaluation: Evaluation with comparisons.
         count: Number of items to return, if there are as many.
         conditions: Names of the conditions with sounds; all of them if empty.
 
-    Returns: The sounds, or an empty list if there is no comparison.
+    Returns: The sounds, or an empty list if there is no comparison or ``count`` is 0.
 
     >>> import pandas
     >>> from hlsim import Audiogram

@@ -29,8 +29,8 @@ class PairedComparison:
 
     A difference is the score after minus the score before. Differences up to 1e-7 of the largest
     score count as zero. Values that the data do not define are None: with one item, all but the
-    means and ``delta``; with equal differences, ``t``, ``p_t`` and ``cohens_d``; and if all
-    differences are zero, ``w`` and ``p_w``.
+    counts, the means and ``delta``; with equal differences, ``t``, ``p_t`` and ``cohens_d``; and if
+    all differences are zero, ``w`` and ``p_w``.
 
     Attributes:
         n: Number of items.

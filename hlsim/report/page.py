@@ -168,6 +168,7 @@ class Player:
 
         Raises:
             ValueError: The file cannot be written.
+            MissingExtraError: jinja2 is not installed.
         """
         title = ", ".join(sound.label for sound in self.sounds)
         title = title[:1].upper() + title[1:]

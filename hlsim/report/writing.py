@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram.scale import FREQUENCIES
 from hlsim.evaluation.result import Evaluation
-from hlsim.extras import require
 from hlsim.report.page import Page, write_page
 from hlsim.report.verdict import limits, verdict
 
@@ -31,7 +30,7 @@ def write_results(page: Page, evaluation: Evaluation, out: str | Path) -> Path:
 
     Raises:
         ValueError: The files cannot be written.
-        MissingExtraError: jinja2 is not installed.
+        MissingExtraError: jinja2 is not installed, or for pictures matplotlib.
 
     >>> import pandas, tempfile
     >>> table = pandas.DataFrame([{"item": 0, "condition": "aid", "haspi": 0.5}])
@@ -70,9 +69,6 @@ def scores_table(evaluation: Evaluation) -> DataFrame:
     Args:
         evaluation: Evaluation with the table.
 
-    Raises:
-        MissingExtraError: pandas is not installed.
-
     >>> import pandas
     >>> row = {"item": 0, "condition": "aid", "audiogram": [20.0] * 8, "haspi": 0.5}
     >>> list(scores_table(Evaluation([], [], [], pandas.DataFrame([row]))))[-2:]
@@ -84,7 +80,5 @@ def scores_table(evaluation: Evaluation) -> DataFrame:
     if "audiogram" not in table:
         return table
     columns = [f"hl_{frequency:g}" for frequency in FREQUENCIES]
-    thresholds = require("pandas", "eval").DataFrame(
-        table["audiogram"].tolist(), columns=columns, index=table.index
-    )
+    thresholds = type(table)(table["audiogram"].tolist(), columns=columns, index=table.index)
     return table.drop(columns="audiogram").join(thresholds)

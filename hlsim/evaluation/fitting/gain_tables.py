@@ -72,7 +72,7 @@ class _Fitting(NamedTuple):
         Shape: -> (8,) in dB, at ``FREQUENCIES``.
 
         Raises:
-            ValueError: The aid has several ears.
+            ValueError: There are several ears, or an ear or the level is not valid.
         """
         gains = self.aid.gains(self.ear, level).double().cpu().numpy()
         if gains.ndim != 1:
@@ -83,7 +83,7 @@ class _Fitting(NamedTuple):
         """Measure the insertion gains in dB for speech at all ``LEVELS``, (levels, 8).
 
         Raises:
-            ValueError: The aid has several ears.
+            ValueError: There are several ears, or an ear is not valid.
         """
         return np.stack([self.gains(level) for level in LEVELS])
 

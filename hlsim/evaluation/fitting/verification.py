@@ -30,7 +30,7 @@ SECTION_SECONDS = 0.125
 """Duration of the sections in which levels are measured. They overlap by half."""
 
 MIN_SECONDS = 1.0
-"""Shortest recording in seconds. In so short a one, the 99 % percentile is the loudest section."""
+"""Shortest recording in seconds, whose 99 % percentile is nearly the loudest section."""
 
 TARGET_STEP = 5.0
 """Largest distance in dB between levels of speech at which a prescription's gains are computed."""
