@@ -178,8 +178,8 @@ class HearingAid(Wearable, HubModel):
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: A slider is outside 0 to 1, or an argument is not valid, see
-                ``Aid.forward``.
+            ValueError: A slider is outside 0 to 1 or has another number of values, or an argument
+                is not valid, see ``Aid.forward``.
         """
         sliders: dict[str, Slider] = {
             "noise_reduction": noise_reduction,

@@ -409,8 +409,8 @@ class Wearable(Aid):
         Returns: Values from 0 to 1, (items, sliders), in the order of ``SLIDERS``.
 
         Raises:
-            ValueError: A value is outside 0 to 1, or the aid has no such slider.
-            RuntimeError: A shape does not broadcast to ``batch``.
+            ValueError: A value is outside 0 to 1, its shape does not broadcast to ``batch``, or the
+                aid has no such slider.
         """
         self.check_sliders(sliders)
         values = like.new_zeros(batch.numel(), len(self.SLIDERS))
@@ -422,7 +422,13 @@ class Wearable(Aid):
             is_known = slider.device.type == "cpu" and not torch.compiler.is_compiling()
             if is_known and not bool(in_range.all()):
                 raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
-            values[:, column] = torch.where(in_range, slider, torch.nan).expand(batch).flatten()
+            try:
+                values[:, column] = torch.where(in_range, slider, torch.nan).expand(batch).flatten()
+            except RuntimeError as error:
+                raise ValueError(
+                    f"expected {name} to be one number, or one value per item in the shape "
+                    f"{tuple(batch)}, got the shape {tuple(slider.shape)}"
+                ) from error
         return values
 
 
@@ -454,12 +460,11 @@ class Stream:
     Raises:
         ValueError: For the constructor: the aid has another sample rate, rejects the ear or has no
             such slider. For a call: a slider is outside 0 to 1 (on a GPU this is not checked, and
-            the output is NaN until ``flush``), the leading dimensions differ from those of earlier
-            chunks or do not fit the ears, there are no samples, samples are no floating-point
-            numbers or above 1e9 in magnitude, or a sample is NaN or infinite, which would affect
-            all later output. A rejected chunk leaves the stream as it was. A rejected
-            value of a slider stays until ``set`` replaces it.
-        RuntimeError: For a call: values of a slider do not broadcast to the items.
+            the output is NaN until ``flush``) or does not broadcast to the items, the leading
+            dimensions differ from those of earlier chunks or do not fit the ears, there are no
+            samples, samples are no floating-point numbers or above 1e9 in magnitude, or a sample is
+            NaN or infinite, which would affect all later output. A rejected chunk leaves the stream
+            as it was. A rejected value of a slider stays until ``set`` replaces it.
 
     >>> import hlsim
     >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")

@@ -82,7 +82,7 @@ def test_sliders_of_a_stream_are_tensors_or_numbers_by_name() -> None:
 
 def test_a_bad_slider_raises_value_error() -> None:
     aid: Any = varied_hearing_aid()
-    for slider in (1.5, float("nan"), "loud", torch.tensor([0.0, 2.0])):
+    for slider in (1.5, float("nan"), "loud", torch.tensor([0.0, 2.0]), torch.zeros(3)):
         for call in (
             lambda x, y: aid(x, EAR, 1.0, y),
             lambda x, y: aid.stream(EAR, amplification=y)(x),
