@@ -1,4 +1,4 @@
-"""Training losses that compare the output of an aid with clean speech, as an impaired ear hears it.
+"""Training losses of aids, which compare what ears perceive, and of the networks that emulate MSBG.
 
 These words have one meaning in the whole package:
 

@@ -59,8 +59,8 @@ class NeuroMSBG(EarNetwork, HubModel):
     channels, and a small network corrects them. With the structures of the paper, the input
     channels are magnitude, phase and the encoded audiogram. An encoder and dual-path blocks (layers
     along time, then along frequency) follow, and two decoders predict the magnitude and the phase
-    of the factor. With ``config.prior``, the spectrogram is first multiplied by the estimate of
-    MSBG's gains, which is also an additional input channel, and the network corrects the product.
+    of the factor. With ``config.prior``, they predict a correction, by which the estimate of MSBG's
+    gains is multiplied. The estimate is then an additional input channel.
 
     ``torch.func.grad`` works with all networks. First derivatives are exact, and so are second
     derivatives with ``cnn`` blocks and, on a CPU, with ``lstm`` blocks. Where there is no second
@@ -310,7 +310,7 @@ def load_pretrained(
 
     Args:
         name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or the folder of
-            a checkpoint. ``hlsim.list_pretrained`` lists the names.
+            a checkpoint or of a training run. ``hlsim.list_pretrained`` lists the names.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 

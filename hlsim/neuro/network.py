@@ -33,8 +33,8 @@ class EarNetwork(nn.Module):
     Subclasses set ``config`` and implement ``process_items``.
 
     On a CPU, a few items run at a time. Long signals run in overlapping parts if a sample of the
-    output depends on a limited part of the input (``cnn`` blocks). The parts change no output, and
-    limit the memory for signals of any length if no gradient is computed.
+    output depends on a limited part of the input (``cnn`` blocks). The parts change the output by
+    rounding errors only, and limit the memory for long signals if no gradient is computed.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
@@ -104,7 +104,8 @@ class EarNetwork(nn.Module):
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Convert signals to pascals at 16 kHz, process them in blocks or whole, and convert back.
 
-        Shape: (items, time), (items, 8) in dB HL -> (items, time).
+        Shape: (items, time), or (items, microphones, time), and (items, 8) in dB HL -> (items,
+            time).
         """
         gain = gain_to_pascals(self.full_scale_spl)
         inputs = resample(signals * gain, self.sample_rate, NEURO_RATE)
@@ -138,7 +139,7 @@ class EarNetwork(nn.Module):
 
         A simulator's output is what the ear perceives. Subclasses implement this method.
 
-        Shape: (items, time), (items, 8) -> (items, time).
+        Shape: (items, time), (items, 8) -> (items, time); see ``microphones`` for several.
         """
         raise NotImplementedError
 

@@ -178,7 +178,7 @@ class BandGains(nn.Module):
 
         Args:
             smeared_powers: Power in Pa^2 at each point of a spectrogram, spread over neighbouring
-                frequencies as ``smear`` does. Negative values are treated as 0.
+                frequencies as ``smear_powers`` does. Negative values are treated as 0.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe), which selects the bank.
         """
         # Unlike relu, threshold stores nothing for its gradient that is not stored anyway. The

@@ -41,7 +41,8 @@ class Mamba(nn.Module):
         self.A_log = nn.Parameter(torch.arange(1.0, d_state + 1.0).log().repeat(inner, 1))
         self.D = nn.Parameter(torch.ones(inner))
         self.out_proj = nn.Linear(inner, d_model, bias=False)
-        # Before training, step sizes lie between 0.001 and 0.1, uniformly in their logarithm.
+        # Before training, the biases alone give step sizes between 0.001 and 0.1, whose logarithms
+        # are uniformly distributed.
         nn.init.uniform_(self.dt_proj.weight, -(rank**-0.5), rank**-0.5)
         step = torch.exp(torch.rand(inner) * math.log(100.0) + math.log(0.001))
         inverse_softplus = step + torch.log(-torch.expm1(-step))
