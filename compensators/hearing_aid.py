@@ -288,7 +288,7 @@ class HearingAid(Wearable, HubModel):
 def _lstm_step(lstm: nn.LSTM, frame: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
     """Run a one-layer LSTM for one frame, in a quarter of the time that a call of the LSTM takes.
 
-    On a CPU, every bit of the result is the same.
+    The result differs by rounding errors at most.
 
     Shape: (items, inputs), (items, units) twice -> hidden and cell state, (items, units) each.
     """
