@@ -26,7 +26,7 @@ from hlsim.calibration import (
 from hlsim.checks import check_attributes, check_rate, check_waveform
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.interpolation import interpolate
-from hlsim.dsp.resample import resample
+from hlsim.dsp.resample import HIGHEST_RATE, resample
 from hlsim.msbg import MSBG
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
@@ -43,6 +43,9 @@ UNSMEARED = "msbg-unsmeared"
 
 _HALF_LENGTH_SECONDS = 0.064
 """Time in seconds that the filter of ``Attenuation`` covers before time 0, and after it."""
+
+_LOWEST_PLUGIN_RATE = 1000
+"""Lowest sample rate of a plug-in in Hz."""
 
 
 class Attenuation(nn.Module):
@@ -130,8 +133,8 @@ class PluginSimulator(nn.Module):
     with shape (items, time) and thresholds in dB HL with shape (items, 8), and returns the
     perceived signals, time-aligned with its input. Gradients pass through it if it is
     differentiable; its parameters do not require a gradient. Its sample rate is its attribute
-    ``sample_rate``, or else 16000 Hz. It may have the attributes ``emulates_msbg``,
-    ``highest_frequency`` and ``needs_exact_lengths``, see ``HearingLossLoss``.
+    ``sample_rate``, 1000 to 1000000, or else 16000 Hz. It may have the attributes
+    ``emulates_msbg``, ``highest_frequency`` and ``needs_exact_lengths``, see ``HearingLossLoss``.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -142,7 +145,7 @@ class PluginSimulator(nn.Module):
     Raises:
         ValueError: There is no such simulator, its attribute ``full_scale_spl`` is not 94, or its
             output for half a second of noise has another shape, is shifted by more than 2 ms,
-            silent or not finite; or the rate or the level is out of range.
+            silent or not finite; or a rate or the level is out of range.
 
     >>> simulator = PluginSimulator("hlsim:MSBG")
     >>> simulator(torch.randn(1, 16000), "N3").shape
@@ -165,7 +168,9 @@ class PluginSimulator(nn.Module):
                 f"expected the simulator {name} to take pascals, full_scale_spl={PASCAL_SPL:g}, "
                 f"got {scale:g}; build it without another scale"
             )
-        self.plugin_rate: int = getattr(function, "sample_rate", NEURO_RATE)
+        self.plugin_rate = check_rate(
+            getattr(function, "sample_rate", NEURO_RATE), _LOWEST_PLUGIN_RATE, HIGHEST_RATE
+        )
         self.emulates_msbg: bool = getattr(function, "emulates_msbg", False)
         self.needs_exact_lengths: bool = getattr(function, "needs_exact_lengths", False)
         highest_frequency = getattr(function, "highest_frequency", math.inf)

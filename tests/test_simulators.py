@@ -13,7 +13,7 @@ from hlsim.simulators import Attenuation, PluginSimulator, load_simulator
 
 PLUGIN = """
 class Quieter:
-    sample_rate = 44100
+    sample_rate = 44100.0
     def __call__(self, waveform, audiogram):
         return 0.5 * waveform * 10 ** (-audiogram[:, :1] / 20)
 
@@ -31,6 +31,10 @@ class Scaled:
     full_scale_spl = 120.0
     def __call__(self, waveform, audiogram):
         return waveform
+
+class Rateless(Scaled):
+    full_scale_spl = 94.0
+    sample_rate = None
 """
 
 
@@ -83,6 +87,7 @@ def test_a_plug_in_is_the_ear_of_simulate(plugin: str) -> None:
     [
         *(("late", "delays by"), ("nobody", "nobody"), ("broken", "NaN or infinite")),
         ("Scaled", "full_scale_spl=94, got 120"),
+        ("Rateless", "a sample rate that is a whole number from 1000"),
     ],
 )
 def test_invalid_plug_ins_are_rejected(plugin: str, name: str, words: str) -> None:
