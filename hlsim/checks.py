@@ -150,9 +150,9 @@ def check_number(
     if accepted and not (whole and type(value) is not int):
         return
     kind = "a whole number" if whole else "a number"
-    limits = "" if lowest == -math.inf else f" from {lowest:g}"
+    limits = "" if lowest == -math.inf else f" from {lowest:.10g}"
     if highest < math.inf:
-        limits += f" to {highest:g}"
+        limits += f" to {highest:.10g}"
     is_other_type = accepted and int(value) == value  # such as 3.0 and NumPy's integers
     fix = f"; convert it: {int(value)}" if is_other_type else ""
     raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}{fix}")

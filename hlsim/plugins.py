@@ -49,7 +49,7 @@ def load_plugin(name: str, kind: str) -> Any:
     parts = _NAME.fullmatch(name)
     if parts is None:
         raise ValueError(
-            f"expected the name of a {kind} as package.module:name or path/to/file.py:name, "
+            f"expected the name of the {kind} as package.module:name or path/to/file.py:name, "
             f"got {name!r}"
         )
     source, attribute = parts["source"], parts["attribute"]
@@ -245,7 +245,17 @@ def _import_file(path: Path) -> ModuleType:
 
 
 def _describe(error: Exception) -> str:
-    """Describe an exception in one line: its type, its text, and where it was raised."""
+    """Describe an exception in one line: its type, its text, and where it was raised.
+
+    Python's import system and this file are no such places.
+    """
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if frame.filename not in (__file__, importlib.__file__)
+        and not frame.filename.startswith("<frozen")
+    ]
+    if not frames:
+        return text
     return f"{text} ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"

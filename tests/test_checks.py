@@ -124,8 +124,9 @@ def test_loud_outputs_leave_the_warning_to_the_next_waveform(
 
 
 def test_a_number_of_another_type_is_to_be_converted() -> None:
-    with pytest.raises(ValueError, match=r"a whole number from 0 to 5, got .*3.*; convert it: 3"):
-        checks.check_number("seed", np.int64(3), 0, 5, whole=True)
+    expected = r"a whole number from 0 to 4294967295, got .*3.*; convert it: 3"
+    with pytest.raises(ValueError, match=expected):
+        checks.check_number("seed", np.int64(3), 0, 2**32 - 1, whole=True)
 
 
 @pytest.mark.parametrize("call", [level_spl, lambda wave: mbstoi(wave, wave)])

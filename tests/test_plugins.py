@@ -131,6 +131,11 @@ def test_names_that_cannot_be_loaded_are_rejected(module: str) -> None:
     for name in ("msbg", "no_such_module:half", "none.py:half", ":half", "x:", unknown):
         with pytest.raises(ValueError, match=name):
             load_plugin(name, "teacher")
+    with pytest.raises(ValueError, match=r"No module named 'no_such_module'$"):
+        load_plugin("no_such_module:half", "teacher")
+    Path("imports.py").write_text("\nimport no_such_module\n")
+    with pytest.raises(ValueError, match=r"No module named 'no_such_module' \(imports\.py, line 2"):
+        load_plugin("imports.py:half", "teacher")
     for load in (load_plugin, WaveformPlugin):
         with pytest.raises(ValueError, match="got an object of type int"):
             load(f"{module}:number", "teacher")

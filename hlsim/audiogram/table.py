@@ -254,7 +254,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
         rows: Rows of the table.
         frequency: Name of the column of frequencies in Hz.
         threshold: Name of the column of thresholds in dB HL.
-        ucl: Name of the column of uncomfortable levels in dB HL, if there is one.
+        ucl: Names of the columns of uncomfortable levels in dB HL.
 
     Returns:
         One row per ear, with the place of the first row of this ear. Its columns are the listener,
@@ -271,6 +271,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
             f"{rows[0][0]}: expected the columns listener and ear beside {frequency} and "
             f"{threshold}, got {', '.join(names)}; add or rename columns"
         )
+    other_names = [name for name in names if name not in ("listener", "ear")]
     # A spreadsheet with merged cells names the listener and the ear in the first row only.
     required_names = [
         name for name in ("listener", "ear") if has_ears and any(row[name] for _, row in rows)
@@ -289,7 +290,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
         key = tuple(EAR_NAMES.get(text.lower(), text) for text in ear.values())
         _, wide = ears.setdefault(key, (place, ear))
         first_row = first_rows.setdefault(key, row)
-        differing_names |= {name for name in names if row[name] != first_row[name]}
+        differing_names |= {name for name in other_names if row[name] != first_row[name]}
         text = row[frequency]
         column = text if re.search("k|hz", text.lower()) else f"{text} Hz"
         if not convert_at(place, threshold_columns, [column]):

@@ -256,8 +256,11 @@ class Audiogram:
             The axes.
 
         Raises:
+            ValueError: ``ear`` is another value.
             MissingExtraError: matplotlib is not installed.
         """
+        if ear not in EAR_STYLES:
+            raise ValueError(f"expected ear to be left, right or None, got {ear!r}; correct it")
         if axes is None:
             _, axes = require("matplotlib.pyplot", "eval").subplots(layout="constrained")
         label = None if ear is None else f"{ear}, PTA {self.pta:.0f} dB HL"
@@ -592,7 +595,10 @@ def _as_array(values: Any) -> NDArray[np.float64]:
     except (TypeError, ValueError):
         numbers = np.array(math.nan)
     if numbers.ndim != 1:
-        raise ValueError(f"expected a list of numbers for an audiogram, got {values!r}")
+        raise ValueError(
+            f"expected a list of numbers for an audiogram, got {values!r}; for a standard "
+            "audiogram, write Audiogram.standard('N3')"
+        )
     return numbers
 
 

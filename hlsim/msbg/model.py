@@ -25,7 +25,7 @@ from hlsim.audiogram.thresholds import (
     store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import check_rate, check_waveform
+from hlsim.checks import check_flag, check_rate, check_waveform
 from hlsim.dsp.fft import rfft
 from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.msbg.cochlea import (
@@ -118,7 +118,8 @@ class MSBG(nn.Module):
             backward pass, a few items or one block at a time, instead of stored. False by default.
 
     Raises:
-        ValueError: The rate, the level or an audiogram is out of range.
+        ValueError: The rate, the level or an audiogram is out of range, or a setting is not True or
+            False.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()[:16000]
@@ -146,6 +147,9 @@ class MSBG(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
+        check_flag("aligned", aligned)
+        check_flag("rescale_active", rescale_active)
+        check_flag("smearing", smearing)
         self.aligned = aligned
         self.rescale_active = rescale_active
         self.smearing = smearing

@@ -22,6 +22,8 @@ def test_axes_and_symbols_are_those_of_audiology() -> None:
     assert right.get_label() == "right, PTA 62 dB HL"
     assert tuple(right.get_ydata()) == Audiogram.standard("N4").levels
     assert tuple(single.get_xdata()) == (500, 3000)
+    with pytest.raises(ValueError, match="expected ear to be left, right or None, got 'L'"):
+        Audiogram.standard("N3").plot(ear="L")  # type: ignore[arg-type]
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

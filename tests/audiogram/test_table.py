@@ -1,6 +1,7 @@
 """Tables of audiograms as spreadsheets, clinics and apps write them."""
 
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,9 @@ def test_columns_that_differ_within_an_ear_of_a_long_table_are_named(tmp_path: P
 
 def test_an_ear_of_a_long_table_may_be_spelt_in_several_ways(tmp_path: Path) -> None:
     rows = "A,R,250,10\nA,right,1000,20\nA,RE,4000,30\n"
-    ears = read_text(tmp_path, f"listener,ear,frequency,threshold\n{rows}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ears = read_text(tmp_path, f"listener,ear,frequency,threshold\n{rows}")
     assert ears == [Audiogram((10, 20, 30), (250, 1000, 4000))]
 
 

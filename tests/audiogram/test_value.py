@@ -142,6 +142,11 @@ def test_pyclaritys_audiograms_are_ears() -> None:
     assert levels.tolist() == [list(ear.levels), [10, 15, 19, 25, 28, 31, 35, 38]]
 
 
+def test_a_name_in_place_of_levels_is_refused_with_the_fix() -> None:
+    with pytest.raises(ValueError, match=r"got 'N3'; .* write Audiogram\.standard\('N3'\)"):
+        Audiogram("N3")
+
+
 def test_frequencies_in_khz_are_refused() -> None:
     for ear in ({250: 20, 1: 40}, {1: 20, 2: 30, 500: 40}, {500: 20, 48000: 30}, {0.25: 10, 8: 20}):
         with pytest.raises(ValueError, match=r"100 to 20000 Hz.*multiply kHz by 1000"):

@@ -335,6 +335,7 @@ BAD_CALLS: list[tuple[Any, Any, str]] = [
 BAD_SETTINGS: list[tuple[str, Any]] = [
     *(("sample_rate", 8000), ("sample_rate", 96000), ("full_scale_spl", math.nan)),
     *(("audiogram", "N7"), ("audiogram", Audiogram((20, 40, 110), (500, 4000, 14000)))),
+    *(("aligned", "no"), ("rescale_active", 0), ("smearing", None)),
 ]
 
 
