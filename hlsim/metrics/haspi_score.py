@@ -86,7 +86,7 @@ def haspi(
             pyclarity draws with ``seed`` (scores vary by up to 0.007); ``"none"`` leaves it out.
         seed: Seed of the drawn noise of each item.
         whole_khz: Round the rate to whole kHz, as pyclarity does. From 44.1 to 44 kHz, scores
-            change by up to 0.005.
+            mostly change by less than 0.01.
 
     Returns:
         Scores, an array if ``output`` is one. Shape: (...).

@@ -102,16 +102,18 @@ def interaural_change(before: Samples, after: Samples, *, sample_rate: int = 160
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Level and time differences of the output minus those of the input, and the coherence of the
-        output.
+        Level and time differences of the output minus those of the input, in dB and microseconds,
+        and the coherence of the output. Shape of each: (..., 5).
 
     Raises:
-        ValueError: The shapes differ or are not (..., 2, time), or the rate is out of range.
+        ValueError: The signals are not floating-point samples, the shapes differ or are not
+            (..., 2, time), or the rate is out of range.
 
     >>> noise = torch.randn(2, 16000)
     >>> interaural_change(noise, noise).level
     tensor([0., 0., 0., 0., 0.], dtype=torch.float64)
     """
+    before, after = as_samples(before), as_samples(after)
     if before.shape != after.shape:
         raise ValueError(
             "expected input and output of the same shape, got "

@@ -101,7 +101,7 @@ class QualityReference(Reference):
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes
             signals that NAL-R or another prescription has amplified.
-        keep: Store the clean signals' features, about 18 MB per second in float32; otherwise they
+        keep: Store the clean signals' features, about 17 MB per second in float32; otherwise they
             are computed, and the level is validated, for each score.
 
     Raises:

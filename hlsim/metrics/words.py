@@ -7,7 +7,7 @@ enhancement challenges.
 - HASPI was that of the better ear at pyclarity's default level. The sentences were in British
   English, in noise, and 7 to 10 words long. For other speech the predictions are an extrapolation.
 - At the same HASPI, people understood fewer words in the second challenge. A prediction for no
-  particular challenge is the mean of the two, and about 0.05 to 0.07 off in each.
+  particular challenge lies between the two, and differs from each by up to 0.08.
 - HASPI ranks aids, not people. Its correlation with the words understood in the first challenge is
   0.97 for the means of ten aids, and 0.33 for the means of the listeners. The intervals include the
   differences between listeners.

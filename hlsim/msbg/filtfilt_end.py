@@ -24,7 +24,7 @@ from hlsim.msbg.recruitment import AHEAD
 from hlsim.torchtools import constant
 
 LOOK_BACK = 4096
-"""Number of last samples with an influence. In this time the slowest low-pass decays by 70 dB."""
+"""Number of last samples with an influence. In this time the slowest low-pass decays by 107 dB."""
 
 _PADDING = 8
 """Number of samples that ``filtfilt`` adds at the end of a signal."""

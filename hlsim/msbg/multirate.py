@@ -1,7 +1,7 @@
 """The filter bank with each channel at a sample rate that its band needs.
 
 A gammatone channel passes a band of frequencies. It is kept up to five bandwidths above its centre
-frequency, where its gain is -57 dB, or up to the highest frequency of interest. Neighbouring
+frequency, where its gain is -40 to -49 dB, or up to the highest frequency of interest. Neighbouring
 channels form a *rate band* with a common sample rate and a common *detector*, the signal from which
 their envelopes are computed:
 

@@ -128,7 +128,7 @@ def apply_gains(
     There is one gain per step, a group of neighbouring samples; the gains between are interpolated.
     Where the envelope goes through zero, because its low-pass overshoots, the gain changes
     suddenly. After a slight loss this is audible, because the inverse of the middle ear amplifies
-    high frequencies by up to 40 dB. There, the envelope is interpolated instead of the gain.
+    high frequencies by more than 40 dB. There, the envelope is interpolated instead of the gain.
 
     Shape: (..., channels, time), (..., channels, steps), (rows, columns) -> (..., time).
 

@@ -56,6 +56,8 @@ def test_change_swapped_ears_and_silence(scene: Tensor) -> None:
         interaural(scene[0])
     with pytest.raises(ValueError, match="input and output of the same shape"):
         interaural_change(scene, scene[:, :8000])
+    with pytest.raises(ValueError, match="expected samples, got the path"):
+        interaural_change("input.wav", scene)  # type: ignore[arg-type]
 
 
 def test_the_loss_depends_only_on_differences_between_the_ears(scene: Tensor) -> None:
