@@ -197,7 +197,8 @@ def haspi_report(parser: Parser) -> None:
     parser.series("--measures", str, text, ["haspi"])
     _declare_precision(parser)
     option("--baseline", str, "condition to compare all others with; by default all pairs")
-    parser.flag("--better-ear", "use the better ear's scores; needs a manifest with both ears")
+    text = "use the better ear's scores; needs a manifest or a table of ears with both ears"
+    parser.flag("--better-ear", text)
     parser.levels("every clean file")
     _declare_study(parser)
 

@@ -275,7 +275,7 @@ class Parser(argparse.ArgumentParser):
         Args:
             condition: Beginning of the restriction in the help text, such as "stereo files; ".
         """
-        text = f"link the gains of both ears ({condition}hearing aids and wdrc only)"
+        text = f"link the gains of both ears ({condition}hearing aids, wdrc and camfit only)"
         self.flag("--linked", text)
 
     def limit_to_ear(self, table: str) -> None:

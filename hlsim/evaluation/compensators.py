@@ -172,6 +172,8 @@ def evaluate_compensators(
         raise ValueError(
             "expected either speech, with or without noise, or a manifest; pass one of them"
         )
+    if root is not None and manifest is None:
+        raise ValueError("root (--root) has no effect without a manifest; leave it out")
     for name, aid in compensators.items():
         check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}

@@ -128,7 +128,9 @@ def haspi_report(
     outputs = {name: folder for name, folder in folders.items() if folder is not None}
     if manifest is None and clean is not None and outputs:
         if root is not None:
-            raise ValueError("root has no effect on folders; leave it out, or pass a manifest")
+            raise ValueError(
+                "root (--root) has no effect on folders; leave it out, or pass a manifest"
+            )
         ears = _read_ears_of_folders(ear, audiograms)
         recordings = read_folders(clean, outputs, ears, **settings)
     elif manifest is not None and clean is None and not outputs:

@@ -68,7 +68,7 @@ def evaluate_simulators(
             ``load_simulator`` accepts.
         measures: Further measures, ``package.module:name``.
         items: Number of items, each of which is measured for each of ``inputs``.
-        seconds: Length of an item in seconds; PESQ and STOI need 2 or more.
+        seconds: Length of an item in seconds. STOI needs 0.4 s of speech without its pauses.
         levels: Levels of the input in dB SPL, through which the items cycle.
         inputs: Names of ways to process the input before the simulator: ``"as-is"``, ``"louder"``
             (by 20 dB), ``"nalr"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and

@@ -255,6 +255,7 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
         {"audiogram": 3},
         {"enhancers": ["no_such:module"]},
         {"audiograms": "ears.csv"},
+        {"root": "."},
     ):
         settings = {"compensators": {"mine": Unaided()}, "audiogram": N3, **options, **changes}
         with pytest.raises(ValueError):

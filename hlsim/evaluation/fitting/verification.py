@@ -246,9 +246,9 @@ def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Arra
     """Compute the insertion gains of an aid for levels of speech in third octaves.
 
     Bands are independent: the gain of a band is the aid's gain for average speech, at the overall
-    level of speech whose level in this band is that of ``band_levels``. These are gains for speech
-    of a constant level. In speech whose level changes, an aid that adapts slowly gives soft and
-    loud sections more similar gains.
+    level of speech whose level in this band is that of ``band_levels``. Overall levels are limited
+    to 0 to 120 dB SPL. These are gains for speech of a constant level. In speech whose level
+    changes, an aid that adapts slowly gives soft and loud sections more similar gains.
 
     Args:
         aid: Aid, linear or compressive.
