@@ -144,12 +144,12 @@ def evaluate_compensators(
 
     Returns:
         The evaluation with the groups ``clean`` and ``noisy`` (speech in noise), if they have
-        items, which hold the comparisons. In its table, ``gap`` is the surrogate gap as a fraction,
-        ``loudness_error`` is relative to ``loudness``, and ``level_over_nal_r`` is the output level
-        minus that of NAL-R in dB. Its ``details`` are ``gain_curves``, ``steady_tones`` and
-        ``wearing``: results of ``measure_aids`` with ``measure_gain_curve``,
-        ``measure_steady_tones`` and ``measure_wearability``; with ``srt``, also
-        ``reception_thresholds``, that of ``measure_reception_thresholds``.
+        items. The groups have the comparisons. In its table, ``gap`` is the surrogate gap as a
+        fraction, ``loudness_error`` is relative to ``loudness``, and ``level_over_nal_r`` is the
+        output level minus that of NAL-R in dB. Its ``details`` are ``gain_curves``,
+        ``steady_tones`` and ``wearing``: results of ``measure_aids`` with ``measure_gain_curve``,
+        ``measure_steady_tones`` (errors relative to ``loudness``, too) and ``measure_wearability``;
+        with ``srt``, also ``reception_thresholds``, that of ``measure_reception_thresholds``.
 
     Raises:
         ValueError: Data or settings are not valid, or no item has all its scores.

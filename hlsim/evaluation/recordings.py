@@ -274,11 +274,12 @@ def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
     numbers: dict[int, int] = {}
     for number, pair in enumerate(utterances.values()):
         if sorted(recording.ear for recording in pair) != sorted(EARS):
+            ears = ", ".join(recording.ear or "unknown" for recording in pair)
             raise ValueError(
                 "expected one left and one right ear of each utterance for the better ear, but "
-                f"{pair[0].both_ears_name} has the ears {', '.join(r.ear for r in pair)}; add the "
-                "missing rows, give different utterances different values in the column item, or "
-                "leave out better_ear (--better-ear)"
+                f"{pair[0].both_ears_name} has the ears {ears}; add the missing rows to the "
+                "manifest or the table of ears, give different utterances different values in the "
+                "column item, or leave out better_ear (--better-ear)"
             )
         _check_same_speech(*pair)
         numbers |= {id(recording): number for recording in pair}

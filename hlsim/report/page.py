@@ -281,8 +281,8 @@ def write_page(
     Returns: The path of ``report.html``.
 
     Raises:
-        ValueError: The files cannot be written, or the data hold NaN or infinity.
-        TypeError: The data hold an object that JSON cannot represent.
+        ValueError: The files cannot be written, or the data contain NaN or infinity.
+        TypeError: The data contain an object that JSON cannot represent.
         MissingExtraError: jinja2 is not installed, or for pictures matplotlib.
 
     >>> import tempfile

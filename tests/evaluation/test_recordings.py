@@ -261,11 +261,11 @@ def test_thresholds_between_the_eight_frequencies_are_in_the_key(corpus: Path) -
         ({"audiogram": N4, "audiograms": "standard"}, "got both; pass one"),
         ({"audiogram": N4, "conditions": {"A": "after"}}, "got both; name all folders"),
         ({"audiogram": N4, "before": None, "after": None}, "expected either a manifest"),
-        ({"audiogram": N4, "root": "."}, "root has no effect on folders"),
+        ({"audiogram": N4, "root": "."}, "--root. has no effect on folders"),
         ({"audiogram": N4, "full_scale_spl": 300.0}, "full_scale_spl"),
         ({"audiogram": N4, "measures": ["loudness"]}, "unknown measures: loudness"),
         ({"audiogram": N4, "baseline": "unaided"}, "no condition 'unaided'"),
-        ({"audiogram": N4, "better_ear": True}, "one left and one right ear"),
+        ({"audiogram": N4, "better_ear": True}, "one left and one right ear .* ears unknown; add"),
         ({"audiogram": N4, "manifest": "study.csv"}, "expected either a manifest, or"),
     ],
 )

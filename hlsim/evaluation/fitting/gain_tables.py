@@ -1,7 +1,7 @@
 """Export of the gains of an aid that is fitted to an ear, as files of other programs.
 
-Two formats hold gains for speech at many levels: a CSV table, and the gain table of openMHA's
-compressor ``dc``. CamillaDSP and Equalizer APO are linear: a file holds the gains for speech at one
+Two formats have gains for speech at many levels: a CSV table, and the gain table of openMHA's
+compressor ``dc``. CamillaDSP and Equalizer APO are linear: a file has the gains for speech at one
 level.
 """
 
@@ -57,7 +57,7 @@ class _Fitting(NamedTuple):
     Attributes:
         aid: Aid with the method ``gains``.
         ear: Audiogram of one ear.
-        level: Level of speech in dB SPL, for formats that hold the gains for one level.
+        level: Level of speech in dB SPL, for formats with the gains for one level.
         sample_rate: Sample rate in Hz of the other program.
     """
 
@@ -128,7 +128,7 @@ def export_gains(
                 f"{name} ({option}) has no effect on the format {program}; leave it out"
             )
     rate = TAPS_RATE if sample_rate is None else sample_rate
-    check_number("sample_rate", rate, RATE, 192000)
+    check_number("sample_rate", rate, RATE, 192000, whole=True)
     return PROGRAMS[program](_Fitting(aid, ear, 65.0 if level is None else level, rate))
 
 

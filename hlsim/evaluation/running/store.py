@@ -1,6 +1,6 @@
 """Scores on disk: each is appended when it is known, so that an interrupted run can be continued.
 
-The file holds one JSON object per line. Two runs can append to it at the same time, and people can
+The file has one JSON object per line. Two runs can append to it at the same time, and people can
 read it.
 """
 
