@@ -31,7 +31,10 @@ Audio = TypeVar("Audio", Tensor, NDArray[Any])
 """Type of a signal and of a result: both are tensors, or both are arrays."""
 
 STORE_BYTES = 2**28
-"""Largest size in bytes of the stored constants. For each severity, MSBG's take 2 to 4 MiB per second of signal."""
+"""Largest size in bytes of the stored constants.
+
+For each severity, MSBG's take 2 to 4 MiB per second of signal.
+"""
 
 _HOST = torch.device("cpu")
 
