@@ -8,6 +8,7 @@ import io
 import json
 import os
 import tempfile
+import unicodedata
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -302,7 +303,10 @@ def read_table(
 
 
 def check_spellings(rows: Iterable[tuple[str, Mapping[str, str]]], column: str) -> None:
-    """Raise ValueError if two names in a column differ only in case, and may mean the same.
+    """Raise ValueError if two names in a column look alike, and may mean the same.
+
+    They differ only in case, or are different codes of the same characters, such as an accent that
+    is part of a letter or follows it.
 
     Args:
         rows: Rows of a table, as ``read_table`` returns them. Those without the column are passed
@@ -314,11 +318,13 @@ def check_spellings(rows: Iterable[tuple[str, Mapping[str, str]]], column: str) 
     spellings: dict[str, str] = {}
     for place, row in rows:
         name = row.get(column, "")
-        spelling = spellings.setdefault(name.casefold(), name)
+        plain_name = unicodedata.normalize("NFKC", name).casefold()
+        spelling = spellings.setdefault(plain_name, name)
         if spelling != name:
             raise ValueError(
-                f"{place}: the {column} {name!r} differs from {spelling!r} only in case; write the "
-                "same name in all places, or give one of the two another name"
+                f"{place}: the {column} {name!a} differs from {spelling!a} only in case or in the "
+                "codes of equal characters; write the same name in all places, or give one of the "
+                "two another name"
             )
 
 

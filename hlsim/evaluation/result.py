@@ -112,7 +112,7 @@ class Evaluation:
 
         Raises:
             ValueError: No output could be scored, or an argument is not valid, see ``run_study``.
-            OSError: The store cannot be read or written.
+            OSError: The store cannot be read.
             MissingExtraError: A package is not installed.
         """
         table, measures = run_measures(items, conditions, measures, ScoreStore(store), **running)

@@ -303,9 +303,8 @@ def run_study(
 
     Raises:
         ValueError: There are no items, conditions or measures; two conditions or measures have the
-            same name; a fact or a measured value has the name of another column; or no scheduler
-            answers.
-        OSError: The store cannot be written.
+            same name; a fact or a measured value has the name of another column; no scheduler
+            answers; or the store cannot be written.
         MissingExtraError: A package is not installed.
 
     >>> signal = torch.ones(1600)
@@ -337,7 +336,7 @@ def run_measures(
         None, that of its copy lists all columns that the measure has returned.
 
     Raises:
-        ValueError, OSError, MissingExtraError: See ``run_study``.
+        ValueError, MissingExtraError: See ``run_study``.
 
     >>> speech = 0.02 * torch.ones(16000)
     >>> item = Item("item 0", speech, speech, Audiogram.standard("N3"))

@@ -35,7 +35,7 @@ from hlsim.checks import (
 from hlsim.losses.criteria import Comparison, CriterionLike, read_criterion, weighted_sum
 from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceKind, ReferenceName
 from hlsim.losses.gradient_limit import limit_gradient_spikes
-from hlsim.torchtools import flatten_items, not_compiled, silence_after
+from hlsim.torchtools import broadcast_shape, flatten_items, not_compiled, silence_after
 
 _Reduction = Literal["mean", "none"]
 
@@ -217,8 +217,9 @@ class HearingLossLoss(nn.Module):
             output: Output of an aid.
             clean: Clean speech.
             audiogram: One ear, (8,), or (..., 8) that broadcasts over the leading dimensions; by
-                default the ears of the constructor. With (batch, 1, time), (batch, 8) is accepted,
-                too. A ``Listener`` goes with (..., 2, time), left first.
+                default the ears of the constructor. One signal may have several ears, but several
+                signals are not combined with several ears. With (batch, 1, time), (batch, 8) is
+                accepted, too. A ``Listener`` goes with (..., 2, time), left first.
             lengths: Number of samples of each item of a padded batch, (...). Samples after the end
                 of an item are ignored, so that its value is the one that it has alone (within 1e-4
                 for the exact MSBG, which simulates the padded batch at once).
@@ -336,6 +337,13 @@ class HearingLossLoss(nn.Module):
             )
         stored = self._unregistered.thresholds
         ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)
+        batch = broadcast_shape(clean.shape[:-1], ears.shape[:-1])
+        if batch.numel() > max(clean[..., 0].numel(), ears[..., 0].numel()):
+            raise ValueError(
+                f"expected one ear for all items or one per item, {(*clean.shape[:-1], 8)}, got "
+                f"{tuple(ears.shape)}, which would combine every item with every ear; reshape "
+                "audiogram"
+            )
         pairs_ears = any(entry.two_ears for entry in self.criteria.values())
         pairs_ears = pairs_ears or self.ears == "better"
         if pairs_ears:

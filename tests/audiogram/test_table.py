@@ -129,6 +129,7 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
         ("frequency,threshold\n500,20\n.5k,30\n", ["line 2", "same frequency"]),
         ("frequency,threshold\n1,20\n2,30\n", ["line 2", "1 Hz"]),
         ("frequency,threshold,500 Hz\n1000,20,30\n", ["column threshold", "500 Hz", "remove"]),
+        ("listener,ear,500 Hz\n\u00e9,L,20\ne\u0301,R,30\n", ["line 3", "u0301", "codes of equal"]),
         ("listener,ear,500 Hz\nL1,left,20\nl1,right,30\n", ["line 3", "L1", "l1", "only in case"]),
         ("listener,ear,500 Hz\nA,both,20\n", ["line 2", "left or right", "'both'"]),
         ("frequency,threshold,threshold 2\n500,20,30\n", ["line 2", "'threshold 2'"]),

@@ -1,5 +1,6 @@
 """The hearing aid's sliders, loudness, gains and gradients."""
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,14 @@ def test_loudness_is_loaded_and_out_of_range_or_without_effect_an_error() -> Non
             load_compensator(name, loudness=-5.0)
 
 
-def test_a_loudness_that_is_not_saved_causes_a_warning(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="loudness of -10 dB is not saved"):
-        save_compensator(load_compensator("hearing-aid", loudness=-10.0), tmp_path)
+@pytest.mark.parametrize("name", ["hearing-aid", "hearing-aid-directional"])
+def test_settings_that_are_not_saved_cause_a_warning(tmp_path: Path, name: str) -> None:
+    aid = load_compensator(
+        name, sample_rate=48000, full_scale_spl=100.0, limit_to_ear=True, loudness=-10.0
+    )
+    text = "sample_rate=48000, full_scale_spl=100.0, loudness=-10.0, limit_to_ear=True; pass"
+    with pytest.warns(UserWarning, match=f"does not store {text}"):
+        save_compensator(aid, tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save_compensator(load_compensator(name), tmp_path)

@@ -43,3 +43,9 @@ def test_each_line_of_the_file_is_a_score(tmp_path: Path) -> None:
     lines = path.read_text().split("\n")
     assert lines.pop() == ""
     assert [json.loads(line)["key"] for line in lines] == ["a", "b"]
+
+
+def test_a_score_that_cannot_be_written_names_the_file(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"scores\.jsonl: a score cannot be written: .*run again"):
+        ScoreStore(tmp_path / "file" / "scores.jsonl").append("a", {"score": 0.25})

@@ -578,6 +578,8 @@ BAD_CALLS: list[tuple[Any, ...]] = [
     (SIGNAL.long(), SIGNAL, N3),
     (SIGNAL[:, :0], SIGNAL[:, :0], N3),
     (SIGNAL, SIGNAL, [N3, N3, N3]),
+    (SIGNAL, SIGNAL, torch.full((2, 1, 8), 40.0)),  # every item with every ear
+    (SIGNAL[:, None], SIGNAL[:, None], [N3, N3, N3]),
     (SIGNAL, SIGNAL, N7),
     (SIGNAL, SIGNAL, N3, [1601, 1600]),
 ]
