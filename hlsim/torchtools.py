@@ -152,7 +152,7 @@ def map_on_cores(
     threads = torch.get_num_threads()
     workers = min(threads, len(arguments))
     is_differentiable = signal.requires_grad and torch.is_grad_enabled()
-    if workers == 1 or signal.device.type != "cpu" or is_differentiable:
+    if workers <= 1 or signal.device.type != "cpu" or is_differentiable:
         return [function(argument) for argument in arguments]
     inference = torch.is_inference_mode_enabled()
 
@@ -487,6 +487,7 @@ def _find_copy(tensor: Tensor, device: torch.device) -> Tensor | None:
 
 
 def _add_copy(tensor: Tensor, copy: Tensor) -> None:
+    """Remember a copy of a tensor on another device, unless the copy could become outdated."""
     if _can_be_remembered(tensor):
         _COPIES.setdefault(tensor, {})[copy.device] = tensor._version, copy
 
@@ -512,6 +513,7 @@ class _Store:
         self._lock = Lock()
 
     def get_or_compute(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Return the stored result of a function for some arguments, or compute and store it."""
         key = function, arguments, tuple(options.items())
         with self._lock:
             if key in self._results:

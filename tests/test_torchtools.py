@@ -85,3 +85,7 @@ def test_constants_of_inference_mode_or_a_transform_serve_gradients_later(
     assert torch.equal(grad(grad(energy))(gain), second)
     leaf = gain.clone().requires_grad_()
     torch.testing.assert_close(grad(energy)(gain), torch.autograd.grad(energy(leaf), leaf)[0])
+
+
+def test_no_arguments_have_no_results() -> None:
+    assert torchtools.map_on_cores(abs, [], torch.zeros(1)) == []

@@ -6,8 +6,8 @@ The score is that of pyclarity 0.9.0, with a gradient. Please note:
 - White noise in place of the output should score 0. It does to within 0.05 on utterances
   of 3 s and more, but scores up to 0.3 on 1.2 s, 0.45 on 0.7 s and 0.99 on 0.2 s. Signals shorter
   than 0.7 s are rejected.
-- If clean speech is below the threshold of hearing, every output has the same score. Clean speech
-  below 20 dB SPL is rejected. A constant offset does not count as level.
+- Clean speech below 20 dB SPL, or that a normal ear does not hear, is rejected, because every
+  output would have the same score. A constant offset does not count as level.
 - The ear spans 80 to 8000 Hz. Between 16 and 48 kHz, scores differ by up to 0.008. Compare scores
   of one rate.
 - Signals and channels are aligned by whole samples. One sample in one channel changes a score by up

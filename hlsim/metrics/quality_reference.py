@@ -264,6 +264,15 @@ class QualityReference(Reference):
         noises: tuple[Tensor | None, Tensor | None],
         extent: Extent,
     ) -> _Comparison:
+        """Compute the features of outputs in some channels, beside those of the clean signals.
+
+        Args:
+            clean: Features of the clean signals in these channels.
+            output: Aligned outputs behind the middle ear. Shape: (items, padded).
+            cells: Hair cells of all channels.
+            noises: Noise of clean signals and outputs, from ``_threshold_noise``.
+            extent: Number of samples of each item before padding.
+        """
         channels, inner = clean.channels, cells[..., clean.channels].inner
         cochlea = ear_model.simulate_cochlea(output, cells, channels, extent, motion=True)
         power, motion = cochlea.power, cochlea.motion
@@ -409,6 +418,7 @@ def _threshold_noise(
 
 @constant
 def _frozen_table() -> NDArray[np.float64]:
+    """Return noise with a standard deviation of 1, (FROZEN_SAMPLES,), the same every time."""
     return np.random.RandomState(0).standard_normal(FROZEN_SAMPLES)
 
 

@@ -91,10 +91,12 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
 
 @constant
 def _step_response(points: int) -> NDArray[np.complex128]:
+    """Return the response of the difference to the next sample, (points // 2 + 1,)."""
     return np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
 
 
 def _lag_points(extent: Extent) -> int:
+    """Return a length of the Fourier transform with which no considered lag wraps around."""
     return fft_length(extent.longest + MAX_LAG, 2)
 
 

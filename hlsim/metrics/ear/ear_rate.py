@@ -134,6 +134,7 @@ def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
 
 @constant
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
+    """Return the response of the low-pass at 10.5 kHz, (points // 2 + 1,), at a rate in Hz."""
     lowpass = digital_filter(chebyshev2(7, 30.0), 10500.0, rate)
     return frequency_response(lowpass, 2.0 * np.pi * np.arange(points // 2 + 1) / points)
 

@@ -316,6 +316,7 @@ def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor
 
 @constant
 def _synchrony_weights() -> NDArray[np.float64]:
+    """Return the weight of each channel by the synchrony of its nerve fibres, 0 to 1, (32,)."""
     ratio = (centre_frequencies() / SYNCHRONY_HZ) ** (2 * SYNCHRONY_ORDER)
     return 1.0 / np.sqrt(1.0 + ratio)
 

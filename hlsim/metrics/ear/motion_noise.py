@@ -28,7 +28,7 @@ class MotionNoise(NamedTuple):
 
 @compute_once  # the conditions, the ears and the scores of an item have the same noise
 def draw_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> MotionNoise:
-    """Draw the noise of one item, which takes a third of the time of HASQI.
+    """Draw the noise of one item, which takes a sixth of the time of a HASQI with this noise.
 
     Args:
         seed: Seed of the generator.
