@@ -1,4 +1,4 @@
-"""A small network that corrects the prior's gains, at a fraction of the paper's network's cost.
+"""A small network that corrects the prior's gains, at a lower cost than the paper's networks.
 
 The prior (``hlsim.neuro.prior``) estimates the gain in each channel of MSBG's filter bank by MSBG's
 formulae. The network works on channels, and on *steps* of a few frames of the spectrogram.

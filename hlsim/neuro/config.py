@@ -158,10 +158,10 @@ class NeuroConfig(NetworkConfig):
 
     Attributes:
         structure: ``bands``, ``dual-path`` or ``monolithic``. ``bands`` is a network along time
-            that corrects the gains in MSBG's frequency channels (``hlsim.neuro.bands``), at a third
-            of the cost of the paper's ``dual-path`` networks. The ``monolithic`` baselines of the
-            paper have a linear encoder and no frequency axis: each frame is a vector of
-            ``channels`` values, and the blocks run along time only.
+            that corrects the gains in MSBG's frequency channels (``hlsim.neuro.bands``), at a lower
+            cost than the paper's ``dual-path`` networks. The ``monolithic`` baselines of the paper
+            have a linear encoder and no frequency axis: each frame is a vector of ``channels``
+            values, and the blocks run along time only.
         audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation
             1), or ``concatenated`` for eight thresholds next to magnitude and phase along frequency
             (its Table IV).
