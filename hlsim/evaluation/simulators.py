@@ -23,7 +23,7 @@ from hlsim.evaluation.measures import load_measure
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.evaluation.running.fingerprint import fingerprint
 from hlsim.evaluation.running.parallel import check_scheduler
-from hlsim.evaluation.sounds import try_conditions
+from hlsim.evaluation.sounds import try_sounds
 from hlsim.evaluation.study import Condition, Item, Measure, Values
 from hlsim.extras import is_installed, require
 from hlsim.metrics import fidelity
@@ -211,7 +211,7 @@ def _example_sounds(evaluation: Evaluation) -> ItemSounds:
     rows = next(iter(evaluation.groups.values())).table.dropna(subset="snr")
     item = evaluation.items[rows["item"][rows["input_level"].idxmax()]].load()
     expected = _teacher_output(load_simulator(evaluation.settings["teacher"]), item)
-    outputs, failures = try_conditions(evaluation.conditions, lambda c: c.output(item))
+    outputs, failures = try_sounds({c.name: partial(c.output, item) for c in evaluation.conditions})
     signals = {"input": item.signal, "teacher": expected, **outputs}
     # A short clip is filled up with silence.
     end = int(item.signal.nonzero().max()) + item.sample_rate // 10

@@ -1,11 +1,13 @@
 """Sounds of a study for the players of a page: outputs of conditions, as an ear perceives them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hlsim.audiogram import Audiogram
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_finite
 from hlsim.evaluation.measures import NORMAL, perceive
@@ -84,7 +86,7 @@ def perceive_items(
 def _perceive(
     item: Item, conditions: Sequence[Condition]
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return the perceived signals of an item by label, and the reasons of failures by condition.
+    """Return the perceived signals of an item, and the reasons of failures, by label.
 
     Args:
         item: The item.
@@ -95,39 +97,38 @@ def _perceive(
         are missing.
     """
     gain, end = gain_to_pascals(item.full_scale_spl), int(_LONGEST_SECONDS * item.sample_rate)
-    clean = item.clean[:end].float() * gain
-    signals = {NORMAL_EAR: perceive(clean, NORMAL, item.sample_rate)}
 
-    def process(condition: Condition) -> Tensor:
-        output = condition.output(item)[:end].float() * gain
-        return perceive(output, item.ear, item.sample_rate)
+    def perceive_part(signal: Tensor, ear: Audiogram) -> Tensor:
+        return perceive(signal[:end].float() * gain, ear, item.sample_rate)
 
-    outputs, failures = try_conditions(conditions, process)
-    return signals | outputs, failures
+    def perceive_output(condition: Condition) -> Tensor:
+        return perceive_part(condition.output(item), item.ear)
+
+    functions = {NORMAL_EAR: partial(perceive_part, item.clean, NORMAL)}
+    return try_sounds(functions | {c.name: partial(perceive_output, c) for c in conditions})
 
 
-def try_conditions(
-    conditions: Sequence[Condition], process: Callable[[Condition], Tensor]
+def try_sounds(
+    functions: Mapping[str, Callable[[], Tensor]],
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Compute a sound under each condition, without gradients; an error does not end the others.
+    """Compute several sounds, without gradients; an error in one does not end the others.
 
     Args:
-        conditions: The conditions.
-        process: Function that returns the sound of a condition. Shape: (time,).
+        functions: Function that returns a sound, (time,), by the label of the sound.
 
     Returns:
-        By the name of the condition, the sounds, and for conditions without one the reason.
+        The sounds by label, and for labels without a sound the reason.
 
-    >>> try_conditions([Condition("a")], lambda condition: torch.ones(2))[0]
+    >>> try_sounds({"a": lambda: torch.ones(2)})[0]
     {'a': tensor([1., 1.])}
     """
     signals, failures = {}, {}
-    for condition in conditions:
+    for label, compute in functions.items():
         try:
             with torch.no_grad():
-                signal = process(condition)
+                signal = compute()
             check_finite(signal, "the sound")
-            signals[condition.name] = signal
+            signals[label] = signal
         except Exception as error:  # The study has scored the item: one sound may be missing.
-            failures[condition.name] = describe_error(error)
+            failures[label] = describe_error(error)
     return signals, failures

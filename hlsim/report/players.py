@@ -59,6 +59,7 @@ def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> S
     """Return the section with the player of an item, and facts about its ear.
 
     The heading has the name of the item, and the change of its score and its rank, if it has one.
+    If all sounds are silent or have failed, there is no player.
 
     Args:
         headline: Comparison by which items are ranked, or None.
@@ -76,6 +77,8 @@ def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> S
         f"{ear.severity}. Thresholds: {thresholds} dB HL."
     ]
     texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
+    if not any(signal.any() for group in sounds.groups.values() for signal in group.values()):
+        return Section(title, [*texts, "There is no sound to play."])
     return Section(title, texts, player=make_player(sounds.groups, sounds.sample_rate))
 
 

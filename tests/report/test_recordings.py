@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import soundfile
 import torch
 
 from hlsim.audio import write_audio
@@ -97,6 +98,21 @@ def test_sounds_of_a_condition_that_fails_are_named(tmp_path: Path) -> None:
     (player,) = page.sections[1].sections
     assert [sound.label for sound in player.player.sounds] == ["normal ear (the goal)"]
     assert "unaided cannot be played: " in player.paragraphs[1]
+
+
+# MSBG accepts no rate above 48 kHz, and only the first 8 s are played.
+@pytest.mark.parametrize(("rate", "silence"), [(96000, 0), (16000, 9 * 16000)])
+def test_a_page_has_no_player_if_there_is_no_sound_to_play(
+    tmp_path: Path, rate: int, silence: int
+) -> None:
+    study = evaluation(tmp_path)
+    noise = torch.nn.functional.pad(0.02 * torch.randn(16000), (silence, 0))
+    soundfile.write(tmp_path / "noise.wav", noise.numpy(), rate)
+    page = report_page(replace(study, sounds=perceive_items(study, 1)))
+    (section,) = page.sections[1].sections
+    assert section.player is None
+    assert section.paragraphs[-1] == "There is no sound to play."
+    assert "no sound to play" in page.html()
 
 
 def test_conditions_without_a_common_item_are_named(tmp_path: Path) -> None:
