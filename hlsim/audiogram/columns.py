@@ -71,8 +71,9 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     audiometry, such as ``aided 250``, ``bone 250`` and ``masked left 250``, and those of
     extrapolated levels at such a frequency, are left out with a warning that names them. With
     ``Hz``, as in ``masked 250 Hz``, they are remarks, and numbers in them are an error (except for
-    levels of bone conduction and extrapolated levels, which are left out). Columns that do not look
-    like thresholds are left out without a warning.
+    levels of bone conduction and extrapolated levels, which are left out). The same warning names
+    columns of uncomfortable levels without a frequency. Columns that do not look like thresholds
+    are left out without a warning.
 
     Args:
         columns: Names of all columns.
@@ -95,7 +96,9 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
         name = " ".join(column.lower().split())
         meaning = _read_name(column, name)
         if meaning is None:
-            if any(_read_hz(*match) in _USUAL_HZ for match in _FREQUENCY.findall(name)):
+            has_hz = any(_read_hz(*match) in _USUAL_HZ for match in _FREQUENCY.findall(name))
+            is_ucl = not UCL_WORDS.isdisjoint(re.findall("[a-z]+", name))
+            if has_hz or is_ucl:
                 other_columns.append(column)
             continue
         meanings[column] = meaning
@@ -116,10 +119,10 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
             )
     if other_columns:
         warnings.warn(
-            f"not read as thresholds, because of other words in the names of the columns: "
-            f"{', '.join(map(repr, other_columns))}; if they hold thresholds of air conduction, "
-            "rename them, for example to hl_500, L500 or R500; if they hold uncomfortable levels, "
-            "to ucl_500",
+            "not read as thresholds, because of other words in the names of the columns, or no "
+            f"frequency: {', '.join(map(repr, other_columns))}; if they hold thresholds of air "
+            "conduction, rename them, for example to hl_500, L500 or R500; if they hold "
+            "uncomfortable levels, to ucl_500",
             stacklevel=2,
         )
     return meanings

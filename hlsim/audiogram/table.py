@@ -229,15 +229,16 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
                 "one of them"
             )
     is_long = {"frequency", "threshold"} <= columns.keys()
-    wide_columns = convert_at(rows[0][0], threshold_columns, rows[0][1]) if is_long else {}
+    if not is_long:
+        return rows
+    ucl = [name for words, name in columns.items() if not UCL_WORDS.isdisjoint(words.split())]
+    others = [column for column in rows[0][1] if column not in ucl]
+    wide_columns = convert_at(rows[0][0], threshold_columns, others)
     if wide_columns:
         raise ValueError(
             f"{rows[0][0]}: expected thresholds in the column {columns['threshold']} alone, got "
             f"some in {', '.join(wide_columns)} as well; remove one of both"
         )
-    if not is_long:
-        return rows
-    ucl = [name for words, name in columns.items() if not UCL_WORDS.isdisjoint(words.split())]
     return _widen(rows, columns["frequency"], columns["threshold"], ucl)
 
 

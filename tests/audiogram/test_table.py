@@ -58,7 +58,7 @@ def test_columns_are_found_whatever_their_order_case_and_delimiter(
 
 OTHER_COLUMNS = ["aided 2000", "unaided_500", "bone 1000", "masked left 500", "L aided 1k"]
 OTHER_COLUMNS += ["visit2_500", "R2_1000", "L1 500", "MCL 500", "AUXU500R", "pta_500_1000_2000"]
-OTHER_COLUMNS += ["bc_500", "hl_8000_extrapolated_flat", "ulc_500"]
+OTHER_COLUMNS += ["bc_500", "hl_8000_extrapolated_flat", "ulc_500", "UCL", "ldl left"]
 
 
 @pytest.mark.parametrize("column", OTHER_COLUMNS)
