@@ -206,9 +206,10 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float]:
 def _example_sounds(evaluation: Evaluation) -> ItemSounds:
     """Return the sounds of one item: its input, and the outputs of the teacher and all simulators.
 
-    It is the item with the highest level among those of the first treatment.
+    It is the item with the highest level among those of the first treatment with an SNR.
     """
-    rows = next(iter(evaluation.groups.values())).table.dropna(subset="snr")
+    scored = (group.table.dropna(subset="snr") for group in evaluation.groups.values())
+    rows = next(rows for rows in scored if not rows.empty)
     item = evaluation.items[rows["item"][rows["input_level"].idxmax()]].load()
     expected = _teacher_output(load_simulator(evaluation.settings["teacher"]), item)
     outputs, failures = try_sounds({c.name: partial(c.output, item) for c in evaluation.conditions})

@@ -106,20 +106,21 @@ def _teacher(evaluation: Evaluation) -> str:
 
 
 def _verdict(evaluation: Evaluation) -> str:
-    """Return a sentence about the SNRs of the simulators for the first treatment, in dB.
+    """Return a sentence about the SNRs, in dB, of the simulators for the first treatment with any.
 
     It names the simulator with the highest median first, with its worst tenth, and then the medians
     of the others.
     """
-    first = next(iter(evaluation.groups.values()))
-    snr = first.wide("snr").dropna(axis=1, how="all")
+    tables = {name: group.wide("snr") for name, group in evaluation.groups.items()}
+    treatment = next(name for name, table in tables.items() if table.notna().any(axis=None))
+    snr = tables[treatment].dropna(axis=1, how="all")
     medians = snr.median().sort_values(ascending=False)
     best = snr[medians.index[0]].dropna()
     other_medians = ", ".join(
         f"{name} {median:.1f} dB" for name, median in medians.iloc[1:].items()
     )
     return (
-        f"{_TREATMENTS[evaluation.settings['inputs'][0]]}: {best.name} has a median SNR of "
+        f"{_TREATMENTS[treatment]}: {best.name} has a median SNR of "
         f"{best.median():.1f} dB (worst tenth {best.quantile(0.1):.1f} dB, {len(best)} items) "
         f"against {_teacher(evaluation)}{other_medians and f'; the others: {other_medians}'}."
     )

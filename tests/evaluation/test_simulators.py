@@ -77,6 +77,25 @@ def test_values_failures_and_page(options: dict[str, Any]) -> None:
     assert "Failures" in page.markdown() and "NaN" in page.markdown()
 
 
+class Soft(nn.Module):
+    """Simulator that rejects loud signals."""
+
+    def forward(self, waveform: Tensor, ear: Any) -> Tensor:
+        if float(waveform.abs().max()) > 3.0:
+            raise ValueError("too loud")
+        return waveform
+
+
+def test_a_treatment_without_any_value_does_not_prevent_the_page(options: dict[str, Any]) -> None:
+    settings = {**options, "items": 1, "levels": [80.0], "inputs": ("louder", "as-is")}
+    study = evaluate_simulators({"soft": Soft()}, **settings, listen=1)
+    assert study.groups["louder"].table["snr"].isna().all()
+    assert ": as-is, " in study.sounds[0].name
+    page = simulators_page(study)
+    assert page.verdict.startswith("Speech as it is: soft has a median SNR")
+    assert page.markdown().count("too loud") == 1
+
+
 TEACHERS = """
 def same(waveform, audiogram):
     return waveform
