@@ -232,8 +232,8 @@ def _read_rows(table: str | Path | Any) -> list[_Row]:
     if not is_long:
         return rows
     ucl = [name for words, name in columns.items() if not UCL_WORDS.isdisjoint(words.split())]
-    others = [column for column in rows[0][1] if column not in ucl]
-    wide_columns = convert_at(rows[0][0], threshold_columns, others)
+    names = [column for column in rows[0][1] if column not in ucl]
+    wide_columns = convert_at(rows[0][0], threshold_columns, names)
     if wide_columns:
         raise ValueError(
             f"{rows[0][0]}: expected thresholds in the column {columns['threshold']} alone, got "
