@@ -141,10 +141,12 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
 
     Returns:
         For each ear its audiogram, or ``None`` if it was measured at the eight frequencies. The
-        list is empty if all ears were.
+        list is empty if all ears were, for a tensor of thresholds, and for None. The two ears of a
+        listener follow one another.
 
     Raises:
-        ValueError: A level of such an ear is above 100 dB HL, or a listener lacks an ear.
+        ValueError: An ear is not valid, a level of one that is returned is above 100 dB HL, or a
+            listener lacks an ear.
 
     >>> ears_on_other_grids(["N3", {500: 20}])
     [None, Audiogram({500: 20})]

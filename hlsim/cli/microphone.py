@@ -69,12 +69,15 @@ class Live:
     def __call__(self, recorded: Any, played: Any, frames: int, clock: Any, status: Any) -> None:
         """Process a block; sounddevice calls this method with its arguments.
 
+        If the stream raises an exception, the block is silent, and ``error`` has the message.
+
         Args:
-            recorded: Input from the microphones, an array (frames, microphones).
+            recorded: Input from the microphones, an array (frames, microphones). For one ear, the
+                first microphone is used.
             played: Array (frames, channels) into which the output is written, limited to -1 to 1.
-            frames: Number of samples per channel.
+            frames: Number of samples per channel, which is not used.
             clock: Times of the block, which are not used.
-            status: Flags of lost samples.
+            status: Flags of lost samples. A block with a flag is counted in ``drop_outs``.
         """
         underflow = status.input_underflow or status.output_underflow
         overflow = status.input_overflow or status.output_overflow

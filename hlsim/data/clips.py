@@ -235,10 +235,11 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
 
 
 def _read_noise(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
-    """Return noisy minus clean speech, (channels, samples), with the arguments of ``read_noisy``.
+    """Return noisy minus clean speech, (channels, samples), from the arguments of ``read_noisy``.
 
     Raises:
-        ValueError: The noisy speech cannot be read, or does not contain the clean speech.
+        ValueError: The noisy speech cannot be read, has another rate, length or number of channels,
+            or does not contain the clean speech: their difference is mostly inverted speech.
     """
     noise = read_noisy(path, clean, clean_rate) - clean
     scale = float(noise.norm() * clean.norm())

@@ -320,9 +320,12 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
         pattern: Regular expression for paths, with named groups as in ``_LAYOUTS``.
         layout: Name of the layout, for messages.
 
+    Returns:
+        One utterance per clean file. Files of noise are left out.
+
     Raises:
-        ValueError: A file does not match the pattern, a clean or noisy file lacks its counterpart,
-            or two folders are for the same split, or two files have the same place in a pair.
+        ValueError: A file does not match the pattern, two folders are for the same split, two files
+            have the same place in a pair, or, in a layout with pairs, a file lacks its counterpart.
     """
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}

@@ -45,7 +45,8 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
 class _RFFT(torch.autograd.Function):
     """Real Fourier transform with a hand-written backward pass, which is also a real transform.
 
-    Autograd's backward pass of ``torch.fft.rfft`` is a complex transform of twice the length.
+    Autograd's backward pass of ``torch.fft.rfft`` is a complex transform, which takes about twice as
+    long as a real one.
     """
 
     @staticmethod
@@ -74,7 +75,8 @@ class _RFFT(torch.autograd.Function):
 def fft_length(minimum: int, multiple: int = 1) -> int:
     """Return the smallest length from ``minimum`` on for which Fourier transforms are fast.
 
-    The length has no prime factors above 7, apart from those of ``multiple``.
+    Apart from the factors of ``multiple``, the length is a product of factors 2, 3, 5 and at most
+    one 7. Factors 2 are added only up to the power ``MAX_POWER_OF_TWO``.
 
     Args:
         minimum: Smallest length allowed.

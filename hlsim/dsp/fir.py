@@ -71,11 +71,12 @@ def lowpass_fir(taps: int, cutoff: float, kaiser_beta: float) -> NDArray[np.floa
 
     Args:
         taps: Number of coefficients. The filter delays by (taps - 1) / 2 samples.
-        cutoff: Frequency at which the gain is one half, where 1 is the Nyquist frequency.
-        kaiser_beta: Parameter of the window. The gain at 0 Hz is 1.
+        cutoff: Frequency at which the gain of a long filter is about one half, where 1 is the
+            Nyquist frequency.
+        kaiser_beta: Parameter of the window.
 
     Returns:
-        Coefficients of the filter, (taps,).
+        Coefficients of the filter, (taps,). The gain at 0 Hz is 1.
 
     >>> lowpass_fir(3, cutoff=0.5, kaiser_beta=0.0).round(2)
     array([0.28, 0.44, 0.28])

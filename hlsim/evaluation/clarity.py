@@ -404,6 +404,9 @@ def _measure_look_ahead(
     """Measure the look-ahead of a condition in ms, on the first 4 s of a scene.
 
     It is None for existing outputs, and for an aid whose call raises ValueError.
+
+    Raises:
+        ValueError: A file of the scene is broken, or has another rate or length.
     """
     if condition.process is None:
         return None

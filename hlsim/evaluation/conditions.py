@@ -98,7 +98,10 @@ class PrescriptionForEar(nn.Module):
         return is_profound(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Return the waveform amplified by the prescription for the ear, (time,) -> (time,)."""
+        """Amplify a waveform at 16 kHz by the prescription for an ear.
+
+        Shape: (time,) in pascals -> (time,).
+        """
         aid = self.profound if is_profound(audiogram) else self.usual
         return aid(waveform, audiogram)
 

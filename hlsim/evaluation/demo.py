@@ -170,8 +170,8 @@ def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
 def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) -> ItemSounds:
     """Return the sounds of the last utterance for the page.
 
-    The first group has what ears perceive under each condition, the second one the outputs of the
-    aids.
+    The first group has what a normal ear perceives of clean speech and what the impaired ear
+    perceives under each condition; the second one has clean speech and the outputs of the aids.
     """
     item = items[-1]
     aided = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}

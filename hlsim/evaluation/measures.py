@@ -301,7 +301,11 @@ def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
         ear: Audiogram of the ear.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
-    Returns: The perceived signals in pascals. Shape: (..., time).
+    Returns:
+        The perceived signals in pascals. Shape: (..., time).
+
+    Raises:
+        ValueError: A threshold is above 100 dB HL, or a signal or the rate is not valid.
 
     >>> perceive(torch.ones(1600), Audiogram.standard("N3"), 16000).shape
     torch.Size([1600])

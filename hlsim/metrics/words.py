@@ -42,9 +42,9 @@ INTERVAL = 0.9
 class Curve(NamedTuple):
     """Parameters of the model that predicts the share of words that a listener understands.
 
-    The logit of the share is linear in HASPI: an intercept, and two slopes, one over the sentences
-    of an aid and one over the means of aids. Intercepts and slopes differ between listeners, and
-    intercepts between aids.
+    The logit of the share is linear in HASPI: an intercept, and two slopes, one over the HASPI of a
+    sentence minus the mean of its aid, and one over this mean minus 0.5. Each listener adds an
+    intercept and a slope over HASPI minus 0.5, and each aid an intercept.
 
     Attributes:
         coefficients: Intercept of the logit at a HASPI of 0.5, slope over the sentences of an aid,

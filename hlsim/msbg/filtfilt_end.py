@@ -95,10 +95,12 @@ def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
 
 @lru_cache(maxsize=4)
 def _oscillations(bank: FilterBank) -> tuple[Array, Array]:
-    """Compute the results of ``_oscillation`` for the low-passes of all channels.
+    """Compute the two free oscillations of each channel's low-pass, see ``_oscillation``.
 
     Returns:
-        Weights, (channels, 2, 4096), and oscillations, (channels, 72 + 4096, 2).
+        Weights of the last 4096 samples of a signal in the amplitudes of the oscillations, the last
+        sample last, (channels, 2, 4096), and the oscillations, backwards in time from 72 samples
+        after the end, (channels, 72 + 4096, 2).
     """
     results = [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
     weights, oscillations = zip(*results, strict=True)

@@ -54,7 +54,8 @@ class DualPathBlock(nn.Sequential):
 
     Args:
         config: Kind and sizes of the layers.
-        time_alone: Leave out the layers along frequency, as in the paper's monolithic baselines.
+        time_alone: Leave out the layers along frequency, as the structure ``"monolithic"`` does, in
+            which a frame is one vector without a frequency axis.
 
     >>> from hlsim.neuro.config import NeuroConfig
     >>> import torch

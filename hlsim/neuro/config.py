@@ -26,7 +26,7 @@ class ModelConfig:
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the settings to a dict of JSON values."""
+        """Convert the settings to a dict that ``json.dumps`` accepts."""
         return asdict(self)
 
     @classmethod

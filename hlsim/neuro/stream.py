@@ -67,7 +67,7 @@ class SimulatedStream:
 
         Raises:
             ValueError: The number of samples is no multiple of ``block``, the chunk is no waveform,
-                its shape is not that of the first chunk, or an ear is not valid.
+                it has another number of signals than the first chunk, or an ear is not valid.
         """
         signals = as_samples(chunk)
         check_waveform(signals, "chunk")

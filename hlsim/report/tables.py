@@ -191,7 +191,7 @@ def fact_tables(table: DataFrame, columns: Columns, captions: Mapping[str, str])
 
 
 def format_number(value: Any, form: str) -> str:
-    """Format a number; return a text as it is, and "n/a" for None and NaN.
+    """Format a number; return a text as it is, and "n/a" for None and for NaN.
 
     Args:
         value: Number, text or None.
@@ -200,7 +200,9 @@ def format_number(value: Any, form: str) -> str:
     >>> format_number(0.25, ".0%"), format_number(None, ".1f")
     ('25%', 'n/a')
     """
-    if value is None or (not isinstance(value, str) and math.isnan(value)):
+    if isinstance(value, str):
+        return value
+    if value is None or math.isnan(value):
         return "n/a"
     return f"{value:{form}}"
 

@@ -59,8 +59,8 @@ def run_parallel(
     """Call a function for each task, and yield the tasks with their results, in the same order.
 
     If a process crashes, the next tasks are repeated one by one in another process, so that only
-    the result of the task that crashes is a ``Crash``. Warnings of the function are repeated in
-    this process, where callers can record them.
+    the result of the task that crashes is a ``Crash``. Warnings of the function for users
+    (``UserWarning``) are repeated in this process, where callers can record them.
 
     Args:
         function: Function of a task, which can be pickled. An exception that it raises ends the
@@ -68,7 +68,7 @@ def run_parallel(
         tasks: Arguments of the function.
         jobs: Number of processes; by default one per core. With 1, and for a single task, tasks run
             in this process, which a crash ends, unless ``in_processes`` is true.
-        dask: Address of a Dask scheduler, whose workers replace the processes. The workers must be
+        dask: Address of a Dask scheduler, whose workers run all tasks instead of the processes. The workers must be
             able to import hlsim and to read the same files.
         in_processes: Whether tasks run in another process even if ``jobs`` is 1.
 
