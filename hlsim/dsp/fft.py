@@ -45,8 +45,8 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
 class _RFFT(torch.autograd.Function):
     """Real Fourier transform with a hand-written backward pass, which is also a real transform.
 
-    Autograd's backward pass of ``torch.fft.rfft`` is a complex transform, which takes about twice as
-    long as a real one.
+    Autograd's backward pass of ``torch.fft.rfft`` is a complex transform, which takes about twice
+    as long as a real one.
     """
 
     @staticmethod
