@@ -328,7 +328,7 @@ def measure_reception_thresholds(
 
 
 def _measure_reception_threshold(aid: Aid, ear: Audiogram, test: DigitTest) -> dict[str, Estimate]:
-    """Measure the speech reception threshold of an ear with an aid, a dict with ``threshold_db``."""
+    """Measure the speech reception threshold of an ear with an aid: a dict, ``threshold_db``."""
     thresholds = torch.tensor(ear.thresholds)
     return {
         "threshold_db": test.measure(thresholds, lambda inputs, _: _aid_outputs(aid, inputs, ear))

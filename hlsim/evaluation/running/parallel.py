@@ -68,7 +68,7 @@ def run_parallel(
         tasks: Arguments of the function.
         jobs: Number of processes; by default one per core. With 1, and for a single task, tasks run
             in this process, which a crash ends, unless ``in_processes`` is true.
-        dask: Address of a Dask scheduler, whose workers run all tasks instead of the processes. They
+        dask: Address of a Dask scheduler, whose workers run all tasks instead of processes. They
             must be able to import hlsim and to read the same files.
         in_processes: Whether tasks run in another process even if ``jobs`` is 1.
 
