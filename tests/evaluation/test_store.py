@@ -28,7 +28,7 @@ def test_lines_that_are_cut_short_or_no_records_are_ignored(tmp_path: Path, cut:
     store = ScoreStore(path)
     for key in ("a", "b"):
         store.append(key, {"score": 0.25})
-    no_records = b'\n[1]\nnonsense\n{"no": "key"}\n"text"\n'
+    no_records = b'\n[1]\nnonsense\n{"no": "key"}\n"text"\n{"key": "d", "values": 5}\n'
     path.write_bytes(no_records + path.read_bytes()[:-cut])
     damaged = ScoreStore(path)
     assert damaged.scores == {"a": {"score": 0.25}}

@@ -42,7 +42,7 @@ class ScoreStore:
             # A line that is cut short, or is not a score, is ignored.
             with suppress(ValueError, KeyError, TypeError):
                 score = json.loads(line)
-                self.scores[score["key"]] = score["values"]
+                self.scores[score["key"]] = dict(score["values"])
 
     def append(self, key: str, values: Mapping[str, float | str]) -> None:
         """Store a score under a key. The file, if any, has the score when this method returns.
