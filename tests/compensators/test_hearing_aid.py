@@ -13,6 +13,7 @@ from compensators import WDRC, HearingAid, load_compensator, save_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.ears import draw_thresholds
+from hlsim.evaluation.aid_properties import measure_steady_tones
 from tests.compensators.aids import EAR, assert_close, tone, varied_hearing_aid
 
 
@@ -108,6 +109,13 @@ def test_noise_reduction_attenuates_noise_and_spares_tones() -> None:
     changes = [float(level_spl(aid(sound, "NH", 1.0)[16000:]) - 65.0) for sound in sounds]
     assert -12.0 < changes[0] < -6.0
     assert max(map(abs, changes[1:])) < 1.0
+
+
+@pytest.mark.parametrize("name", ["N2", "N3", "N4"])
+def test_an_impaired_ear_perceives_tones_as_loud_as_a_normal_ear(name: str) -> None:
+    aid: Any = load_compensator("hearing-aid")
+    errors = measure_steady_tones(aid, Audiogram.standard(name), [65.0])["loudness_error_db"]
+    assert max(map(abs, errors[0])) < 3.0
 
 
 @torch.no_grad()
