@@ -108,8 +108,12 @@ class TrainingModule(L.LightningModule):
             self.print(f"step {self.global_step} of {self.recipe.steps}: {', '.join(texts)}")
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
+        # Without foreach, each of the many small tensors costs several calls on a CPU.
         optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=self.recipe.learning_rate, weight_decay=1e-4
+            self.network.parameters(),
+            lr=self.recipe.learning_rate,
+            weight_decay=1e-4,
+            foreach=True,
         )
         scheduler = LambdaLR(optimizer, partial(relative_learning_rate, steps=self.recipe.steps))
         return {
