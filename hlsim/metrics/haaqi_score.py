@@ -159,7 +159,7 @@ class HaaqiReference(QualityReference):
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity, 1 or 2, see ``haaqi``.
-        keep: Store the clean music's features, about 17 MB per second in float32; otherwise they
+        keep: Store the clean music's features, about 19 MB per second in float32; otherwise they
             are computed, and the level is validated, for each score.
 
     Raises:

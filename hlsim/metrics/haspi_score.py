@@ -117,7 +117,7 @@ class HaspiReference(Reference):
     """Clean speech that is prepared once for the HASPI of many outputs of aids.
 
     HASPI compares with clean speech in a normal ear, so the impaired ear is an argument of
-    ``score``. In float32 the features of clean speech take about 4 MB per second.
+    ``score``. In float32 the features of clean speech take about 5 MB per second.
 
     Args:
         clean: Clean speech, not amplified. The scores are on its device, and float64 if it is,

@@ -94,7 +94,7 @@ class HasqiReference(QualityReference):
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity, 1 or 2, see ``hasqi``.
-        keep: Store the clean speech's features, about 17 MB per second in float32; otherwise they
+        keep: Store the clean speech's features, about 19 MB per second in float32; otherwise they
             are computed, and the level is validated, for each score.
 
     Raises:

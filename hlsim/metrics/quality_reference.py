@@ -101,7 +101,7 @@ class QualityReference(Reference):
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes
             signals that NAL-R or another prescription has amplified.
-        keep: Store the clean signals' features, about 17 MB per second in float32; otherwise they
+        keep: Store the clean signals' features, about 19 MB per second in float32; otherwise they
             are computed, and the level is validated, for each score.
 
     Raises:
@@ -375,8 +375,8 @@ def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: 
 
     Shape: (items, channels, padded) three times -> (items, channels, padded).
     """
-    scaled = motion * levels * power.clamp_min(1.0).rsqrt()  # below 0 dB SPL the level is 0
-    return torch.where(power > 0.0, scaled, unit * motion)
+    factor = levels * power.clamp_min(1.0).rsqrt()  # below 0 dB SPL the level is 0
+    return motion * factor.masked_fill_(power <= 0.0, unit)
 
 
 # -- noise -----------------------------------------------------------------------------------------

@@ -2,19 +2,19 @@
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.torchtools import constant
 
 MAX_LAG = 2400
 """Largest shift of a single channel of an output in samples, 100 ms."""
+
+LAG_BLOCK = RATE // 2
+"""Approximate number of samples per block of the correlation that aligns channels."""
 
 HEADROOM = RATE // 500
 """Number of samples (2 ms) by which the whole output is late after its alignment.
@@ -70,34 +70,39 @@ def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> T
 def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     """Transform a clean signal's channels for ``align_channels``, which correlates outputs with it.
 
-    The result is the spectrum of the differences between neighbouring samples. A correlation with
+    The result has the spectra of the differences between neighbouring samples. A correlation with
     these differences is the change of the correlation with the signal from one lag to the next.
     Near the maximum, single precision resolves these changes, but not the values themselves.
+
+    Blocks of half a second are transformed, which fit into caches. Neighbouring blocks overlap by
+    all lags.
 
     Args:
         reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).
         extent: Number of samples of each item before padding.
 
     Returns:
-        Complex spectrum, (items, channels, frequencies).
+        Complex spectra, (items, channels, blocks, frequencies).
 
     >>> lag_spectrum(torch.zeros(1, 2, 128), Extent((128,))).shape
-    torch.Size([1, 2, 1297])
+    torch.Size([1, 2, 1, 193])
     """
-    points = _lag_points(extent)
-    step = _step_response(points, like=reference)
-    return torch.fft.rfft(extent.cut(reference), points) * step
+    max_lag, (count, hop, points) = _max_lag(extent), _lag_blocks(extent)
+    behind = count * hop - extent.longest + max_lag + 1
+    steps = functional.pad(extent.cut(reference), (max_lag, behind)).diff()
+    return torch.fft.rfft(steps.unfold(-1, hop + 2 * max_lag, hop), points)
 
 
-@constant
-def _step_response(points: int) -> NDArray[np.complex128]:
-    """Return the response of the difference to the next sample, (points // 2 + 1,)."""
-    return np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
+def _max_lag(extent: Extent) -> int:
+    """Return the largest delay of a channel in samples."""
+    return min(MAX_LAG, extent.longest)
 
 
-def _lag_points(extent: Extent) -> int:
-    """Return a length of the Fourier transform with which no considered lag wraps around."""
-    return fft_length(extent.longest + MAX_LAG, 2)
+def _lag_blocks(extent: Extent) -> tuple[int, int, int]:
+    """Return the number of blocks of ``lag_spectrum``, samples per block, and transform length."""
+    count = max(1, round(extent.longest / LAG_BLOCK))
+    hop = -(-extent.longest // count)
+    return count, hop, fft_length(hop + 2 * _max_lag(extent), 16)
 
 
 def align_channels(
@@ -126,11 +131,13 @@ def align_channels(
     True
     """
     with torch.no_grad():
-        points, max_lag = _lag_points(extent), min(MAX_LAG, extent.longest)
-        spectrum = torch.fft.rfft(extent.cut(envelope), points)
-        steps = torch.fft.irfft(reference_spectrum * spectrum.conj(), points)
-        near = torch.cat((steps[..., points - max_lag + 1 :], steps[..., :max_lag]), -1)
-        correlation = functional.pad(near.double().cumsum(-1), (1, 0))
+        max_lag, (count, hop, points) = _max_lag(extent), _lag_blocks(extent)
+        padded = functional.pad(extent.cut(envelope), (0, count * hop - extent.longest))
+        spectra = torch.fft.rfft(padded.unflatten(-1, (count, hop)), points)
+        # in place, because these are large tensors
+        products = spectra.conj_physical_().mul_(reference_spectrum)
+        steps = torch.fft.irfft(products.sum(-2), points)[..., 1 : 2 * max_lag]
+        correlation = functional.pad(steps.double().cumsum(-1), (1, 0))
         delays = correlation.argmax(-1) - (max_lag - 1)
     return shift(signal, delays, extent.ends, extent.ends, extent.padded)
 

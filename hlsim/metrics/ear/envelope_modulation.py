@@ -230,21 +230,21 @@ def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Co
         clean, output: Cepstral coefficients of the audible frames. Shape: (items, 5, frames).
         extent: Number of audible frames of each item.
     """
-    frames, points = extent.longest, _points(extent.longest)
-    waves = extent.centred(clean), extent.centred(output)
-    a, b = (torch.fft.rfft(wave, points) for wave in waves)
+    points = _points(extent.longest)
+    waves = extent.centred(torch.stack((clean, output), 1))
+    spectra = torch.fft.rfft(waves, points)
     responses = _responses(points, like=clean)
     # On a CPU, one filter at a time fits into the caches; a GPU needs large tensors.
     filters_at_once = 1 if clean.device.type == "cpu" else len(responses)
     sums = []
     for part in responses.split(filters_at_once):
-        x, y = (
-            extent.centred(torch.fft.irfft(spectrum[:, None] * part[:, None], points)[..., :frames])
-            for spectrum in (a, b)
-        )
+        filtered = torch.fft.irfft(spectra[:, None] * part[:, None, None], points)
+        x, y = extent.centred(filtered).unbind(2)
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
     xx, yy, xy = torch.cat(sums, 2)
-    return _Covariance(xx, yy, xy, waves, (a, b))
+    clean_wave, output_wave = waves.unbind(1)
+    a, b = spectra.unbind(1)
+    return _Covariance(xx, yy, xy, (clean_wave, output_wave), (a, b))
 
 
 def _points(frames: int) -> int:
@@ -252,7 +252,8 @@ def _points(frames: int) -> int:
     return fft_length(frames + len(_filters()[0]) // 2, 256)
 
 
-def _filters() -> list[NDArray[np.float64]]:
+@lru_cache(maxsize=1)
+def _filters() -> tuple[NDArray[np.float64], ...]:
     """Return the taps of the ten modulation filters: a Hann window, then Hann-windowed cosines.
 
     Each filter has an odd number of taps, (taps,), and is centred on the middle one.
@@ -266,7 +267,7 @@ def _filters() -> list[NDArray[np.float64]]:
         if k:
             window *= 2.0 * np.cos(2.0 * np.pi * rate / FRAME_RATE * np.arange(-half, half + 1))
         filters.append(window)
-    return filters
+    return tuple(filters)
 
 
 @constant

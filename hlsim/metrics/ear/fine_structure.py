@@ -264,11 +264,28 @@ def coherence(
     (x, xx), (y, yy) = clean, output
     kinds = _segment_kinds(counts, xx.device)
     weights = _lag_weights(like=xx)[kinds][:, None]
-    covariance = torch.fft.irfft(x * y.conj(), FFT_POINTS)
-    near = torch.cat((covariance[..., : MAX_LAG + 1], covariance[..., -MAX_LAG:]), -1) * weights
+    # A matrix product computes a ninth of the inverse Fourier transform faster than all of it.
+    near = torch.view_as_real(x * y.conj()).flatten(-2) @ _inverse_transform(like=xx) * weights
     is_moving = (xx > 2.0 * ENERGY_FLOOR) & (yy > 2.0 * ENERGY_FLOOR)
     norm = 0.5 * torch.where(is_moving, xx, 1.0).sqrt() * torch.where(is_moving, yy, 1.0).sqrt()
     return torch.where(is_moving, near.abs().amax(-1) / norm, 0.0).clamp(0.0, 1.0)
+
+
+_LAGS = (*range(MAX_LAG + 1), *range(-MAX_LAG, 0))
+"""Lags in samples at which segments are compared."""
+
+
+@constant
+def _inverse_transform() -> NDArray[np.float64]:
+    """Return the inverse Fourier transform at some lags, from real and imaginary parts in turn.
+
+    Shape: (2 * frequencies, 49).
+    """
+    frequencies = np.arange(FFT_POINTS // 2 + 1)
+    sides = np.where((frequencies == 0) | (frequencies == FFT_POINTS // 2), 1.0, 2.0)
+    angles = 2.0 * np.pi / FFT_POINTS * np.outer(frequencies, _LAGS)
+    waves = np.stack((np.cos(angles), -np.sin(angles)), 1) * sides[:, None, None] / FFT_POINTS
+    return waves.reshape(-1, len(_LAGS))
 
 
 @constant
@@ -278,7 +295,7 @@ def _lag_weights() -> NDArray[np.float64]:
     A weight is 1 over the autocorrelation of the window. The rows are the kinds of segments; the
     columns are lags of 0 to 24, then -24 to -1 samples. Shape: (3, 49).
     """
-    lags = [*range(MAX_LAG + 1), *range(MAX_LAG, 0, -1)]
+    lags = np.abs(_LAGS)
     rows = []
     for window in _windows():
         autocorrelation = np.correlate(window, window, "full")[SEGMENT - 1 :]

@@ -38,7 +38,6 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.interpolation import interpolation_weights
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.recursions import (
-    BLOCK,
     RATE,
     Recursion,
     adaptation,
@@ -248,13 +247,13 @@ def _apply_gammatones(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tenso
         signal: Signals. Shape: (items, padded).
 
     Returns:
-        Real part in blocks, (items, channels, padded / 64, 64), and power, (items, channels,
-        padded).
+        Real part and power. Shape of each: (items, channels, padded).
     """
     # Torch rounds products of tensors with a dimension for items differently.
-    output = filters(signal)[None] if len(signal) == 1 else filters(signal[:, None])
-    real, imaginary = output.split(BLOCK, -1)
-    return real, (real * real).addcmul_(imaginary, imaginary).flatten(-2)
+    parts = filters(signal) if len(signal) == 1 else filters(signal[:, None])
+    shape = len(signal), -1, signal.shape[-1]
+    real, imaginary = (part.reshape(shape) for part in parts)
+    return real, (real * real).addcmul_(imaginary, imaginary)
 
 
 def _control_power(signal: Tensor, channels: slice) -> Tensor:
@@ -345,12 +344,12 @@ def simulate_cochlea(
     filters = _gammatones(bandwidth.squeeze(0), channels, signal.dtype)
     real, power = _apply_gammatones(filters, signal)
     gain = _compression_gain(control, cells)
-    compressed = power * gain.square()
+    compressed = (power * gain).mul_(gain)
     if not motion:
         empty = compressed.new_empty(0)
         return CochlearOutput(compressed, bandwidth, empty, empty)
     level = _long_term_level(extent.mean(power), extent.mean(control), cells)
-    return CochlearOutput(compressed, bandwidth, real.flatten(-2) * gain, level)
+    return CochlearOutput(compressed, bandwidth, real * gain, level)
 
 
 def _compression_gain(control: Tensor, cells: HairCells) -> Tensor:
@@ -366,12 +365,14 @@ def _compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     knee, ratio, loss = (
         field.to(control).unsqueeze(-1) for field in (cells.knee, cells.ratio, cells.outer)
     )
-    highest = knee.new_full((), 10.0 ** (CEILING_SPL / 10.0))
-    level = control.clamp(10.0 ** (knee / 10.0), highest).log()
+    # Clamping by a tensor and a number takes a fifth of the time of clamping by two tensors, and
+    # operations in place save memory, whose first use is slow.
+    level = torch.maximum(control, 10.0 ** (knee / 10.0))
+    level = level.clamp_max_(10.0 ** (CEILING_SPL / 10.0)).log_()
     # The gain in nepers is -loss - (level - knee) (1 - 1 / ratio).
     exponent = 0.5 * (1.0 / ratio - 1.0)
     neper = math.log(10.0) / 20.0
-    gain = torch.addcmul(-neper * (loss + 2.0 * exponent * knee), level, exponent).exp_()
+    gain = level.mul_(exponent).sub_(neper * (loss + 2.0 * exponent * knee)).exp_()
     return apply_filter(gain_lowpass, gain)
 
 
@@ -415,8 +416,8 @@ def nerve_levels(power: Tensor, inner: Tensor) -> Tensor:
     tensor([60., 30.])
     """
     loss = inner.to(power).unsqueeze(-1)
-    level = torch.maximum(power, 10.0 ** (loss / 10.0)).log().mul_(10.0 / math.log(10.0))
-    return apply_filter(adaptation, level.sub_(loss)).clamp_min(0.0)
+    level = torch.maximum(power, 10.0 ** (loss / 10.0)).log_().mul_(10.0 / math.log(10.0))
+    return apply_filter(adaptation, level.sub_(loss)).clamp_min_(0.0)
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:

@@ -46,7 +46,8 @@ def apply_filter(
     >>> apply_filter(gain_lowpass, torch.ones(1, 192)).shape
     torch.Size([1, 192])
     """
-    return design(signal.device, signal.dtype)(signal).flatten(-2)
+    (output,) = design(signal.device, signal.dtype)(signal)
+    return output.flatten(-2)
 
 
 class Recursion(NamedTuple):
@@ -64,7 +65,8 @@ class Recursion(NamedTuple):
         memory: Number of samples after which the influence of an input sample has vanished.
 
     >>> lowpass = gain_lowpass(torch.device("cpu"), torch.float64)
-    >>> lowpass(torch.ones(1, 192, dtype=torch.float64)).shape
+    >>> (output,) = lowpass(torch.ones(1, 192, dtype=torch.float64))
+    >>> output.shape
     torch.Size([1, 3, 64])
     """
 
@@ -74,7 +76,7 @@ class Recursion(NamedTuple):
     step: Tensor
     memory: int
 
-    def __call__(self, signal: Tensor) -> Tensor:
+    def __call__(self, signal: Tensor) -> list[Tensor]:
         """Filter a signal.
 
         Args:
@@ -82,14 +84,33 @@ class Recursion(NamedTuple):
                 dimensions broadcast with those of the filters.
 
         Returns:
-            Output in blocks. Shape: (..., time / 64, outputs).
+            Output in blocks; of complex filters, the real part and the imaginary part. Shape of
+            each: (..., time / 64, 64).
         """
         blocks = signal.unflatten(-1, (-1, BLOCK))
         # Three matrix products for all blocks at once replace a loop over samples.
         states = _accumulate(blocks @ self.inward, self.step, self.memory // BLOCK)
         before = functional.pad(states[..., :-1, :], (0, 0, 1, 0))
-        # These are the largest tensors of a score, therefore the addition is in place.
-        return (blocks @ self.through).add_(before @ self.outward)
+        shape = *before.shape[:-1], BLOCK
+        tensors = [blocks, before, self.through, self.outward]
+        is_shared = self.through.ndim == 2  # one filter for all signals
+        if is_shared:
+            tensors[:2] = [tensor.flatten(0, -2) for tensor in tensors[:2]]
+        else:
+            tensors = [tensor.expand(*shape[:-2], -1, -1).flatten(0, -3) for tensor in tensors]
+        blocks, before, through, outward = tensors
+        outputs = []
+        # Parts are computed separately, because operations on halves of one tensor are slow. The
+        # second product is added in place, because outputs are the largest tensors of a score.
+        parts = zip(through.split(BLOCK, -1), outward.split(BLOCK, -1), strict=True)
+        for matrix, state_matrix in parts:
+            output = blocks @ matrix
+            if is_shared:
+                output.addmm_(before, state_matrix)
+            else:
+                output.baddbmm_(before, state_matrix)
+            outputs.append(output.view(shape))
+        return outputs
 
 
 def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
@@ -277,8 +298,9 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
         Filters. Shape of the matrices: (..., filters, ., .).
 
     >>> filters = gammatone(torch.tensor([0.05]), torch.tensor([0.3]), 1000, torch.float32)
-    >>> filters(torch.zeros(1, 128)).shape
-    torch.Size([1, 2, 128])
+    >>> real, imaginary = filters(torch.zeros(1, 128))
+    >>> real.shape
+    torch.Size([1, 2, 64])
     """
     n = torch.arange(BLOCK, dtype=decay.dtype, device=decay.device)
     gain = 2.0 * torch.expm1(-decay) ** 4 / (1.0 + 2.0 * torch.exp(-decay)) ** 2
@@ -295,12 +317,10 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     after = gain[..., None] * torch.exp(-decay * n)
     phase, phase_to_end = angle * n, angle * (BLOCK - n)
     # within a block
-    wave = (after * p[0])[..., None] * torch.stack((phase.cos(), phase.sin()), -1)
-    lag = torch.arange(BLOCK, device=decay.device)
-    lag = lag - lag[:, None]
-    wave = functional.pad(wave, (0, 0, 0, 1)).to(dtype)  # ..., filters, BLOCK + 1, 2
-    through = wave[..., torch.where(lag >= 0, lag, BLOCK), :]  # ..., filters, in, out, 2
-    through = through.transpose(-1, -2).flatten(-2)
+    wave = (after * p[0])[..., None, :] * torch.stack((phase.cos(), phase.sin()), -2)
+    # Sample j of the output receives sample i of the block through the response at j - i.
+    responses = functional.pad(wave.to(dtype), (BLOCK - 1, 0)).unfold(-1, BLOCK, 1).flip(-2)
+    through = responses.transpose(-2, -3).flatten(-2)
     # from block to block: powers of the distance in blocks, times the decaying carrier
     order = torch.arange(GAMMATONE_ORDER, dtype=decay.dtype, device=decay.device)
     distance = ((BLOCK - n) / BLOCK)[:, None] ** order
@@ -314,7 +334,8 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     decayed = torch.exp(-BLOCK * decay)[..., None] * binomials
     step_angle = BLOCK * angle[..., None]
     step = _as_real(decayed * torch.cos(step_angle), decayed * torch.sin(step_angle))
-    return Recursion(through, inward.to(dtype), outward.to(dtype), step.to(dtype), memory)
+    inward, outward, step = (matrix.to(dtype) for matrix in (inward, outward, step))
+    return Recursion(through, inward, outward, step, memory)
 
 
 def _as_real(real: Tensor, imaginary: Tensor) -> Tensor:

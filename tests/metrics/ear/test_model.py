@@ -18,7 +18,6 @@ from hlsim.metrics.ear import (
 )
 from hlsim.metrics.ear.extent import Extent
 
-CPU = torch.device("cpu")
 CHANNELS = (0, 9, 31)
 SPL = 94.0
 
@@ -86,9 +85,9 @@ def test_middle_ear_and_adaptation(pair: tuple[Tensor, Tensor]) -> None:
     level[level < 10.0] = 0.0
     expected, _ = eb.inner_hair_cell_adaptation(level[0].numpy(), level[0].numpy(), 2.0, 24000.0)
     for dtype, error in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
-        sound = recursions.middle_ear(CPU, dtype)(signal.to(dtype)).flatten(-2)[0]
+        sound = recursions.apply_filter(recursions.middle_ear, signal.to(dtype))[0]
         np.testing.assert_allclose(sound.double().numpy(), expected_sound, rtol=0, atol=error)
-        adapted = recursions.adaptation(CPU, dtype)(level.to(dtype)).flatten(-2).clamp_min(0.0)
+        adapted = recursions.apply_filter(recursions.adaptation, level.to(dtype)).clamp_min(0.0)
         ours = adapted[0].double().numpy()
         np.testing.assert_allclose(ours, expected, rtol=0, atol=100 * error)
 
@@ -103,7 +102,7 @@ def test_gammatones(pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: floa
     decay = 2.0 * np.pi / 24000 * 1.019 * (24.7 + centres / 9.26449) * width
     angle = torch.from_numpy(2.0 * np.pi * centres / 24000)
     filters = recursions.gammatone(torch.from_numpy(decay), angle, 8192, dtype)
-    real, imaginary = filters(signal.to(dtype)).double().split(recursions.BLOCK, -1)
+    real, imaginary = (part.double() for part in filters(signal.to(dtype)))
     for channel in CHANNELS:
         x = signal[0].numpy()
         envelope, motion, _, _ = eb.gammatone_basilar_membrane(
@@ -141,7 +140,7 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
     x, y = (
         torch.nn.functional.pad(signal, (0, extent.padded - extent.longest)) for signal in (x, y)
     )
-    x, y = (recursions.middle_ear(CPU, torch.float64)(signal).flatten(-2) for signal in (x, y))
+    x, y = (recursions.apply_filter(recursions.middle_ear, signal) for signal in (x, y))
     normal, ours = (
         ear_model.hair_cells(torch.tensor(a.thresholds)) for a in (Audiogram.standard("NH"), ear)
     )
@@ -207,3 +206,23 @@ def test_shift_of_several_items_and_its_gradient() -> None:
             inside = 0 <= source < ends[i] and t < stops[i]
             assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
     assert torch.autograd.gradcheck(shifted, (signal,))
+
+
+@pytest.mark.parametrize("time", [3000, 20000])
+def test_channels_are_aligned_where_the_whole_correlation_is_largest(time: int) -> None:
+    extent, max_lag = Extent((time, time // 2)), min(alignment.MAX_LAG, time)
+    clean = extent.cut(torch.randn(2, 3, extent.padded, dtype=torch.float64).abs())
+    output = clean + extent.cut(torch.randn(clean.shape, dtype=torch.float64))
+    for channel, delay in enumerate((-max_lag + 1, 7, max_lag)):
+        output[:, channel] = output[:, channel].roll(-delay, -1)
+    output = extent.cut(output)
+    spectrum = alignment.lag_spectrum(clean, extent)
+    aligned = alignment.align_channels(output, output, spectrum, extent)
+    lags = np.arange(1 - max_lag, max_lag + 1)
+    for item, channel in np.ndindex(2, 3):
+        x, y = clean[item, channel].numpy(), output[item, channel].numpy()
+        correlation = np.correlate(x, y, "full")[len(x) - 1 + lags]
+        delay = torch.tensor([int(lags[correlation.argmax()])])
+        ends = extent.ends[item : item + 1]
+        expected = alignment.shift(output[item, channel][None], delay, ends, ends, time)
+        torch.testing.assert_close(aligned[item, channel, :time], expected[0], rtol=0, atol=0)
