@@ -46,7 +46,7 @@ def check_full_scale(full_scale_spl: float) -> float:
 
 
 def gain_to_pascals(full_scale_spl: float) -> float:
-    """Compute the factor that converts samples to pascals.
+    """Compute the factor that converts samples to pascals, where 1 Pa counts as 94 dB SPL.
 
     Args:
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.

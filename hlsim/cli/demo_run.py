@@ -57,8 +57,8 @@ def run_demo(out: str | Path, audiogram: Audiogram, *, steps: int = 1000, **runn
         Text for a terminal: the verdict, the table of results, and the address of the page.
 
     Raises:
-        ValueError: The steps are not 1 or more, the folder has another training, or nothing could
-            be scored.
+        ValueError: The steps are not 1 or more, a threshold is above 100 dB HL, the folder has
+            another training, or nothing could be scored.
     """
     ear = f"{ear_name(audiogram)} (pure-tone average {audiogram.pta:.0f} dB HL)"
     print(f"Training an aid for the ear {ear}, {steps} steps")

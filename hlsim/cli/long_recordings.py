@@ -76,11 +76,10 @@ def process_recording(
 ) -> Iterator[Tensor]:
     """Yield the output of a simulator or an aid for a recording, one part after the other.
 
-    The parts together are the output for the whole recording: for simulators at 16 kHz bit by bit,
-    for MSBG above 20 kHz to 5e-4 of the peak (in frames that smearing leaves nearly empty, which
-    depend on the last bits), otherwise to 2e-5. The memory does not depend on the length, except
-    for directional aids, simulators of your own, and networks with layers other than convolutions,
-    which get the whole recording at once.
+    The parts together are the output for the whole recording: to 5e-4 of the peak for MSBG, where
+    frames that smearing leaves nearly empty amplify rounding, otherwise to 2e-5. The memory does
+    not depend on the length, except for directional aids, simulators of your own, and networks with
+    layers other than convolutions or with ``level_aware=False``, which get the whole recording.
 
     Args:
         model: Simulator or aid at the sample rate of the recording.

@@ -364,8 +364,9 @@ def _delay(signal: Tensor, delays: Tensor, extent: Extent) -> Tensor:
 def _scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
     """Rescale the motion so that its envelope equals the level in dB at the auditory nerve.
 
-    Envelope and motion are aligned separately. Where the aligned envelope is zero, the motion is
-    only converted to the scale of the input, as in pyclarity.
+    The envelope and the motion of an output are shifted separately to fit those of the clean
+    signal, so the envelope may be zero where the motion is not. There, the motion is only converted
+    to the scale of the input, as in pyclarity.
 
     Args:
         motion: Motion of the basilar membrane in multiples of 20 uPa.

@@ -74,8 +74,9 @@ def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     The gain of a channel of the filter bank is (envelope / pressure at 105 dB SPL) ** (ratio - 1).
     It is computed once per step, a group of neighbouring samples with one value of the envelope.
-    Envelopes are limited to 2e-8 Pa to 105 dB SPL, so that gains stay above 0. They are at most 1,
-    except for ratios below 1, those of thresholds below 0 dB HL.
+    Envelopes are limited to the range from 2e-8 Pa to 105 dB SPL, so that their logarithm is
+    finite. Gains are at most 1, except for ratios below 1, those of thresholds below 0 dB HL. In
+    float32, the gains of the softest envelopes are 0 for thresholds above about 88 dB HL.
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
 

@@ -247,9 +247,10 @@ class DualPathNeuroMSBG(NeuroMSBG):
             prior_factor: Complex factor of the prior, (items, frames, frequencies), or None.
 
         Returns:
-            Magnitude, phase and, depending on the configuration, encoded audiogram and prior.
-            Shape: (items, 2 to 4, frames, rows), where rows are the frequencies, followed by the
-            eight thresholds if ``config.audiogram`` is ``"concatenated"``.
+            Log magnitude and sine of the phase (magnitude and phase unless ``config.level_aware``)
+            and, depending on the configuration, encoded audiogram and log gain of the prior. Shape:
+            (items, 2 to 4, frames, rows), where rows are the frequencies, followed by the eight
+            thresholds in units of 100 dB HL if ``config.audiogram`` is ``"concatenated"``.
         """
         if self.config.level_aware:
             channels = [log_magnitude(powers), sine_of_phase(spectrum, powers)]

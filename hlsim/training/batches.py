@@ -113,8 +113,9 @@ class TrainingData:
     ) -> TrainingData:
         """Return the training data of a manifest: its splits ``train`` and ``valid``.
 
-        The difference between the manifest's noisy and clean speech is the noise. Rows with
-        references are scenes instead.
+        The difference between the manifest's noisy and clean speech is the noise. Rows with a value
+        in the column ``reference`` are recorded scenes, clean speech with its signals at several
+        microphones, and give no noise.
 
         Args:
             manifest: CSV file, see ``read_manifest``.
