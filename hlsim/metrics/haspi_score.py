@@ -21,10 +21,10 @@ Communication 131, 35-46, doi 10.1016/j.specom.2020.05.001.
 from __future__ import annotations
 
 import json
-from functools import lru_cache, reduce
+from functools import reduce
 from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ from hlsim.metrics.ear import alignment, envelope_modulation as envelopes, model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
-from hlsim.metrics.ear.motion_noise import draw_motion_noise
+from hlsim.metrics.ear.motion_noise import state_after_motion_noise
 from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import Audio, Samples, as_type_of, constant, not_compiled
@@ -281,6 +281,9 @@ def _cepstrum(clean: _Channels, output: Tensor, ear: HairCells, extent: Extent) 
 def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Tensor:
     """Draw the internal noise of the ear for clean speech and for the output, as pyclarity does.
 
+    Before it, pyclarity draws noise for the motion of the basilar membrane, which only HASQI and
+    HAAQI use.
+
     Args:
         seed: Seed, the same for each item, so that its score does not depend on the batch.
         extent: Number of samples at 24 kHz of each item.
@@ -294,28 +297,11 @@ def _draw_noise(seed: int, extent: Extent, audible: Extent, like: Tensor) -> Ten
     noise = torch.zeros((2, *like.shape), dtype=like.dtype)
     random = np.random.RandomState()
     for item, (samples, frames) in enumerate(zip(extent.ends, audible.ends, strict=True)):
-        random.set_state(_state_after_motion_noise(seed, samples, like.dtype))
+        random.set_state(state_after_motion_noise(seed, samples))
         for signal in (0, 1):
             levels = torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like.dtype)
             noise[signal, item, :, :frames] = envelopes.NOISE_DB * envelopes.cepstrum(levels.mT)
     return noise.to(like.device)
-
-
-@lru_cache(maxsize=256)
-def _state_after_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> Any:
-    """Return the state of NumPy's generator after the noise that pyclarity draws for the motion.
-
-    Before the noise on the levels, pyclarity draws noise for the motion of the basilar membrane of
-    both signals, which only HASQI and HAAQI use. These are most of the random numbers. The state is
-    stored, because a study needs the same one for all conditions and ears, and it takes less memory
-    than the noise.
-
-    Args:
-        seed: Seed of the generator.
-        samples: Number of samples at 24 kHz per channel.
-        dtype: Precision in which HASQI uses the noise.
-    """
-    return draw_motion_noise(seed, samples, dtype).state
 
 
 # -- networks --------------------------------------------------------------------------------------

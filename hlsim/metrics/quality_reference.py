@@ -405,7 +405,7 @@ def _threshold_noise(
     if noise == "seeded":
         drawn = torch.zeros(2, len(extent.ends), CHANNELS, longest, dtype=like.dtype)
         for item, end in enumerate(extent.ends):
-            drawn[:, item, :, :end] = draw_motion_noise(seed, end, like.dtype).signals
+            drawn[:, item, :, :end] = draw_motion_noise(seed, end, like.dtype)
         clean_noise, output_noise = drawn.to(like.device)
         return clean_noise, output_noise
     if noise == "expected":
