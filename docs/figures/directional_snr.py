@@ -1,17 +1,19 @@
 """Noise that directional microphones remove, and what they do to the talker in front.
 
-    python docs/figures/directional_snr.py [CHECKPOINT]
+    python docs/figures/directional_snr.py [CHECKPOINT [SECONDS]]
 
 The bundled utterances for validation come from the front, and noise with the mean spectrum of the
 bundled speech from one direction on the left or from all directions (64), at -5 dB, to a rigid
-sphere. The microphones are equal, or their gains differ at random with a standard deviation of
-.5 dB. The benefit is the signal-to-noise ratio of both ears after a front end minus that of the
-front microphones, a mean over third octaves in dB; signal and noise behind the adaptive front ends
-are separated by a second output, for noise of the opposite sign (Hagerman and Olofsson 2004).
-The table has the benefits, by how much the beamformers are ahead of the adaptive microphone, with
-95 % intervals over the utterances, and the largest changes of the talker's differences between the
-ears, of the level over five octaves and of the time over the two octaves below 1 kHz (means over
-the utterances). The front end of a trained checkpoint is one of the beamformers, if there is one.
+sphere, in the open or in a room with a reverberation time of SECONDS. The microphones are equal, or
+their gains differ at random with a standard deviation of .5 dB. The benefit is the ratio of the
+direct sound of the speech to all other sound, its echoes included, of both ears after a front end
+minus that of the front microphones, a mean over third octaves in dB; the two parts behind the
+adaptive front ends are separated by a second output, for the other sound with the opposite sign
+(Hagerman and Olofsson 2004). The table has the benefits, by how much the beamformers are ahead of
+the adaptive microphone, with 95 % intervals over the utterances, and the largest changes of the
+talker's differences between the ears, of the level over five octaves and of the time over the two
+octaves below 1 kHz (means over the utterances). The front end of a trained checkpoint is one of the
+beamformers, if there is one.
 """
 
 import sys
@@ -28,6 +30,7 @@ from compensators.directional import AdaptiveDifferentialMicrophone
 from hlsim.audio import find_audio, read_audio
 from hlsim.calibration import set_level
 from hlsim.data.bundled import SPEECH
+from hlsim.data.rooms import Room
 from hlsim.data.scenes import make_scene
 from hlsim.metrics.interaural import interaural_change
 from hlsim.metrics.sii import SII_BANDS
@@ -78,7 +81,9 @@ def speech_shaped_noise(samples: int, seed: int) -> Tensor:
     return torch.from_numpy(np.fft.irfft(white * np.sqrt(shape), samples)).float()
 
 
-def main(checkpoint: str | None = None) -> None:
+def main(checkpoint: str | None = None, reverberation_time: str = "0") -> None:
+    seconds = float(reverberation_time)
+    room = Room(reverberation_time=seconds) if seconds else None
     adaptive = AdaptiveDifferentialMicrophone()
     beamformers: dict[str, nn.Module] = {"untrained": AdaptiveBeamformer().requires_grad_(False)}
     if checkpoint is not None:
@@ -93,7 +98,7 @@ def main(checkpoint: str | None = None) -> None:
         for name, azimuth in AZIMUTHS.items():
             masker = {"diffuse": noise} if azimuth is None else {"maskers": [noise]}
             azimuths = [] if azimuth is None else [azimuth]
-            scene = make_scene(target, azimuths=azimuths, snr=SNR, seed=seed, **masker)
+            scene = make_scene(target, azimuths=azimuths, snr=SNR, seed=seed, room=room, **masker)
             for mismatch in (0.0, 0.5):
                 gains = 10.0 ** (torch.from_numpy(mismatch * normal).float() / 20.0)
                 at_microphones = gains * scene.target, gains * (scene.input - scene.target)

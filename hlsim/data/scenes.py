@@ -1,4 +1,4 @@
-"""Scenes for several microphones: talkers and noise around a spherical head, without a room."""
+"""Scenes for several microphones: talkers and noise around a spherical head."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,11 +12,18 @@ from torch import Tensor
 from hlsim.calibration import NEURO_RATE, set_level
 from hlsim.checks import check_number, check_rate, check_waveform
 from hlsim.data.mixing import mix
+from hlsim.data.rooms import Room, draw_room, find_arrivals
 from hlsim.dsp.sphere import evenly_spread_directions, head_responses, unit_vectors
 from hlsim.torchtools import compute_once
 
 DIFFUSE_DIRECTIONS = 64
 """Number of directions from which diffuse noise comes."""
+
+ECHO_HEIGHTS = 12
+"""Number of heights from which echoes come."""
+
+ECHO_AZIMUTHS = 24
+"""Number of azimuths from which echoes come, at each height."""
 
 _LEAD_SECONDS = 0.002
 """Length of the impulse responses before the time at which sound passes the centre of the head."""
@@ -30,7 +37,7 @@ class Scene(NamedTuple):
 
     Attributes:
         input: Target and maskers at the microphones, (..., microphones, ears, time).
-        target: Target alone, likewise.
+        target: Direct sound of the target alone, likewise.
 
     >>> Scene(torch.zeros(2, 2, 10), torch.zeros(2, 2, 10)).input.shape
     torch.Size([2, 2, 10])
@@ -56,12 +63,13 @@ def make_scene(
     spacing: float = 0.01,
     sample_rate: int = NEURO_RATE,
     seed: int = 0,
+    room: Room | None = None,
 ) -> Scene:
     """Place a talker, maskers and diffuse noise around a listener with two microphones a side.
 
     Talker and maskers are plane waves from the horizontal plane to a rigid sphere, see
-    ``hlsim.dsp.sphere``; there is no room. Diffuse noise comes from 64 directions that are evenly
-    spread over the sphere, with another part of the recording from each.
+    ``hlsim.dsp.sphere``, and in a ``room``, so are their echoes. Diffuse noise comes from 64
+    directions that are evenly spread over the sphere, with another part of the recording from each.
 
     Args:
         target: Speech at its level at the centre of the head without the head, (time,).
@@ -69,19 +77,23 @@ def make_scene(
         azimuths: Azimuth of each masker in degrees, 0 in front, 90 on the left.
         diffuse: Recording of noise with the level of a masker that becomes diffuse, at least as
             long as the target.
-        snr: Signal-to-noise ratio at the microphones in dB: the active level of the target minus
-            the level of all other sounds, with the powers of all microphones averaged.
+        snr: Signal-to-noise ratio at the microphones in dB: the active level of the target, with
+            its echoes, minus the level of all other sounds, with the powers of all microphones
+            averaged.
         target_azimuth: Azimuth of the target in degrees.
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         sample_rate: Sample rate of all signals in Hz, 16000 to 48000.
         seed: Seed of the parts of the recording for diffuse noise, 0 or more.
+        room: Room with echoes of the talker and the maskers; none by default, as in the open.
 
     Returns:
-        The scene. Sound from the front arrives at the time it has in ``target``.
+        The scene. Direct sound from the front arrives at the time it has in ``target``.
 
     Raises:
+        MissingExtraError: There is a room, and pyroomacoustics is not installed.
         ValueError: A signal is not valid, silent or too short, there is no masker and no diffuse
-            noise, there is not one azimuth for each masker, or a number is out of range.
+            noise, there is not one azimuth for each masker, a number is out of range, or a source
+            is outside the room.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()
@@ -109,14 +121,20 @@ def make_scene(
     if target.ndim != 1:
         raise ValueError(f"expected a target of shape (time,), got {tuple(target.shape)}")
     time = len(target)
-    target_at_ears = sound_at_microphones(
-        target[None], unit_vectors([target_azimuth]), spacing, rate
-    )
+
+    def place(sound: Tensor, azimuth: float, room: Room | None) -> Tensor:
+        directions = unit_vectors([azimuth])
+        if room is None:
+            return sound_at_microphones(sound[None], directions, spacing, rate)
+        responses = room_impulse_responses(room, azimuth, spacing, rate)
+        return _filter_sounds(sound[None], responses[None], rate)
+
+    direct_sound = place(target, target_azimuth, None)
+    target_at_ears = direct_sound if room is None else place(target, target_azimuth, room)
     noise_at_ears = torch.zeros_like(target_at_ears)
     for masker, azimuth in zip(maskers, azimuths, strict=True):
         _check_masker(masker, "a masker", time)
-        direction = unit_vectors([azimuth])
-        noise_at_ears += sound_at_microphones(masker[None, :time], direction, spacing, rate)
+        noise_at_ears += place(masker[:time], azimuth, room)
     if diffuse is not None:
         _check_masker(diffuse, "diffuse", time)
         shifts = np.random.default_rng(seed).integers(len(diffuse), size=DIFFUSE_DIRECTIONS)
@@ -124,7 +142,7 @@ def make_scene(
         noise_at_ears += _filter_sounds(parts, diffuse_impulse_responses(spacing, rate), rate)
     channels = target_at_ears.flatten(0, 1)
     mixture = mix(channels, noise_at_ears.flatten(0, 1), snr, rate, channels=True)
-    return Scene(mixture.reshape(target_at_ears.shape), target_at_ears)
+    return Scene(mixture.reshape(target_at_ears.shape), direct_sound)
 
 
 def draw_scenes(
@@ -136,6 +154,7 @@ def draw_scenes(
     *,
     mismatch: float = 0.0,
     spacing: float = 0.01,
+    reverberation_time: float = 0.0,
 ) -> Scene:
     """Draw random scenes at 16 kHz for training, see ``make_scene``.
 
@@ -152,12 +171,15 @@ def draw_scenes(
         generator: Source of the random numbers.
         mismatch: Standard deviation in dB of the gains of the microphones.
         spacing: Distance between the two microphones of a side in m.
+        reverberation_time: Longest reverberation time in s of random rooms, in which half of the
+            scenes are; 0 for no rooms.
 
     Returns:
         Scenes with leading dimension (items,). The gains of the microphones are those of ``input``
         alone.
 
     Raises:
+        MissingExtraError: There are rooms, and pyroomacoustics is not installed.
         ValueError: There is only one item, which would be its own masker, or ``make_scene`` rejects
             a signal.
 
@@ -187,6 +209,7 @@ def draw_scenes(
         diffuse = None
         if noise is not None and is_diffuse:
             diffuse = set_level(noise[item], draw(59.0, 71.0))
+        has_room = reverberation_time > 0.0 and draw(0.0, 1.0) < 0.5
         scene = make_scene(
             target,
             maskers,
@@ -196,6 +219,7 @@ def draw_scenes(
             target_azimuth=draw(-10.0, 10.0),
             spacing=spacing,
             seed=int(draw(0.0, 2.0**31)),
+            room=draw_room(reverberation_time, generator) if has_room else None,
         )
         normal = np.random.default_rng(int(draw(0.0, 2.0**31))).normal(
             size=(*scene.input.shape[:2], 1)
@@ -254,6 +278,61 @@ def _filter_sounds(signals: Tensor, responses: NDArray[np.float64], sample_rate:
     sums = np.einsum("...df,dmef->...mef", spectra, filters)
     filtered = np.fft.irfft(sums, points)[..., lead : lead + time]
     return torch.from_numpy(filtered).to(signals)
+
+
+def room_impulse_responses(
+    room: Room, azimuth: float, spacing: float = 0.01, sample_rate: int = NEURO_RATE
+) -> NDArray[np.float64]:
+    """Compute impulse responses from a source in a room to the microphones on a spherical head.
+
+    Each echo is a plane wave at a whole number of samples, from the centre of one of 288 equal
+    areas of the sphere.
+
+    Args:
+        room: Room with the listener.
+        azimuth: Azimuth of the source in degrees.
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Impulse responses, (microphones, ears, length). Direct sound passes the centre of the head 2
+        ms after their beginning, with the same level as without the room.
+
+    >>> room_impulse_responses(Room(reverberation_time=0.2), 90.0).shape
+    (2, 2, 3744)
+    """
+    delays, amplitudes, directions = find_arrivals(room, azimuth)
+    height, turn = directions[:, 2], np.arctan2(directions[:, 1], directions[:, 0])
+    row = np.minimum(ECHO_HEIGHTS * (0.5 + 0.5 * height), ECHO_HEIGHTS - 1).astype(int)
+    column = np.floor(ECHO_AZIMUTHS * turn / (2.0 * np.pi)).astype(int) % ECHO_AZIMUTHS
+    area = ECHO_AZIMUTHS * row + column
+    area[delays.argmin()] = ECHO_HEIGHTS * ECHO_AZIMUTHS  # the direct sound, after all areas
+    lead = int(_LEAD_SECONDS * sample_rate)
+    samples = lead + np.rint(sample_rate * delays).astype(int)
+    length = lead + int((room.reverberation_time + _RESPONSE_SECONDS) * sample_rate)
+    impulses = np.zeros((ECHO_HEIGHTS * ECHO_AZIMUTHS + 1, length))
+    np.add.at(impulses, (area, samples), amplitudes)
+    direct = head_impulse_responses(unit_vectors([azimuth]), spacing, sample_rate)
+    responses = np.concatenate((_echo_impulse_responses(spacing, sample_rate), direct))
+    return _filter_sounds(torch.from_numpy(impulses), responses, sample_rate).numpy()
+
+
+@compute_once
+def _echo_impulse_responses(spacing: float, sample_rate: int) -> NDArray[np.float64]:
+    """Compute impulse responses from the centres of the areas from which echoes come.
+
+    The areas are numbered by height, from below, and then by azimuth, from the front to the left.
+    The constant parts are removed: those of thousands of echoes would add up to 100 times that of
+    the direct sound.
+
+    Shape: () -> (areas, microphones, ears, length), see ``head_impulse_responses``.
+    """
+    height = (2.0 * np.arange(ECHO_HEIGHTS) + 1.0) / ECHO_HEIGHTS - 1.0
+    flat = unit_vectors(360.0 * (np.arange(ECHO_AZIMUTHS) + 0.5) / ECHO_AZIMUTHS)
+    directions = np.sqrt(1.0 - height[:, None, None] ** 2) * flat
+    directions[..., 2] = height[:, None]
+    responses = head_impulse_responses(directions.reshape(-1, 3), spacing, sample_rate)
+    return responses - responses.mean(-1, keepdims=True)
 
 
 @compute_once

@@ -379,10 +379,13 @@ class _CompensatorBatches(_RandomBatches):
         snr = draw_uniform(*recipe.snr, (count,), generator)
         is_noisy = torch.rand(count, generator=generator) < recipe.noisy
         snr = torch.where(is_noisy, snr, _QUIET_SNR)
-        microphones = {"mismatch": recipe.mismatch}
+        settings = {
+            "mismatch": recipe.mismatch,
+            "reverberation_time": recipe.reverberation_time,
+        }
         if recipe.kind == "beamforming-aid":
-            microphones["spacing"] = BeamformerConfig.from_dict(recipe.model).spacing
-        scenes = draw_scenes(clean, voices, noise, snr, generator, **microphones)
+            settings["spacing"] = BeamformerConfig.from_dict(recipe.model).spacing
+        scenes = draw_scenes(clean, voices, noise, snr, generator, **settings)
         ears = self.draw_ears(count, generator).unsqueeze(1).expand(-1, 2, -1)
         return {"clean": scenes.reference, "signal": scenes.input, "thresholds": ears}
 
@@ -400,8 +403,8 @@ def _warn_of_settings_without_effect(recipe: CompensatorRecipe, data: TrainingDa
     unused: dict[str, Any] = {}  # by name, the value that the data have
     reason = ""
     if data.scenes:
-        unused = {"babble": 0.0, "equalised": 0.0, "mismatch": 0.0, "noisy": 1.0, "sounds": 0.0}
-        unused["snr"] = None
+        zero = ("babble", "equalised", "mismatch", "reverberation_time", "sounds")
+        unused = {**dict.fromkeys(zero, 0.0), "noisy": 1.0, "snr": None}
         reason = "recorded scenes, which are used as they are, except for their level"
     elif data.noise is None and _microphones_and_ears(recipe)[0] == 1:
         unused = {"noisy": 0.0, "snr": None}

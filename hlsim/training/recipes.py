@@ -172,6 +172,8 @@ class CompensatorRecipe(TrainingRecipe):
         snr: Lowest and highest signal-to-noise ratio in dB. The level of the speech is its active
             level, without pauses.
         mismatch: Standard deviation in dB of the gains of the microphones in random scenes.
+        reverberation_time: Longest reverberation time in s of the rooms of half of the random
+            scenes, 0.2 to 1.5; 0 for scenes without rooms. It needs the extra ``scenes``.
         unreduced: Share of items for which a hearing aid's noise reduction is off.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.
@@ -194,6 +196,7 @@ class CompensatorRecipe(TrainingRecipe):
     babble: float = 0.0
     snr: tuple[float, float] = (0.0, 20.0)
     mismatch: float = 0.0
+    reverberation_time: float = 0.0
     unreduced: float = 0.0
     loudness: float | dict[float, float] = 0.0
     limit_to_ear: bool = False
@@ -207,6 +210,7 @@ class CompensatorRecipe(TrainingRecipe):
         return (*CRITERIA, *_NOISE_REDUCTION_CRITERIA)
 
     def __post_init__(self) -> None:
+        from hlsim.data.rooms import REVERBERATION_TIMES  # imports torch
         from hlsim.metrics.pair import SHORTEST_SECONDS  # imports torch
 
         super().__post_init__()
@@ -220,6 +224,13 @@ class CompensatorRecipe(TrainingRecipe):
         self._require("kind", has_two_ears or not self.weights.get("interaural"), expected)
         expected = "beamforming-aid, or ears: 2 in model, because mismatch is that of microphones"
         self._require("kind", has_two_ears or not self.mismatch, expected)
+        has_rooms = self.reverberation_time != 0.0
+        expected = "beamforming-aid, or ears: 2 in model, because only random scenes have rooms"
+        self._require("kind", has_two_ears or not has_rooms, expected)
+        shortest, longest = REVERBERATION_TIMES
+        is_in_range = shortest <= self.reverberation_time <= longest
+        expected = f"0, or {shortest:g} to {longest:g} s"
+        self._require("reverberation_time", is_in_range or not has_rooms, expected)
         expected = "0 for two ears, because their scenes have other voices in any case"
         self._require("babble", not self.babble or not has_two_ears, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:
