@@ -13,7 +13,9 @@ adaptive front ends are separated by a second output, for the other sound with t
 the adaptive microphone, with 95 % intervals over the utterances, and the largest changes of the
 talker's differences between the ears, of the level over five octaves and of the time over the two
 octaves below 1 kHz (means over the utterances). The front end of a trained checkpoint is one of the
-beamformers, if there is one.
+beamformers, if there is one. The second table has the change of the level of a talker in quiet, at
+the front or beside it, relative to the front microphone, in third octaves at the ear that loses
+more.
 """
 
 import sys
@@ -31,10 +33,13 @@ from hlsim.audio import find_audio, read_audio
 from hlsim.calibration import set_level
 from hlsim.data.bundled import SPEECH
 from hlsim.data.rooms import Room
-from hlsim.data.scenes import make_scene
+from hlsim.data.scenes import make_scene, sound_at_microphones
+from hlsim.dsp.sphere import unit_vectors
 from hlsim.metrics.interaural import interaural_change
 from hlsim.metrics.sii import SII_BANDS
 
+TALKER_AZIMUTHS = (0.0, 5.0, 10.0, 20.0)
+OCTAVES = (250, 500, 1000, 2000, 4000)
 AZIMUTHS: dict[str, float | None] = {"90": 90.0, "135": 135.0, "180": 180.0, "all": None}
 SNR = -5.0
 SECONDS = 2.0
@@ -65,6 +70,21 @@ def measure(front_end: nn.Module, target: Tensor, noise: Tensor) -> tuple[float,
         float(change.level.abs().max()),
         float(change.time[:2].abs().max()),
     )
+
+
+def print_talker(front_ends: dict[str, nn.Module], speech: Tensor) -> None:
+    """Print the table of the level of a talker in quiet behind each front end."""
+    print("\n| front end | talker at | " + " | ".join(f"{octave} Hz" for octave in OCTAVES) + " |")
+    print("|---" * (2 + len(OCTAVES)) + "|")
+    chosen = [SII_BANDS.index(octave) for octave in OCTAVES]
+    for name, front_end in front_ends.items():
+        for azimuth in TALKER_AZIMUTHS:
+            at_microphones = sound_at_microphones(speech[None], unit_vectors([azimuth]))
+            change = band_levels(front_end(at_microphones)) - band_levels(at_microphones[0])
+            worse = change.min(0)[chosen]
+            print(
+                f"| {name} | {azimuth:g} | " + " | ".join(f"{level:.1f}" for level in worse) + " |"
+            )
 
 
 def speech_shaped_noise(samples: int, seed: int) -> Tensor:
@@ -119,6 +139,8 @@ def main(checkpoint: str | None = None, reverberation_time: str = "0") -> None:
                 f"{ahead.mean():.1f} [{ahead.mean() - margin:.1f}, {ahead.mean() + margin:.1f}] | "
                 f"{means[number, 1]:.1f} dB, {means[number, 2]:.0f} us |"
             )
+    speech = read_audio(find_audio(SPEECH / "valid")[0])[0][0]
+    print_talker({"adaptive": adaptive, **beamformers}, speech)
 
 
 if __name__ == "__main__":

@@ -74,7 +74,9 @@ def test_echoes_come_from_their_directions(monkeypatch: pytest.MonkeyPatch) -> N
         arrivals = Arrivals(
             np.array([0.0, 0.05]), np.array([0.0, 1.0]), np.stack((unit_vectors(0.0), echo))
         )
-        monkeypatch.setattr("hlsim.data.scenes.find_arrivals", lambda *_, arrivals=arrivals: arrivals)
+        monkeypatch.setattr(
+            "hlsim.data.scenes.find_arrivals", lambda *_, arrivals=arrivals: arrivals
+        )
         response = room_impulse_responses(room, 0.0)[..., 800 : 800 + 512]
         expected = head_impulse_responses(echo[None])[0]
         np.testing.assert_allclose(response, expected - expected.mean(-1, keepdims=True), atol=1e-6)
