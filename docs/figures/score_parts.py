@@ -21,7 +21,7 @@ PARTS = {
     "score": "both scores",
     "simulate_cochlea": "cochlea of the output, twice",
     "state_after_motion_noise": "counting of the noise, HASPI",
-    "draw_motion_noise": "drawing of the noise, HASQI",
+    "_threshold_noise": "drawing of the noise, HASQI",
     "align_channels": "alignment of channels",
     "segment_spectra": "spectra of segments",
     "nerve_levels": "adaptation of hair cells",
