@@ -112,14 +112,14 @@ def _process(
         ValueError: The single file failed or, once all are processed, a file of the folder did.
     """
     use_one_thread()
-    from hlsim.checks import LOWEST_RATE
+    from hlsim.calibration import NEURO_RATE
 
     ears = parse_ears(options)
     sliders = read_sliders(options)
     tasks = _plan_outputs(options.input, options.output, [*ears])
     build = cache(partial(build_model, options))
     if options.input.is_dir():
-        build(LOWEST_RATE)  # A model that cannot be loaded is reported before the first file.
+        build(NEURO_RATE)  # A model that cannot be loaded is reported before the first file.
     failures = 0
     with ProgressLine("outputs") as progress:
         for number, (source, target, name) in enumerate(tasks):
