@@ -16,6 +16,7 @@ from compensators.directional import (
     FilterAndSum,
     MicrophoneStream,
     front_blocking_taps,
+    look_ahead_samples,
     mvdr_taps,
 )
 from compensators.filter_bank import FRAME, HISTORY, HOP, filter_powers, level_db
@@ -27,7 +28,7 @@ from hlsim.calibration import NEURO_RATE, PASCAL_SPL, check_full_scale, gain_to_
 from hlsim.checkpoint import HubModel
 from hlsim.checks import check_settings
 from hlsim.dsp.resample import resample
-from hlsim.torchtools import Audio, as_samples, as_type_of, built_in_float32, constant
+from hlsim.torchtools import built_in_float32, constant
 
 LOOK_AHEAD_SAMPLES = 8
 """Look-ahead of the fixed filters and again of the adaptive ones in samples, 0.5 ms each."""
@@ -107,12 +108,15 @@ class AdaptiveBeamformer(FilterAndSum):
         nn.init.zeros_(decisions.weight)
         nn.init.zeros_(decisions.bias)
 
-    def forward(self, waveform: Audio, audiogram: AudiogramLike | None = None) -> Audio:
-        signals = as_samples(waveform)
-        self.check_microphones(signals)
-        output = super().forward(resample(signals, self.sample_rate, NEURO_RATE))
-        output = resample(output, NEURO_RATE, self.sample_rate)
-        return as_type_of(waveform, output[..., : signals.shape[-1]])
+    def delayed_output(self, waveform: Tensor) -> Tensor:
+        if self.sample_rate == NEURO_RATE:
+            return super().delayed_output(waveform)
+        self.check_microphones(waveform)
+        delayed = super().delayed_output(resample(waveform, self.sample_rate, NEURO_RATE))
+        output = resample(delayed[..., self.latency :], NEURO_RATE, self.sample_rate)
+        # The latency at 16 kHz need not be a whole number of samples at another rate.
+        samples = look_ahead_samples(self.sample_rate)
+        return functional.pad(output[..., : waveform.shape[-1]], (samples, 0))
 
     def stream(self, audiogram: AudiogramLike | None = None) -> MicrophoneStream:
         if self.sample_rate != NEURO_RATE:

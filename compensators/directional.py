@@ -105,10 +105,25 @@ class FilterAndSum(nn.Module):
                 or there is another number of microphones or ears.
         """
         signals = as_samples(waveform)
-        self.check_microphones(signals)
-        padded = functional.pad(signals, (0, self.latency))
-        output, _ = self.process(padded, self.initial_state(signals))
-        return as_type_of(waveform, output[..., self.latency :])
+        return as_type_of(waveform, self.delayed_output(signals)[..., -signals.shape[-1] :])
+
+    def delayed_output(self, waveform: Tensor) -> Tensor:
+        """Return the output for whole signals as a stream returns it: late by the look-ahead.
+
+        The frames of an aid begin at the first sample of its input. So an aid that gets this output
+        changes its gains at the same times as behind the stream.
+
+        Args:
+            waveform: Signals of the microphones.
+
+        Shape: (..., microphones, ears, time) -> (..., ears, latency + time).
+
+        Raises:
+            ValueError: See ``forward``.
+        """
+        self.check_microphones(waveform)
+        padded = functional.pad(waveform, (0, self.latency))
+        return self.process(padded, self.initial_state(waveform))[0]
 
     def check_microphones(self, waveform: Tensor) -> None:
         """Raise ValueError unless a waveform has as many microphones and ears as the filters."""
@@ -178,9 +193,8 @@ class FilterAndSum(nn.Module):
 class MicrophoneStream:
     """A front end for signals that arrive in chunks: a function from a chunk to the next output.
 
-    The output has no gradients, and is delayed by the ``latency`` of the front end and of the aid.
-    Without an aid, it is that for the whole signal. With an aid, the aid's gains change at other
-    times than for the whole signal, because the front end delays its input.
+    The output is that for the whole signal, without gradients, and is delayed by the ``latency`` of
+    the front end and of the aid.
 
     Args:
         front_end: Front end with ``process`` and ``initial_state``.
@@ -415,8 +429,9 @@ class DirectionalAid(nn.Module):
             ValueError: The waveform has another number of microphones or ears, or the aid rejects
                 an ear or a slider.
         """
-        output: Tensor = self.aid(self.front_end(waveform), audiogram, **sliders)
-        return output
+        delayed = self.front_end.delayed_output(waveform)
+        output: Tensor = self.aid(delayed, audiogram, **sliders)
+        return output[..., -waveform.shape[-1] :]
 
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Measure the insertion gains of the aid behind the front end, see ``Aid.gains``.
