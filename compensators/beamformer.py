@@ -89,7 +89,7 @@ class AdaptiveBeamformer(FilterAndSum):
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
-        config = config or BeamformerConfig()
+        config = BeamformerConfig.resolve(config)
         beams = mvdr_taps(config.loading, config.spacing, NEURO_RATE, LOOK_AHEAD_SAMPLES)
         blocking = front_blocking_taps(beams, config.spacing, LOOK_AHEAD_SAMPLES)
         beams = np.pad(beams, [(0, 0)] * 3 + [(0, blocking.shape[-1] - beams.shape[-1])])
@@ -228,7 +228,7 @@ class BeamformingAid(DirectionalAid, HubModel):
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
-        config = config or BeamformerConfig()
+        config = BeamformerConfig.resolve(config)
         aid_config = HearingAidConfig.from_dict(config.aid)
         levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
         super().__init__(
@@ -236,6 +236,10 @@ class BeamformingAid(DirectionalAid, HubModel):
             HearingAid(audiogram, aid_config, **levels),
         )
         self.config = replace(config, aid=aid_config.to_dict())
+
+    def unsaved_settings(self) -> dict[str, Any]:
+        settings: dict[str, Any] = self.aid.unsaved_settings()
+        return settings
 
 
 def _subtract(frames: Tensor, weights: Tensor) -> Tensor:

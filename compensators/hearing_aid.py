@@ -115,7 +115,7 @@ class HearingAid(Wearable, HubModel):
         super().__init__(audiogram, sample_rate, full_scale_spl, linked, limit_to_ear)
         check_number("loudness", loudness, *LOUDNESS_RANGE)
         self.loudness = loudness
-        self.config = config = config or HearingAidConfig()
+        self.config = config = HearingAidConfig.resolve(config)
         self.bands = config.bands
         self.limit_spl = config.limit_spl
         self.state_shapes = {

@@ -1,6 +1,5 @@
 """Loading of compensators by name, and saving of trained ones in folders."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +29,6 @@ UNTRAINED: dict[str, type[NALR | WDRC]] = {
     "camfit": CAMFIT,
 }
 """Compensators without a checkpoint."""
-
-_UNSAVED_SETTINGS = {
-    "sample_rate": NEURO_RATE,
-    "full_scale_spl": PASCAL_SPL,
-    "linked": False,
-    "loudness": 0.0,
-    "limit_to_ear": False,
-}
-"""Settings of ``load_compensator`` that checkpoints do not store, with their default values."""
 
 
 def load_compensator(
@@ -107,8 +97,7 @@ def save_compensator(model: Trained, folder: str | Path, audiogram: EarLike | No
 
     A checkpoint that is already there is replaced. A card, README.md, is written too, unless the
     folder has one that hlsim did not write. The sample rate, ``full_scale_spl``, ``linked``,
-    ``limit_to_ear`` and ``loudness`` are not saved; pass them to ``load_compensator``. A warning
-    names those that differ from their default, because the loaded aid has other outputs.
+    ``limit_to_ear`` and ``loudness`` are not saved, see ``save_pretrained``.
 
     Args:
         model: Compensator to save.
@@ -129,14 +118,6 @@ def save_compensator(model: Trained, folder: str | Path, audiogram: EarLike | No
         raise ValueError(
             "expected a MappingCompensator, a HearingAid or a BeamformingAid to save, got "
             f"{type(model).__name__}"
-        )
-    aid = behind_front_end(model)
-    values = {name: getattr(aid, name, default) for name, default in _UNSAVED_SETTINGS.items()}
-    texts = [f"{name}={v!r}" for name, v in values.items() if v != _UNSAVED_SETTINGS[name]]
-    if texts:
-        warnings.warn(
-            f"the checkpoint does not store {', '.join(texts)}; pass this to load_compensator",
-            stacklevel=2,
         )
     ear = None if audiogram is None else as_audiogram(audiogram).to_dict()
     model.save_pretrained(folder, about={"audiogram": ear})

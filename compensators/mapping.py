@@ -95,7 +95,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
     ) -> None:
         EarNetwork.__init__(self, sample_rate, full_scale_spl)
         self.store_ears(audiogram)
-        self.config = config = config or MappingConfig()
+        self.config = config = MappingConfig.resolve(config)
         self.stft = config.stft
         sizes = config.channels, config.dense_depth, config.stride
         is_predicted = config.phase == "predicted"

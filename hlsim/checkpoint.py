@@ -9,8 +9,10 @@ loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-
 """
 
 import hashlib
+import inspect
 import json
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -349,6 +351,10 @@ class HubModel:
     ) -> None:
         """Save the model as a checkpoint, in place of an older one in the same folder.
 
+        The sample rate, ``full_scale_spl`` and other arguments of the constructor beside ``config``
+        are not saved; pass them when the model is loaded. A warning names those that differ from
+        their default, because the loaded model has other outputs.
+
         Args:
             folder: Folder to write.
             license: Licence of the weights, such as ``"mit"``, for the card.
@@ -359,6 +365,12 @@ class HubModel:
             ValueError: A weight is NaN or infinite, or the folder cannot be written.
         """
         assert isinstance(self, nn.Module)
+        texts = [f"{name}={value!r}" for name, value in self.unsaved_settings().items()]
+        if texts:
+            warnings.warn(
+                f"the checkpoint does not store {', '.join(texts)}; pass this when you load it",
+                stacklevel=2,
+            )
         card: dict[str, Any] = {}
         if license:
             card["license"] = license
@@ -366,6 +378,23 @@ class HubModel:
             card["datasets"] = [*datasets]
         record = {"hlsim": __version__, **(about or {})}
         save_checkpoint(folder, self.kind, self, self.config.to_dict(), record, card)
+
+    def unsaved_settings(self) -> dict[str, Any]:
+        """Return the settings that a checkpoint does not store and that differ from their default.
+
+        They are the arguments of constructors that have to be passed by their names, except those
+        that the model does not keep as an attribute.
+        """
+        constructors = [vars(base).get("__init__") for base in type(self).__mro__]
+        parameters = [
+            parameter
+            for construct in constructors
+            if construct is not None
+            for parameter in inspect.signature(construct).parameters.values()
+        ]
+        defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
+        values = {name: getattr(self, name, default) for name, default in defaults.items()}
+        return {name: value for name, value in values.items() if value != defaults[name]}
 
     @classmethod
     def from_pretrained(

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import warnings
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from compensators import load_compensator
+from compensators import HearingAid, HearingAidConfig, MappingCompensator, load_compensator
+from compensators.beamformer import AdaptiveBeamformer, BeamformingAid
 from hlsim import NeuroMSBG, list_pretrained, load_pretrained
 from hlsim.checkpoint import read_record, save_checkpoint
+from hlsim.evaluation.digits import DigitListener
 from hlsim.neuro import NeuroConfig
 
 FILES = {"model.safetensors", "config.json", "README.md"}
@@ -143,6 +146,28 @@ def test_weights_that_are_not_finite_are_not_saved(folder: Path) -> None:
     with pytest.raises(ValueError, match="expected finite weights, got NaN or infinity in"):
         save(folder, model)
     load_pretrained(folder)
+
+
+def test_settings_of_a_network_that_are_not_saved_cause_a_warning(tmp_path: Path) -> None:
+    model = NeuroMSBG(SMALL, sample_rate=44100, full_scale_spl=100.0)
+    expected = "does not store sample_rate=44100, full_scale_spl=100.0; pass this when you load it"
+    with pytest.warns(UserWarning, match=expected):
+        model.save_pretrained(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        NeuroMSBG(SMALL).save_pretrained(tmp_path)
+        DigitListener().save_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("config", [{"channels": 8}, "small", HearingAidConfig, SMALL])
+@pytest.mark.parametrize(
+    "build",
+    [MappingCompensator, HearingAid, BeamformingAid, AdaptiveBeamformer, DigitListener, NeuroMSBG],
+)
+def test_a_configuration_of_another_type_is_an_error(build: Any, config: Any) -> None:
+    if (build, config) != (NeuroMSBG, SMALL):
+        with pytest.raises(ValueError, match=r"expected config to be a \w+Config, got "):
+            build(config=config)
 
 
 def test_changed_weights_are_rejected(folder: Path) -> None:

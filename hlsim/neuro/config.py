@@ -37,10 +37,35 @@ class ModelConfig:
             data: Values under the names of settings. Missing settings have their default values.
 
         Raises:
-            ValueError: A name is unknown, or a value is not accepted.
+            ValueError: The data are no dict, a name is unknown, or a value is not accepted.
         """
+        if not isinstance(data, Mapping):
+            raise ValueError(
+                f"expected a dict from the names of network settings to values, got "
+                f"{describe(data)}"
+            )
         check_names(data, (field.name for field in fields(cls)), "network settings")
         return cls(**data)
+
+    @classmethod
+    def resolve(cls, config: Any) -> Self:
+        """Return a configuration of this class, or the default one in place of None.
+
+        Args:
+            config: Argument ``config`` of a model.
+
+        Raises:
+            ValueError: The argument is neither None nor a configuration of this class.
+
+        >>> NeuroConfig.resolve(None) == NeuroConfig()
+        True
+        """
+        if config is None:
+            return cls()
+        if not isinstance(config, cls):
+            fix = f"; write {cls.__name__}.from_dict({{...}})" if isinstance(config, dict) else ""
+            raise ValueError(f"expected config to be a {cls.__name__}, got {describe(config)}{fix}")
+        return config
 
 
 @dataclass(frozen=True)

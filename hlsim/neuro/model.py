@@ -102,7 +102,7 @@ class NeuroMSBG(EarNetwork, HubModel):
         # ``NeuroMSBG(config)`` is an object of the subclass for the structure of the configuration.
         kind: type = cls
         if cls is NeuroMSBG:
-            is_bands = config is None or config.structure == "bands"
+            is_bands = NeuroConfig.resolve(config).structure == "bands"
             kind = BandNeuroMSBG if is_bands else DualPathNeuroMSBG
         return super().__new__(kind)
 
@@ -115,7 +115,7 @@ class NeuroMSBG(EarNetwork, HubModel):
         compute_prior: bool = True,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        self.config = config = config or NeuroConfig()
+        self.config = config = NeuroConfig.resolve(config)
         self.stft = config.stft
         # Training may run the network in bfloat16, but not the prior and the transforms.
         self.autocast_dtype: torch.dtype | None = None

@@ -150,7 +150,7 @@ def test_settings_that_are_not_saved_cause_a_warning(tmp_path: Path, name: str) 
     aid = load_compensator(
         name, sample_rate=48000, full_scale_spl=100.0, limit_to_ear=True, loudness=-10.0
     )
-    text = "sample_rate=48000, full_scale_spl=100.0, loudness=-10.0, limit_to_ear=True; pass"
+    text = "sample_rate=48000, full_scale_spl=100.0, limit_to_ear=True, loudness=-10.0; pass"
     with pytest.warns(UserWarning, match=f"does not store {text}"):
         save_compensator(aid, tmp_path)
     with warnings.catch_warnings():

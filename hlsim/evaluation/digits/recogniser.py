@@ -74,7 +74,7 @@ class DigitListener(nn.Module, HubModel):
 
     def __init__(self, config: DigitListenerConfig | None = None) -> None:
         super().__init__()
-        self.config = config = config or DigitListenerConfig()
+        self.config = config = DigitListenerConfig.resolve(config)
         self.stft = STFT(fft=512, window=400, hop=NEURO_RATE // 100)
         self.register_buffer("bands", self._band_weights(), persistent=False)
         slot_frames = SLOT_SAMPLES // self.stft.hop
