@@ -6,6 +6,7 @@ from compensators import HearingAid, load_compensator, save_compensator
 from docs.figures.train_tones import find_levels, main, steady_level
 from hlsim import MSBG
 from hlsim.calibration import set_level
+from hlsim.checkpoint import read_record
 from hlsim.data.bundled import SPEECH
 
 
@@ -23,7 +24,7 @@ def test_found_levels_are_perceived_as_loud_as_by_a_normal_ear():
     assert torch.allclose(bounded_targets.levels, torch.tensor([55.0, 72.0]), atol=0.1)
 
 
-def test_only_the_amplification_is_trained(tmp_path):
+def test_only_the_amplification_is_trained_and_the_settings_are_recorded(tmp_path):
     table = tmp_path / "ears.csv"
     frequencies = "250,500,1000,2000,3000,4000,6000,8000"
     table.write_text(f"name,{frequencies}\nA,20,30,50,60,60,60,60,60\n")
@@ -39,3 +40,6 @@ def test_only_the_amplification_is_trained(tmp_path):
         if not torch.equal(weight, trained[name])
     }
     assert changed == {"correct"}
+    about = read_record(tmp_path / "trained")["about"]
+    assert about["start_sha256"] == read_record(tmp_path / "start")["sha256"]
+    assert (about["steps"], about["recipe"]["tones"], about["recipe"]["seed"]) == (2, 3, 8)

@@ -26,6 +26,7 @@ from __future__ import annotations
 import argparse
 import copy
 import math
+import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
@@ -36,11 +37,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 from whisper_likelihood import TextLikelihood, read_weights
 
-from compensators import HearingAid, load_compensator, save_compensator
+from compensators import HearingAid, load_compensator
 from examples.machine_listener import PEAK, RATE, Whisper, agreed_text, internal_noise
 from hlsim import MSBG
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
+from hlsim.checkpoint import read_record
 from hlsim.data.augment import draw_uniform
 from hlsim.data.clips import Clips
 from hlsim.data.ears import draw_thresholds
@@ -263,7 +265,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--out", required=True, help="folder of the checkpoint that is written")
     options = parser.parse_args(arguments)
-    aid = load_compensator(options.start)
+    start_time = time.monotonic()
+    aid, start = load_compensator(options.start), read_record(options.start)
     recogniser = Whisper(options.model)
     weights = read_weights(recogniser.folder / "model.bin", options.device)
     mel_filters = recogniser.mel_filters.to(options.device)
@@ -276,7 +279,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = draw_text_clips(speech, recogniser, likelihood, options.clips, generator)
     batches = draw_batches(clips, noise, measured_ears, options.batch, generator)
     train(aid, batches, likelihood, options.steps)
-    save_compensator(aid, options.out)
+    about = {
+        "start_sha256": start["sha256"],
+        "audiogram": None,
+        "simulator": "msbg",
+        "recogniser": options.model,
+        "recipe": {
+            "speech": options.speech,
+            "noise": options.noise,
+            "audiograms": options.audiograms,
+            "weights": WEIGHTS,
+            "batch": options.batch,
+            "seconds": SECONDS,
+            "levels": LEVELS,
+            "snr": SNRS,
+            "learning_rate": LEARNING_RATE,
+            "clips": options.clips,
+            "seed": options.seed,
+        },
+        "steps": options.steps,
+        "minutes": round((time.monotonic() - start_time) / 60.0, 1),
+        "device": options.device,
+        "before": start["about"],
+    }
+    aid.save_pretrained(options.out, about=about)
 
 
 if __name__ == "__main__":

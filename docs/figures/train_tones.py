@@ -14,6 +14,7 @@ levels. For speech, noise and clicks it is trained towards the gains that the ai
 import argparse
 import copy
 import math
+import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,11 +22,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from compensators import HearingAid, load_compensator, save_compensator
+from compensators import HearingAid, load_compensator
 from compensators.filter_bank import HISTORY, frame_power
 from hlsim import MSBG
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
+from hlsim.checkpoint import read_record
 from hlsim.data.augment import draw_uniform
 from hlsim.data.clips import Clips
 from hlsim.data.ears import draw_thresholds
@@ -200,7 +202,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=8, help="seed of all random numbers")
     parser.add_argument("--out", required=True, help="folder of the checkpoint that is written")
     options = parser.parse_args(arguments)
-    aid = load_compensator(options.start)
+    start_time = time.monotonic()
+    aid, start = load_compensator(options.start), read_record(options.start)
     settings = {"sample_rate": NEURO_RATE, "seconds": SECONDS}
     speech = Clips(options.speech, **settings)
     noise = Clips(options.noise, **settings, repeat=True)
@@ -216,7 +219,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parts.append(find_levels(sound, ears, highest))
     tones = Tones(*map(torch.cat, zip(*parts, strict=True)))
     train(aid, tones, speech, noise, measured, options.steps, generator)
-    save_compensator(aid, options.out)
+    about = {
+        "start_sha256": start["sha256"],
+        "audiogram": None,
+        "simulator": "msbg",
+        "trained": "correction of the gains, towards normal loudness of steady tones, and towards "
+        "the gains of the start for speech, noise and clicks",
+        "recipe": {
+            "speech": options.speech,
+            "noise": options.noise,
+            "audiograms": options.audiograms,
+            "tones": options.tones,
+            "tones_per_step": TONES_PER_STEP,
+            "others_per_step": OTHERS_PER_STEP,
+            "learning_rate": LEARNING_RATE,
+            "seed": options.seed,
+        },
+        "steps": options.steps,
+        "minutes": round((time.monotonic() - start_time) / 60.0, 1),
+        "device": "CPU",
+        "before": start["about"],
+    }
+    aid.save_pretrained(options.out, about=about)
 
 
 if __name__ == "__main__":
