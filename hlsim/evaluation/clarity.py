@@ -214,6 +214,7 @@ def evaluate_scenes(
         listen=listen,
         played=[UNAIDED, NAL_R, *aid_names],
         store=Path(out) / "scores.jsonl",
+        required=["haspi", "hasqi"],
         **running,
     )
     combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)

@@ -263,6 +263,7 @@ def evaluate_compensators(
             "simulator": str(simulator),
             "enhancers": list(map(str, enhancer_plugins.values())),
         },
+        required=["haspi", "hasqi", "level", "loudness_error", "loss_neuro"],
         **running,
     )
     table = evaluation.table

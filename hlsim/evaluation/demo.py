@@ -89,6 +89,7 @@ def evaluate_trained_aid(
             "training_steps": training_steps,
             "limit_spl": MappingConfig().limit_spl,
         },
+        required=["haspi", "level", "loudness_error"],
         **running,
     )
     outputs, perceived = _process(items, conditions, audiogram)

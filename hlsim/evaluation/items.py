@@ -231,7 +231,7 @@ def _warn_of_silence(items: Sequence[Item]) -> None:
             f"{silent} of {len(items)} items end in silence for more than a tenth of their length, "
             "for example because recordings are shorter. The silence counts in the level, so the "
             "speech is louder than stated; choose shorter items (seconds, --seconds) or longer "
-            "recordings",
+            "recordings.",
             stacklevel=3,
         )
 

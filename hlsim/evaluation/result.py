@@ -96,6 +96,7 @@ class Evaluation:
         *,
         store: str | Path | None,
         settings: Mapping[str, Any],
+        required: Sequence[str] = (),
         **running: Any,
     ) -> Evaluation:
         """Score every output of a study, and return its evaluation without statistical tests.
@@ -108,31 +109,43 @@ class Evaluation:
                 run reads them; None stores nothing.
             settings: Settings to record in the evaluation, such as the seed, each under its name.
                 This method does not use them.
+            required: Columns of the table without which the study has no result.
             running: Arguments ``jobs``, ``dask`` and ``progress`` of ``run_study``.
 
         Raises:
-            ValueError: No output could be scored, or an argument is not valid, see ``run_study``.
+            ValueError: No output could be scored, a required column has no value, or an argument is
+                not valid, see ``run_study``.
             OSError: The store cannot be read.
             MissingExtraError: A package is not installed.
         """
         table, measures = run_measures(items, conditions, measures, ScoreStore(store), **running)
         evaluation = cls(items, conditions, measures, table, settings=settings)
+        for column in required:
+            evaluation.check_values([column], f"has a value of {column}")
         evaluation.check_scores()
         return evaluation
 
     def check_scores(self) -> None:
-        """Raise ValueError if the table has no score at all.
+        """Raise ValueError if the table has no score at all."""
+        self.check_values(self.scores, "could be scored")
 
-        The message has the reason of the first failure.
+    def check_values(self, columns: Sequence[str], predicate: str) -> None:
+        """Raise ValueError if the table has no value in any of some columns.
+
+        Args:
+            columns: Names of the columns. A column that the table lacks has no values.
+            predicate: Predicate of the sentence that begins with "none of the items". The message
+                also has the reason of the first failure.
         """
-        if self.table.reindex(columns=self.scores).isna().all(axis=None):
-            if self.failures.empty:
-                raise ValueError("the measures returned no score; return one or more numbers")
-            first = self.failures.iloc[0]
-            raise ValueError(
-                f"none of {self.table['item'].nunique()} items could be scored; the first, "
-                f"{first['name']} under {first['condition']}: {first['failure']}"
-            )
+        if not self.table.reindex(columns=columns).isna().all(axis=None):
+            return
+        if self.failures.empty:
+            raise ValueError("the measures returned no score; return one or more numbers")
+        first = self.failures.iloc[0]
+        raise ValueError(
+            f"none of {self.table['item'].nunique()} items {predicate}; the first, "
+            f"{first['name']} under {first['condition']}: {first['failure']}"
+        )
 
     @property
     def names(self) -> list[str]:

@@ -87,7 +87,7 @@ def evaluate_simulators(
         SNR of every simulator is compared with that of the first one in ``simulators``.
 
     Raises:
-        ValueError: Data or settings are not valid, or no item has a value.
+        ValueError: Data or settings are not valid, or no item has an SNR.
         MissingExtraError: pandas or pystoi is not installed. Without pesq, PESQ is left out.
 
     >>> from hlsim import MSBG
@@ -116,6 +116,7 @@ def evaluate_simulators(
         scores,
         store=store,
         settings={"teacher": teacher, **settings, "inputs": inputs},
+        required=["snr"],
         **running,
     )
     groups: dict[str, Evaluation] = {}

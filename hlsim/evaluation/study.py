@@ -314,6 +314,7 @@ def run_study(
     >>> run_study(items, conditions, measures, jobs=1)["peak"].tolist()
     [1.0]
     """
+    check_scheduler(dask)
     return run_measures(items, conditions, measures, store, progress, jobs=jobs, dask=dask)[0]
 
 
@@ -347,7 +348,6 @@ def run_measures(
     ['count']
     """
     pandas = require("pandas", "eval")
-    check_scheduler(running.get("dask"))
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
     facts = {fact for source in items for fact in source.facts}

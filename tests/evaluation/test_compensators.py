@@ -262,6 +262,18 @@ def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
             evaluate_compensators(**settings)
 
 
+def test_an_evaluation_without_any_loudness_error_names_the_reason(
+    options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any) -> Tensor:
+        raise ValueError("the simulator is broken")
+
+    monkeypatch.setattr("hlsim.evaluation.measures.perceive", fail)
+    options |= {"noise": None, "items": 1, "audiogram": N3}
+    with pytest.raises(ValueError, match=r"has a value of loudness_error; .*simulator is broken"):
+        evaluate_compensators({"mine": Unaided()}, **options)
+
+
 def test_command(
     options: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

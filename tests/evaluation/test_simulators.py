@@ -96,6 +96,19 @@ def test_a_treatment_without_any_value_does_not_prevent_the_page(options: dict[s
     assert page.markdown().count("too loud") == 1
 
 
+def test_an_evaluation_without_any_snr_names_the_reason(
+    options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any) -> float:
+        raise ValueError("the score is broken")
+
+    (tmp_path / "mine.py").write_text("def count(item, output):\n    return {'count': len(output)}")
+    monkeypatch.setattr("hlsim.metrics.fidelity.snr_db", fail)
+    settings = {**options, "items": 1, "measures": [f"{tmp_path}/mine.py:count"]}
+    with pytest.raises(ValueError, match=r"none of 1 items has a value of snr; .*score is broken"):
+        evaluate_simulators({"soft": Soft()}, **settings)
+
+
 TEACHERS = """
 def same(waveform, audiogram):
     return waveform
