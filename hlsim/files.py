@@ -107,13 +107,19 @@ def check_output_folder(folder: str | Path) -> None:
         raise ValueError(f"{folder}: cannot write to this folder ({reason}); choose another one")
 
 
-def check_output_file(path: str | Path) -> None:
+def check_output_file(path: str | Path, inputs: Iterable[Path] = ()) -> None:
     """Raise ValueError unless a file can be written, whose folder need not exist yet.
+
+    Args:
+        path: File to write.
+        inputs: Files that must not be replaced.
 
     >>> check_output_file(f"{tempfile.gettempdir()}/page.html")
     """
     if Path(path).is_dir():
         raise ValueError(f"{path}: expected the name of a file, got a folder; add a name")
+    if Path(path).resolve() in [file.resolve() for file in inputs]:
+        raise ValueError(f"{path}: refusing to overwrite the input; choose another name")
     check_output_folder(Path(path).parent)
 
 

@@ -62,7 +62,7 @@ def _listen(options: argparse.Namespace) -> None:
     from hlsim.files import check_output_file, write_atomically
     from hlsim.report.page import Page
 
-    check_output_file(options.out)
+    check_output_file(options.out, options.files)
     ears = parse_ears(options)
     simulator = cache(partial(build_simulator, options))
     aid = cache(partial(build_single_microphone_aid, options))

@@ -187,6 +187,8 @@ def evaluate_scenes(
     rate = read_audio(pairs[0].mix)[1]
     levels = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
     conditions = _make_conditions(aids, folders, enhancers, linked, **levels)
+    for condition in conditions:
+        _check_existing_outputs(condition, folders, Path(out))
     look_ahead_ms = {
         c.name: _measure_look_ahead(c, pairs[0], rate, microphones)
         for c in track(conditions, "conditions", len(conditions))
@@ -391,6 +393,23 @@ def _make_conditions(
         if names.count(folder) > 1:
             raise ValueError(f"two labels would have the same folder, {folder}; rename one of them")
     return [*conditions, *(Condition(label) for label in folders)]
+
+
+def _check_existing_outputs(condition: Condition, folders: Mapping[str, Path], out: Path) -> None:
+    """Raise ValueError if the outputs of a condition would replace existing ones.
+
+    Args:
+        condition: Condition of the study.
+        folders: Folders of existing outputs, by the label of their aid.
+        out: Folder of the results.
+    """
+    target = out / "signals" / _folder_name(condition)
+    for label, folder in folders.items():
+        if condition.process is not None and folder.resolve() == target.resolve():
+            raise ValueError(
+                f"{folder}: the outputs of {condition.name} would replace those of {label}; choose "
+                "another folder for the results (out, --out)"
+            )
 
 
 def _folder_name(condition: Condition) -> str:

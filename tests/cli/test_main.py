@@ -150,6 +150,9 @@ listen {speech} --audiogram N3 --compensator hearing-aid-directional --out {out}
 srt --audiogram N3 --compensator hearing-aid-directional | one signal per ear
 listen {speech} --audiogram N3 --out {folder} | got a folder; add a name
 listen {speech} --audiogram N3 --out {text}/page.html | text.wav is a file
+listen {text} {speech} --audiogram N3 --out {speech} | refusing to overwrite the input
+verify {speech} {speech} --audiogram N3 --csv {speech} | refusing to overwrite the input
+verify {speech} {speech} --audiogram N3 --plot {folder} | got a folder; add a name
 listen {speech} {text} --audiogram N3 --simulator no-such --out {out} | text.wav: cannot
 haspi-report --clean {folder} --after {folder} --out {text} | text.wav is a file
 evaluate-compensator nalr --speech {folder} --out {text}/judged | text.wav is a file

@@ -338,6 +338,19 @@ def test_three_microphones_are_averaged_or_handed_to_an_aid(clarity: Path, tmp_p
         evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
 
 
+def test_existing_outputs_that_an_aid_would_replace_are_rejected(
+    clarity: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "signals" / "mine"
+    folder.mkdir(parents=True)
+    output = folder / "S06001_L0001_HA-output.wav"
+    shutil.copy(clarity / "scenes" / "S06001_mix_CH1.wav", output)
+    contents = output.read_bytes()
+    with pytest.raises(ValueError, match="outputs of mine would replace those of old; choose"):
+        evaluate_scenes({"mine": "wdrc"}, out=tmp_path, **options(clarity, outputs={"old": folder}))
+    assert output.read_bytes() == contents
+
+
 LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
 
 

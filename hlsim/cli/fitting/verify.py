@@ -44,8 +44,10 @@ def _verify(options: argparse.Namespace) -> None:
     from hlsim.audio import read_audio
     from hlsim.calibration import full_scale_at
     from hlsim.evaluation.fitting.verification import verify as verify_aid
-    from hlsim.files import write_atomically
+    from hlsim.files import check_output_file, write_atomically
 
+    for file in filter(None, (options.csv, options.plot)):
+        check_output_file(file, [options.input, options.output])
     ear = parse_ear(options)
     warn_of_other_ears({options.target: options.target}, ear)
     (input_, rate), (output, output_rate) = map(read_audio, (options.input, options.output))
