@@ -58,8 +58,9 @@ def split_into_blocks(
 ) -> list[Block]:
     """Divide a signal into overlapping blocks, whose outputs together are as long as the signal.
 
-    A signal of up to one and a half hops is one block, and so is any signal if the hop is 0. The
-    output of the last block covers half a hop to one and a half hops.
+    A signal of up to one and a half hops and the lead is one block, and so is any signal if the hop
+    is 0. The output of the last block covers half a hop to one and a half hops. So the input of a
+    block is not divided again if it is passed as a signal, unless the lag is above half a hop.
 
     Args:
         samples: Length of the signal.
@@ -73,9 +74,9 @@ def split_into_blocks(
     Block(input_start=40, output_start=50, output_stop=100, input_stop=100)
     """
     hop = hop // unit * unit
-    if hop == 0 or samples <= 1.5 * hop:
-        return [Block(0, 0, samples, samples)]
     lead_samples = math.ceil(lead / unit) * unit
+    if hop == 0 or samples <= 1.5 * hop + lead_samples:
+        return [Block(0, 0, samples, samples)]
     lag_samples = math.ceil(lag / unit) * unit
     starts = list(range(0, samples - hop // 2, hop))
     stops = [*starts[1:], samples]

@@ -82,8 +82,9 @@ def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[
     value, which is 0.64 s at 16 kHz and 16 s at 16384 Hz. The input of a block begins at least
     0.75 s earlier than its output and ends at least 0.55 s later, because MSBG's filters make the
     output depend on these margins; the result for the margins is discarded. A signal of up to one
-    and a half blocks is not divided. Each block begins where the frames of smearing and the steps
-    of envelopes lie at the same samples as in the whole signal.
+    and a half blocks and the first margin is not divided, nor is the input of a block. Each
+    block begins where the frames of smearing and the steps of envelopes lie at the same samples as
+    in the whole signal.
 
     Args:
         samples: Length of the signal in samples.
