@@ -15,7 +15,7 @@ from tests.helpers import mostly_slow
 # Modules in which a public function or class may lack an example, such as those of commands and
 # pages, whose results are files. Remove yours when each has one.
 WITHOUT_EXAMPLES = re.compile(
-    r"hlsim\.(audiogram\.(scale|published)|cli\..*|demo|evaluation\.(clarity|demo)"
+    r"hlsim\.(audiogram\.published|cli\..*|demo|evaluation\.(clarity|demo)"
     r"|report\.(compensators|demo)_page|training\.trainer|version)"
 )
 

@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hlsim.audiogram.scale import HIGHEST_HZ, HIGHEST_UCL, LOWEST_HZ, LOWEST_UCL, UCL_NOT_REACHED
+from hlsim.audiogram.scale import HIGHEST_HZ, HIGHEST_UCL, LOWEST_HZ, LOWEST_UCL
 
 Levels = TypeVar("Levels")
 
@@ -95,35 +94,3 @@ def read_points(ucl: UclLike | None) -> Points:
     if len({hz for hz, _ in points}) < len(points):
         raise ValueError(f"expected one uncomfortable level per frequency, got {ucl!r}")
     return tuple(points)
-
-
-def uncomfortable_levels_at(
-    points: Points,
-    thresholds_at_points: NDArray[np.float64],
-    frequencies: Sequence[float],
-    thresholds: NDArray[np.float64],
-) -> tuple[float, ...]:
-    """Return the uncomfortable levels of an ear in dB HL, measured ones or else predicted ones.
-
-    The difference between measured and predicted levels is interpolated over log frequency, and
-    constant beyond the lowest and the highest frequency that was measured. A measured level of 115
-    dB HL or more was not reached: it counts only if it is above the prediction.
-
-    Args:
-        points: Measured levels.
-        thresholds_at_points: Thresholds of the ear in dB HL at their frequencies.
-        frequencies: Frequencies of the result in Hz.
-        thresholds: Thresholds of the ear in dB HL at these frequencies.
-
-    >>> at_1_khz = ((1000.0, 90.0),)
-    >>> uncomfortable_levels_at(at_1_khz, np.array([50.0]), [2000.0], np.array([50.0]))
-    (90.0,)
-    """
-    predicted = predict_uncomfortable_levels(thresholds)
-    if points:
-        hertz, levels = np.array(points).T
-        difference = levels - predict_uncomfortable_levels(thresholds_at_points)
-        is_reached = levels < UCL_NOT_REACHED
-        difference = np.where(is_reached, difference, np.maximum(difference, 0.0))
-        predicted = predicted + np.interp(np.log(frequencies), np.log(hertz), difference)
-    return tuple(predicted.tolist())

@@ -20,7 +20,7 @@ from hlsim.audiogram.published import (
     FREE_FIELD_THRESHOLD_SPL,
     PRESCRIPTION_TABLES,
 )
-from hlsim.audiogram.scale import FREQUENCIES
+from hlsim.audiogram.scale import FREQUENCIES, interpolate_over_log
 from hlsim.torchtools import constant
 
 Frequencies = tuple[float, ...]
@@ -79,15 +79,10 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     tensor([ 0.,  2., 13., 14., 15., 16., 18., 18.])
     """
     losses = torch.cat((thresholds[..., :4], thresholds[..., 5:7]), -1)  # without 3 and 8 kHz
-    three_frequency_sum = losses[..., 1:4].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
-    common = _common_gain(three_frequency_sum)
-    bias = _table("nalr_bias", like=losses)
-    gains = (common + 0.31 * losses + bias).clamp_min(0.0)
+    gains = _nal_gains(losses, losses[..., 1:4], _table("nalr_bias", like=losses))
     low, high = gains[..., :4], gains[..., 4:]
     at_3_khz = 0.5 * (low[..., -1:] + high[..., :1])
-    all_gains = torch.cat((low, at_3_khz, high, high[..., -1:]), -1)
-    has_no_loss = (losses <= 0.0).all(-1, keepdim=True)
-    return torch.where(has_no_loss, 0.0, all_gains)
+    return torch.cat((low, at_3_khz, high, high[..., -1:]), -1)
 
 
 def nalrp_gains_db(
@@ -115,15 +110,13 @@ def nalrp_gains_db(
     tensor([31., 40., 46., 46., 43., 45., 45., 20.])
     """
     losses = _interpolate_over_log(thresholds, frequencies, NALRP_FREQUENCIES)
-    three_frequency_sum = losses[..., [1, 2, 4]].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz
-    common = _common_gain(three_frequency_sum)
     at_2_khz = losses[..., 4:5]
     table = _table("nalrp_corrections", like=losses)
     row = (at_2_khz - PROFOUND_FROM) / 5.0 - torch.arange(len(table)).to(losses)
     weights = (1.0 - row.abs()).clamp_min(0.0)
     correction = (weights.unsqueeze(-1) * table).sum(-2)
-    gains = (common + 0.31 * losses + _table("nalrp_bias", like=losses) + correction).clamp_min(0.0)
-    gains = torch.where((losses <= 0.0).all(-1, keepdim=True), 0.0, gains)
+    bias = _table("nalrp_bias", like=losses)
+    gains = _nal_gains(losses, losses[..., [1, 2, 4]], bias, correction)
     gains = torch.cat((gains, torch.zeros_like(at_2_khz)), -1)
     return _interpolate_over_log(gains, (*NALRP_FREQUENCIES, NALRP_END), points)
 
@@ -212,17 +205,25 @@ def highest_band_levels(uncomfortable_levels: Tensor, points: Frequencies) -> Te
     return levels + _free_field_threshold(points, like=levels)
 
 
-def _common_gain(three_frequency_sum: Tensor) -> Tensor:
-    """Return the gain in dB that NAL-R adds at all frequencies.
+def _nal_gains(
+    losses: Tensor, three_losses: Tensor, bias: Tensor, correction: Tensor | float = 0.0
+) -> Tensor:
+    """Compute gains by the formula that NAL-R and NAL-RP have in common.
 
     Args:
-        three_frequency_sum: Sum of the thresholds at 500, 1000 and 2000 Hz in dB HL. Any shape.
+        losses: Thresholds in dB HL. Shape: (..., frequencies).
+        three_losses: Those at 500, 1000 and 2000 Hz. Shape: (..., 3).
+        bias: Constant of the formula at each frequency in dB. Shape: (frequencies,).
+        correction: Gains in dB that are added for a profound loss. Shape: (..., frequencies).
+
+    Returns:
+        Gains in dB, 0 or more, and 0 for an ear without any loss. Shape: (..., frequencies).
     """
-    return torch.where(
-        three_frequency_sum <= 180.0,
-        0.05 * three_frequency_sum,
-        9.0 + 0.116 * (three_frequency_sum - 180.0),
-    )
+    total = three_losses.sum(-1, keepdim=True)
+    common = torch.where(total <= 180.0, 0.05 * total, 9.0 + 0.116 * (total - 180.0))
+    gains = (common + 0.31 * losses + bias + correction).clamp_min(0.0)
+    has_no_loss = (losses <= 0.0).all(-1, keepdim=True)
+    return torch.where(has_no_loss, 0.0, gains)
 
 
 def _interpolate_over_log(values: Tensor, grid: Frequencies, points: Frequencies) -> Tensor:
@@ -241,8 +242,7 @@ def _interpolate_over_log(values: Tensor, grid: Frequencies, points: Frequencies
 @constant
 def _log_weights(grid: Frequencies, points: Frequencies) -> NDArray[np.float64]:
     """Return the matrix that interpolates over log frequency, (grid, points)."""
-    logs = np.log(np.maximum(points, grid[0]))
-    return np.stack([np.interp(logs, np.log(grid), row) for row in np.eye(len(grid))])
+    return np.stack([interpolate_over_log(points, grid, row) for row in np.eye(len(grid))])
 
 
 @constant
@@ -258,9 +258,8 @@ def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
 
     It is interpolated linearly, and constant outside 125 Hz to 12.5 kHz. Shape: (points,).
     """
-    return np.interp(
-        points, list(FREE_FIELD_THRESHOLD_SPL), list(FREE_FIELD_THRESHOLD_SPL.values())
-    )
+    grid, levels = zip(*FREE_FIELD_THRESHOLD_SPL.items(), strict=True)
+    return np.interp(points, grid, levels)
 
 
 @constant
@@ -269,6 +268,5 @@ def _cambridge_intercepts(points: Frequencies) -> NDArray[np.float64]:
 
     They are interpolated over log frequency. Shape: (points,).
     """
-    grid = np.log(list(CAMBRIDGE_INTERCEPTS))
-    lowest = min(CAMBRIDGE_INTERCEPTS)
-    return np.interp(np.log(np.maximum(points, lowest)), grid, list(CAMBRIDGE_INTERCEPTS.values()))
+    grid, intercepts = zip(*CAMBRIDGE_INTERCEPTS.items(), strict=True)
+    return interpolate_over_log(points, grid, intercepts)

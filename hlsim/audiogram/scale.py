@@ -1,6 +1,13 @@
-"""Frequencies and ranges of thresholds, and severities of hearing loss."""
+"""Frequencies and ranges of thresholds, severities of hearing loss, and interpolation."""
 
+from collections.abc import Sequence
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Numbers = Sequence[float] | NDArray[np.float64]
+"""Frequencies or levels in one dimension."""
 
 EarName = Literal["left", "right"]
 
@@ -53,3 +60,20 @@ WHO_GRADES = {
     "complete": float("inf"),
 }
 """Pure-tone average in dB HL below which each of WHO's grades of hearing loss ends (2021)."""
+
+
+def interpolate_over_log(points: Numbers, grid: Numbers, values: Numbers) -> NDArray[np.float64]:
+    """Interpolate values linearly over log frequency, constant below the grid and above it.
+
+    Args:
+        points: Frequencies of the result in Hz, 0 or more. Shape: (points,).
+        grid: Ascending frequencies of the values in Hz. Shape: (grid,).
+        values: Values such as thresholds or gains. Shape: (grid,).
+
+    Returns:
+        Values at ``points``. Shape: (points,).
+
+    >>> interpolate_over_log([0.0, 500.0], (250.0, 1000.0), [10.0, 20.0])
+    array([10., 15.])
+    """
+    return np.interp(np.log(np.maximum(points, grid[0])), np.log(grid), values)

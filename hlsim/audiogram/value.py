@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.audiogram.columns import threshold_columns
-from hlsim.audiogram.discomfort import Points, UclLike, read_points, uncomfortable_levels_at
+from hlsim.audiogram.discomfort import (
+    Points,
+    UclLike,
+    predict_uncomfortable_levels,
+    read_points,
+)
 from hlsim.audiogram.plot import EAR_STYLES, frequency_axis
 from hlsim.audiogram.published import STANDARD
 from hlsim.audiogram.scale import (
@@ -31,6 +36,8 @@ from hlsim.audiogram.scale import (
     UCL_NOT_REACHED,
     WHO_GRADES,
     EarName,
+    Numbers,
+    interpolate_over_log,
 )
 from hlsim.extras import require
 
@@ -92,15 +99,13 @@ class Audiogram:
         ) -> None: ...
 
     def __post_init__(self) -> None:
+        attributes = vars(self)  # which can be written, unlike the fields of a frozen dataclass
+        attributes["ucl"] = read_points(self.ucl)
         names_frequencies = isinstance(self.levels, Mapping) or hasattr(self.levels, "to_dict")
-        object.__setattr__(self, "ucl", read_points(self.ucl))
-        ear = None
         if names_frequencies and self.frequencies is FREQUENCIES:
             ear = find_audiogram(self.levels)
-        if ear is not None:
-            object.__setattr__(self, "levels", ear.levels)
-            object.__setattr__(self, "frequencies", ear.frequencies)
-            object.__setattr__(self, "ucl", self.ucl or ear.ucl)
+            if ear is not None:
+                attributes |= vars(ear) | {"ucl": self.ucl or ear.ucl}
         levels, frequencies = _as_array(self.levels), _as_array(self.frequencies)
         if len(levels) != len(frequencies):
             raise ValueError(
@@ -124,8 +129,8 @@ class Audiogram:
                 f"Hz that overlap the range from {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g}, got "
                 f"levels at {frequencies.tolist()} Hz; sort them, or multiply kHz by 1000"
             )
-        object.__setattr__(self, "levels", tuple(levels.tolist()))
-        object.__setattr__(self, "frequencies", tuple(frequencies.tolist()))
+        attributes["levels"] = tuple(levels.tolist())
+        attributes["frequencies"] = tuple(frequencies.tolist())
         thresholds = self._interpolate([hz for hz, _ in self.ucl]).tolist()
         for (hz, level), threshold in zip(self.ucl, thresholds, strict=True):
             if level < min(threshold, UCL_NOT_REACHED):
@@ -191,7 +196,8 @@ class Audiogram:
         They are those that were measured, ``ucl``, or else predicted from the thresholds (see
         ``hlsim.audiogram.discomfort``, which states the error of the prediction: 8.7 dB). Between
         measured frequencies, their difference from the prediction is interpolated over log
-        frequency; beyond them it is constant.
+        frequency; beyond them it is constant. A measured level of 115 dB HL or more, which was not
+        reached, counts only above the prediction.
 
         Args:
             frequencies: Frequencies of the result in Hz.
@@ -214,19 +220,18 @@ class Audiogram:
             raise ValueError(
                 f"expected a list of frequencies in Hz, such as [500, 1000], got {frequencies!r}"
             )
-        measured_hz = [hz for hz, _ in self.ucl]
-        levels = uncomfortable_levels_at(
-            self.ucl, self._interpolate(measured_hz), hertz, self._interpolate(hertz)
-        )
-        return tuple(round(level, 6) for level in levels)
+        levels = predict_uncomfortable_levels(self._interpolate(hertz))
+        if self.ucl:
+            measured_hz, measured = np.array(self.ucl).T
+            difference = measured - predict_uncomfortable_levels(self._interpolate(measured_hz))
+            is_reached = measured < UCL_NOT_REACHED
+            difference = np.where(is_reached, difference, np.maximum(difference, 0.0))
+            levels = levels + interpolate_over_log(hertz, measured_hz, difference)
+        return tuple(round(level, 6) for level in levels.tolist())
 
-    def _interpolate(self, frequencies: Sequence[float]) -> NDArray[np.float64]:
-        """Interpolate the thresholds linearly over log frequency, constant beyond the ends.
-
-        Returns: Thresholds in dB HL, one for each of ``frequencies``.
-        """
-        values = np.interp(np.log(frequencies), np.log(self.frequencies), self.levels)
-        return np.asarray(values)
+    def _interpolate(self, frequencies: Numbers) -> NDArray[np.float64]:
+        """Return thresholds in dB HL, interpolated over log frequency, at frequencies in Hz."""
+        return interpolate_over_log(frequencies, self.frequencies, self.levels)
 
     @property
     def severity(self) -> str:
