@@ -266,22 +266,19 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
             one frequency, or a row lacks the listener or the ear that other rows have.
     """
     names = [column for column in rows[0][1] if column not in (frequency, threshold, *ucl)]
-    has_ears = {"listener", "ear"} <= set(names)
-    if names and not has_ears:
+    key_names: list[str] = [name for name in ("listener", "ear") if name in names]
+    if names and len(key_names) < 2:
         raise ValueError(
             f"{rows[0][0]}: expected the columns listener and ear beside {frequency} and "
             f"{threshold}, got {', '.join(names)}; add or rename columns"
         )
-    other_names = [name for name in names if name not in ("listener", "ear")]
+    other_names = [name for name in names if name not in key_names]
     # A spreadsheet with merged cells names the listener and the ear in the first row only.
-    required_names = [
-        name for name in ("listener", "ear") if has_ears and any(row[name] for _, row in rows)
-    ]
-    ears: dict[tuple[str, ...], _Row] = {}
-    first_rows: dict[tuple[str, ...], dict[str, str]] = {}
+    required_names = [name for name in key_names if any(row[name] for _, row in rows)]
+    ears: dict[tuple[str, ...], tuple[str, dict[str, str], dict[str, str]]] = {}
     differing_names = set()
     for place, row in rows:
-        ear = {name: row[name] for name in ("listener", "ear") if has_ears}
+        ear = {name: row[name] for name in key_names}
         for name in required_names:
             if not row[name]:
                 raise ValueError(
@@ -289,8 +286,7 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
                     "fill it in"
                 )
         key = tuple(EAR_NAMES.get(text.lower(), text) for text in ear.values())
-        _, wide = ears.setdefault(key, (place, ear))
-        first_row = first_rows.setdefault(key, row)
+        _, wide, first_row = ears.setdefault(key, (place, ear, row))
         differing_names |= {name for name in other_names if row[name] != first_row[name]}
         text = row[frequency]
         column = text if re.search("k|hz", text.lower()) else f"{text} Hz"
@@ -313,4 +309,4 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
             "air conduction",
             stacklevel=2,
         )
-    return [*ears.values()]
+    return [(place, wide) for place, wide, _ in ears.values()]
