@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -30,14 +31,20 @@ RATE = 24000
 
 Array = NDArray[np.float64]
 
+StateSpace = tuple[Array, Array, Array, float, int]
+"""A filter with the input u, the state x, the output y = c x + d u and the next state a x + b u.
 
-def apply_filter(
-    design: Callable[[torch.device, torch.dtype], Recursion], signal: Tensor
-) -> Tensor:
-    """Filter a signal by a real filter that is designed for its device and precision.
+It is a, (states, states); b, (states, 1); c, (1, states); d; and the number of samples after which
+the influence of an input sample has vanished.
+"""
+
+
+def apply_filter(design: Callable[[], StateSpace], signal: Tensor) -> Tensor:
+    """Filter a signal by a real filter.
 
     Args:
-        design: Function that returns the filter for a device and a dtype, such as ``middle_ear``.
+        design: Function at the top level of a module that designs the filter, such as
+            ``middle_ear``.
         signal: Signal whose length is a multiple of 64. Shape: (..., time).
 
     Returns:
@@ -46,7 +53,7 @@ def apply_filter(
     >>> apply_filter(gain_lowpass, torch.ones(1, 192)).shape
     torch.Size([1, 192])
     """
-    (output,) = design(signal.device, signal.dtype)(signal)
+    (output,) = _recursion(design, signal.device, signal.dtype)(signal)
     return output.flatten(-2)
 
 
@@ -64,7 +71,7 @@ class Recursion(NamedTuple):
         step: Matrix from the state before a block to that after it. Shape: (..., states, states).
         memory: Number of samples after which the influence of an input sample has vanished.
 
-    >>> lowpass = gain_lowpass(torch.device("cpu"), torch.float64)
+    >>> lowpass = _recursion(gain_lowpass, torch.device("cpu"), torch.float64)
     >>> (output,) = lowpass(torch.ones(1, 192, dtype=torch.float64))
     >>> output.shape
     torch.Size([1, 3, 64])
@@ -138,29 +145,20 @@ def _accumulate(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
 # -- real filters ----------------------------------------------------------------------------------
 
 
+@compute_once
 def _recursion(
-    a: Array,
-    b: Array,
-    c: Array,
-    d: float,
-    memory: int,
-    device: torch.device,
-    dtype: torch.dtype,
+    design: Callable[[], StateSpace], device: torch.device, dtype: torch.dtype
 ) -> Recursion:
     """Convert a filter from state-space form to matrices for blocks of 64 samples.
 
-    With the input u and the state x, the output is y = c x + d u, and the next state is a x + b u.
     The form is balanced first, so that single precision suffices.
 
     Args:
-        a: Matrix from a state to the next one. The filter must be stable. Shape: (states, states).
-        b: Column from the input to the state. Shape: (states, 1).
-        c: Row from the state to the output. Shape: (1, states).
-        d: Factor from the input to the output.
-        memory: Number of samples after which the influence of an input sample has vanished.
+        design: Function that designs the filter, which must be stable.
         device: Device of the matrices.
         dtype: Precision of the matrices.
     """
+    a, b, c, d, memory = design()
     # Balancing makes each state as easily reached as observed. Otherwise a large and a small state
     # of a slow filter, such as adaptation, would cancel in single precision.
     root = np.linalg.cholesky(_gramian(a, b))
@@ -170,14 +168,12 @@ def _recursion(
     a, b, c = np.linalg.solve(basis, a @ basis), np.linalg.solve(basis, b), c @ basis
     # Sample i of a block reaches sample j of the output by the impulse response at j - i, and the
     # state after the block by a^(63 - i) b.
-    powers = [np.eye(len(a))]
-    for _ in range(BLOCK):
-        powers.append(powers[-1] @ a)
-    impulse = np.array([d, *(float((c @ power @ b)[0, 0]) for power in powers[: BLOCK - 1])])
+    powers = np.array([*accumulate([np.eye(len(a)), *[a] * BLOCK], np.matmul)])
+    impulse = np.append(d, c @ powers[: BLOCK - 1] @ b)
     lag = np.arange(BLOCK)[None, :] - np.arange(BLOCK)[:, None]
     through = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
-    inward = np.stack([(powers[BLOCK - 1 - i] @ b)[:, 0] for i in range(BLOCK)])
-    outward = np.stack([(c @ powers[i])[0] for i in range(BLOCK)], -1)
+    inward = (powers[BLOCK - 1 :: -1] @ b)[..., 0]
+    outward = (c @ powers[:BLOCK])[:, 0].T
     matrices = (through, inward, outward, powers[BLOCK].T)
     return Recursion._make([*(as_tensor(matrix, dtype, device) for matrix in matrices), memory])
 
@@ -190,7 +186,7 @@ def _gramian(a: Array, b: Array) -> Array:
 
 
 def _state_space(numerator: Array, denominator: Array) -> tuple[Array, Array, Array, float]:
-    """Return a, b, c and d of ``_recursion`` for a filter with the first denominator 1."""
+    """Return a, b, c and d of ``StateSpace`` for a filter with the first denominator 1."""
     order = len(denominator) - 1
     a = np.eye(order, k=-1)
     a[0] = -denominator[1:]
@@ -198,36 +194,31 @@ def _state_space(numerator: Array, denominator: Array) -> tuple[Array, Array, Ar
     return a, np.eye(order, 1), c, float(numerator[0])
 
 
-@compute_once
-def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
+def middle_ear() -> StateSpace:
+    """Design the filter of the middle ear, between the eardrum and the cochlea, at 24 kHz.
 
     The filter is a low-pass of first order at 5 kHz and a high-pass of second order at 350 Hz, both
-    Butterworth. Its matrices are on ``device`` in the precision ``dtype``.
+    Butterworth.
 
     Source: Kates 2013, Proceedings of Meetings on Acoustics 19, 050184.
 
-    >>> middle_ear(torch.device("cpu"), torch.float32).step.shape
-    torch.Size([3, 3])
+    >>> middle_ear()[0].shape
+    (3, 3)
     """
     low = coefficients(digital_filter(butterworth(1), 5000.0, RATE))
     high = coefficients(digital_filter(butterworth(2), 350.0, RATE, highpass=True))
-    a, b, c, d = _state_space(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
-    return _recursion(a, b, c, d, 2048, device, dtype)
+    return *_state_space(np.convolve(low[0], high[0]), np.convolve(low[1], high[1])), 2048
 
 
-@compute_once
-def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the filter that smooths the gain of the outer hair cells over 0.2 ms.
+def gain_lowpass() -> StateSpace:
+    """Design the filter that smooths the gain of the outer hair cells over 0.2 ms.
 
-    The filter is a Butterworth low-pass of first order at 800 Hz, for gains at 24 kHz. Its matrices
-    are on ``device`` in the precision ``dtype``.
+    The filter is a Butterworth low-pass of first order at 800 Hz, for gains at 24 kHz.
 
-    >>> gain_lowpass(torch.device("cpu"), torch.float32).step.shape
-    torch.Size([1, 1])
+    >>> gain_lowpass()[0].shape
+    (1, 1)
     """
-    a, b, c, d = _state_space(*coefficients(digital_filter(butterworth(1), 800.0, RATE)))
-    return _recursion(a, b, c, d, 192, device, dtype)
+    return *_state_space(*coefficients(digital_filter(butterworth(1), 800.0, RATE))), 192
 
 
 ONSET_RATIO = 2.0
@@ -237,17 +228,15 @@ RAPID_SECONDS, SHORT_TERM_SECONDS = 0.002, 0.060
 """Time constants of rapid and of short-term adaptation in seconds."""
 
 
-@compute_once
-def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
-    """Return the filter by which inner hair cells emphasise onsets, for levels in dB at 24 kHz.
+def adaptation() -> StateSpace:
+    """Design the filter by which inner hair cells emphasise onsets, for levels in dB at 24 kHz.
 
     The response to an onset is twice the steady response, and decays with time constants of 2 and
     60 ms. Kates describes the filter by an electrical circuit, which is solved here by backward
-    differences. Where the output is negative, the caller must replace it by zero. The filter's
-    matrices are on ``device`` in the precision ``dtype``.
+    differences. Where the output is negative, the caller must replace it by zero.
 
-    >>> adaptation(torch.device("cpu"), torch.float32).step.shape
-    torch.Size([2, 2])
+    >>> adaptation()[0].shape
+    (2, 2)
     """
     r1 = 1.0 / ONSET_RATIO
     r2 = r3 = 0.5 * (1.0 - r1)
@@ -257,7 +246,7 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
     a = inverse @ np.diag([charge1, charge2])
     b = inverse @ np.array([[r2], [0.0]])
     d = (1.0 - float(b[0, 0])) / r1
-    return _recursion(a, b, -a[:1] / r1, d, 1 << 30, device, dtype)
+    return a, b, -a[:1] / r1, d, 1 << 30
 
 
 # -- gammatone filters -----------------------------------------------------------------------------
@@ -316,8 +305,9 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     )
     after = gain[..., None] * torch.exp(-decay * n)
     phase, phase_to_end = angle * n, angle * (BLOCK - n)
+    cosine, sine = phase.cos(), phase.sin()
     # within a block
-    wave = (after * p[0])[..., None, :] * torch.stack((phase.cos(), phase.sin()), -2)
+    wave = (after * p[0])[..., None, :] * torch.stack((cosine, sine), -2)
     # Sample j of the output receives sample i of the block through the response at j - i.
     responses = functional.pad(wave.to(dtype), (BLOCK - 1, 0)).unfold(-1, BLOCK, 1).flip(-2)
     through = responses.transpose(-2, -3).flatten(-2)
@@ -325,11 +315,10 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     order = torch.arange(GAMMATONE_ORDER, dtype=decay.dtype, device=decay.device)
     distance = ((BLOCK - n) / BLOCK)[:, None] ** order
     remainder = torch.exp(-decay * (BLOCK - n))
-    inward_real = (remainder * phase_to_end.cos())[..., None] * distance
-    inward_imaginary = (remainder * phase_to_end.sin())[..., None] * distance
-    inward = torch.cat((inward_real, inward_imaginary), -1)
+    waves_to_end = remainder * phase_to_end.cos(), remainder * phase_to_end.sin()
+    inward = torch.cat([wave_to_end[..., None] * distance for wave_to_end in waves_to_end], -1)
     weight = after[..., None, :] * p * (float(BLOCK) ** order)[:, None]
-    outward = _as_real(weight * phase.cos()[..., None, :], weight * phase.sin()[..., None, :])
+    outward = _as_real(weight * cosine[..., None, :], weight * sine[..., None, :])
     binomials = _binomials(like=decay)
     decayed = torch.exp(-BLOCK * decay)[..., None] * binomials
     step_angle = BLOCK * angle[..., None]
