@@ -211,16 +211,16 @@ class _Covariance(NamedTuple):
     Attributes:
         xx, yy, xy: Sums over time of the squares and of the products of the filtered coefficients,
             clean x and output y, without their means. Shape: (items, 10, 5).
-        waves: Coefficients x and y before the filters, without their means. Shape: (items, 5,
-            audible frames) each.
-        spectra: Fourier transforms of ``waves``. Shape: (items, 5, frequencies) each.
+        waves: Coefficients x and y before the filters, without their means. Shape: (items, 2, 5,
+            audible frames).
+        spectra: Fourier transforms of ``waves``. Shape: (items, 2, 5, frequencies).
     """
 
     xx: Tensor
     yy: Tensor
     xy: Tensor
-    waves: tuple[Tensor, Tensor]
-    spectra: tuple[Tensor, Tensor]
+    waves: Tensor
+    spectra: Tensor
 
 
 def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Covariance:
@@ -242,9 +242,7 @@ def _modulation_covariance(clean: Tensor, output: Tensor, extent: Extent) -> _Co
         x, y = extent.centred(filtered).unbind(2)
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
     xx, yy, xy = torch.cat(sums, 2)
-    clean_wave, output_wave = waves.unbind(1)
-    a, b = spectra.unbind(1)
-    return _Covariance(xx, yy, xy, (clean_wave, output_wave), (a, b))
+    return _Covariance(xx, yy, xy, waves, spectra)
 
 
 def _points(frames: int) -> int:
@@ -403,10 +401,10 @@ def _energies_filtered_twice(covariance: _Covariance, extent: Extent) -> list[Te
     items = []
     for item, frames in enumerate(extent.ends):
         points = _points(frames)
-        a, b = (spectrum[item] for spectrum in covariance.spectra)
+        spectra = covariance.spectra[item]
         if points != _points(extent.longest):
-            a, b = (torch.fft.rfft(wave[item, :, :frames], points) for wave in covariance.waves)
-        x, y = torch.view_as_real(a), torch.view_as_real(b)
+            spectra = torch.fft.rfft(covariance.waves[item, ..., :frames], points)
+        x, y = torch.view_as_real(spectra)
         weights = _twice_filtered(points, like=x)
         products = x.square(), y.square(), x * y
         energies = [weights @ product.sum(-1).mT for product in products]
