@@ -158,21 +158,16 @@ class FrozenSimulator:
         shape = (*batch, clean.shape[-1])
         if reference is None:
             return clean.expand(shape)
-        ears = thresholds[None]
-        if thresholds.ndim > 1:
-            ears = flatten_items(thresholds, batch, thresholds.dtype)
         is_chosen = self.choice is not None and not reference.is_fixed
         is_normal = (self.choice if is_chosen else reference.signal) == "normal-hearing"
         target = self._limit_band(clean)
         if is_normal and self._has_bank_phase and reference.normal_ear == "filter":
-            items = flatten_items(target, batch, clean.dtype)
-            return simulate_normal_ear(items, ears, self.sample_rate).reshape(shape)
+            return simulate_normal_ear(target, thresholds, self.sample_rate).expand(shape)
         if is_normal:
             target = self._simulate_normal_ear(target, lengths)
-        if not (self._has_bank_phase and reference.bank_phase):
-            return target.expand(shape)
-        items = flatten_items(target, batch, clean.dtype)
-        return apply_bank_phase(items, ears, self.sample_rate, normal=is_normal).reshape(shape)
+        if self._has_bank_phase and reference.bank_phase:
+            target = apply_bank_phase(target, thresholds, self.sample_rate, normal=is_normal)
+        return target.expand(shape)
 
     def _simulate_normal_ear(self, clean: Tensor, lengths: Tensor | None) -> Tensor:
         """Compute what the normal ear perceives, by ``normal`` or by the simulator at 0 dB HL.

@@ -72,7 +72,7 @@ def apply_bank_phase(
     (``fixed_response``) is more than 20 dB below its maximum, the magnitude falls with it (unless
     ``normal`` is true).
 
-    Shape: (items, time), (items, 8) -> (items, time).
+    Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
 
     Args:
         waveform: Signals, such as clean speech.
@@ -103,7 +103,7 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
     MSBG's output with an SNR of 75 dB or more. It keeps the last 80 Hz below half the sample rate,
     which MSBG fades out at rates below 44.1 kHz.
 
-    Shape: (items, time), (items, 8) -> (items, time).
+    Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
 
     Args:
         waveform: Clean speech.
