@@ -148,6 +148,11 @@ def _score(name: str, signals: Comparison) -> dict[str, Tensor]:
     return {name: loss}
 
 
+def _call(function: Callable[..., Any], signals: Comparison) -> dict[str, Tensor]:
+    value = function(signals.perceived, signals.reference)
+    return {"criterion": check_shape(value, "criterion", (len(signals.perceived),))}
+
+
 def _interaural(signals: Comparison) -> dict[str, Tensor]:
     output = signals.limited_output.unflatten(0, (-1, 2))
     clean = signals.clean.unflatten(0, (-1, 2))
@@ -192,25 +197,6 @@ CRITERIA = {
 """Criteria of ``HearingLossLoss``, each under its name."""
 
 
-def function_criterion(function: Callable[[Tensor, Tensor], Tensor]) -> Criterion:
-    """Return the criterion that calls a function of perceived speech and its reference.
-
-    Args:
-        function: Function, (items, time) twice in pascals -> (items,).
-
-    >>> list(function_criterion(lambda perceived, reference: perceived.mean(-1)).weights)
-    ['criterion']
-    """
-    return Criterion(
-        weights={"criterion": 1.0}, compute=partial(_call, function), reference=ReferenceKind()
-    )
-
-
-def _call(function: Callable[..., Any], signals: Comparison) -> dict[str, Tensor]:
-    value = function(signals.perceived, signals.reference)
-    return {"criterion": check_shape(value, "criterion", (len(signals.perceived),))}
-
-
 def read_criterion(
     criterion: CriterionLike, weights: Mapping[str, float] | None = None
 ) -> tuple[dict[str, Criterion], dict[str, float]]:
@@ -232,13 +218,17 @@ def read_criterion(
     >>> list(criteria), weights
     (['bands', 'haspi'], {'band_levels': 0.5, 'haspi': 2.0})
     """
+    known, named = CRITERIA, criterion
     if callable(criterion):
-        scales = {"criterion": 1.0}
-        criteria = {"criterion": function_criterion(criterion)}
-    else:
-        named = {criterion: 1.0} if isinstance(criterion, str) else criterion
-        scales = check_weights(named, CRITERIA, "criteria")
-        criteria = {name: CRITERIA[name] for name, scale in scales.items() if scale}
+        call, reference = partial(_call, criterion), ReferenceKind()
+        known = {
+            "criterion": Criterion(weights={"criterion": 1.0}, compute=call, reference=reference)
+        }
+        named = "criterion"
+    if isinstance(named, str):
+        named = {named: 1.0}
+    scales = check_weights(named, known, "criteria")
+    criteria = {name: known[name] for name, scale in scales.items() if scale}
     defaults: dict[str, float] = {}
     part_scales: dict[str, float] = {}
     for name, entry in criteria.items():
