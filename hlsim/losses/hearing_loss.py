@@ -35,6 +35,7 @@ from hlsim.checks import (
 from hlsim.losses.criteria import Comparison, CriterionLike, read_criterion, weighted_sum
 from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceKind, ReferenceName
 from hlsim.losses.gradient_limit import limit_gradient_spikes
+from hlsim.metrics.pair import check_pair
 from hlsim.torchtools import broadcast_shape, flatten_items, not_compiled, silence_after
 
 _Reduction = Literal["mean", "none"]
@@ -322,11 +323,7 @@ class HearingLossLoss(nn.Module):
         """
         check_waveform(output, "output", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
-        if output.shape != clean.shape:
-            raise ValueError(
-                "expected output and clean with the same shape, "
-                f"got {tuple(output.shape)} and {tuple(clean.shape)}; cut or expand one of them"
-            )
+        check_pair(output, clean)
         if clean.requires_grad and not output.requires_grad and not self._has_warned_of_order:
             self._has_warned_of_order = True
             warnings.warn(
