@@ -35,10 +35,9 @@ def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
     """
     left, right, cross, octaves = spectra_of_ears(output, sample_rate)
     clean_left, clean_right, clean_cross, _ = spectra_of_ears(clean, sample_rate)
-    left_level = torch.log10(left @ octaves + _POWER_FLOOR)
-    right_level = torch.log10(right @ octaves + _POWER_FLOOR)
-    clean_left_level = torch.log10(clean_left @ octaves + _POWER_FLOOR)
-    clean_right_level = torch.log10(clean_right @ octaves + _POWER_FLOOR)
+    left_level, right_level, clean_left_level, clean_right_level = (
+        torch.log10(ear @ octaves + _POWER_FLOOR) for ear in (left, right, clean_left, clean_right)
+    )
     level_error = (left_level - right_level - clean_left_level + clean_right_level).abs()
     # The added power is proportional to those of the ears. With a constant instead, the phase of an
     # ear that is nearly silent would have a gradient of a million.

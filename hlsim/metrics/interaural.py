@@ -15,7 +15,7 @@ from torch import Tensor
 from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import power
-from hlsim.dsp.stft import STFT
+from hlsim.metrics.band_levels import band_analysis
 from hlsim.torchtools import Samples, as_samples, constant
 
 OCTAVES = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
@@ -141,11 +141,8 @@ def spectra_of_ears(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor,
     >>> spectra_of_ears(torch.randn(2, 16000), 16000)[0].shape
     torch.Size([257])
     """
-    hop = round(0.016 * sample_rate)
-    stft = STFT(2 * hop, 2 * hop, hop)
-    spectra = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
-    mean_square_of_window = 0.375
-    spectra = spectra * (2.0 / (stft.fft * stft.window * mean_square_of_window)) ** 0.5
+    stft, _, scale = band_analysis(waveform, sample_rate)
+    spectra = stft.analyse(waveform.reshape(-1, waveform.shape[-1])) * scale**0.5
     left, right = spectra.reshape(*waveform.shape[:-1], *spectra.shape[-2:]).unbind(-3)
     left_power = power(left).mean(-2)
     right_power = power(right).mean(-2)
