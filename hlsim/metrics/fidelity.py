@@ -106,16 +106,13 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
         )
     # The frequencies are at most 4 Hz apart, because the lowest band is 29 Hz wide.
     points = max(len(x), sample_rate // 4)
-    reference_powers = _third_octave_powers(x, points, sample_rate)
-    estimate_powers = _third_octave_powers(y, points, sample_rate)
-    loudest = reference_powers.max()
+    powers = np.stack([_third_octave_powers(signal, points, sample_rate) for signal in (x, y)])
+    loudest = powers[0].max()
     if loudest <= 0.0:
         raise ValueError("expected a reference with power between 125 Hz and 7 kHz, got none")
-    reference_levels = 10.0 * np.log10(np.maximum(reference_powers / loudest, _MIN_BAND_RATIO))
-    estimate_levels = 10.0 * np.log10(np.maximum(estimate_powers / loudest, _MIN_BAND_RATIO))
-    differences = np.abs(reference_levels - estimate_levels)
+    reference_levels, levels = 10.0 * np.log10(np.maximum(powers / loudest, _MIN_BAND_RATIO))
     is_loud = reference_levels >= -_BAND_RANGE_DB
-    return float(np.median(differences[is_loud]))
+    return float(np.median(np.abs(reference_levels - levels)[is_loud]))
 
 
 def _third_octave_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarray:
@@ -187,9 +184,8 @@ def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
     pesq = require("pesq", "pesq")
 
     def score_at_16_khz(x: np.ndarray, y: np.ndarray) -> float:
-        x_at_16_khz = resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy()
-        y_at_16_khz = resample(torch.from_numpy(y), sample_rate, _PESQ_RATE).numpy()
-        return float(pesq.pesq(_PESQ_RATE, x_at_16_khz, y_at_16_khz, "wb"))
+        signals = resample(torch.from_numpy(np.stack((x, y))), sample_rate, _PESQ_RATE)
+        return float(pesq.pesq(_PESQ_RATE, *signals.numpy(), "wb"))
 
     return _score("PESQ", score_at_16_khz, clean, output)
 

@@ -194,10 +194,6 @@ class _MeanScore(_Metric):
         )
         items = len(outputs)
         audiogram = self.audiogram if audiogram is None else audiogram
-        if audiogram is None:
-            raise ValueError(
-                "expected an audiogram, got None; pass one to update, or to the constructor"
-            )
         ears = _thresholds(audiogram, items, sides).reshape(*outputs.shape[:3], -1)
         ends = torch.full((items,), time)
         if lengths is not None:
@@ -389,7 +385,7 @@ class MBSTOI(_MeanScore):
         super().update(output, clean, ["NH", "NH"], lengths)
 
 
-def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
+def _thresholds(audiogram: AudiogramLike | None, items: int, sides: int) -> Tensor:
     """Return the thresholds of each item's ears in dB HL on the CPU. Shape: -> (items, sides, 8).
 
     Args:
@@ -398,8 +394,8 @@ def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
         sides: Number of ears per item, 1 or 2.
 
     Raises:
-        ValueError: The shape of the ears fits neither all items nor each of them, or a level is out
-            of range.
+        ValueError: There is no audiogram, its shape fits neither all items nor each of them, or a
+            level is out of range.
     """
     if isinstance(audiogram, Tensor):
         audiogram = audiogram.cpu()  # a level out of range is an error there, and NaN on a GPU
