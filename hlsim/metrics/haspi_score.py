@@ -35,7 +35,6 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import alignment, envelope_modulation as envelopes, model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
 from hlsim.metrics.ear.motion_noise import state_after_motion_noise
@@ -157,12 +156,9 @@ class HaspiReference(Reference):
             full_scale_spl=full_scale_spl,
             lengths=lengths,
             whole_khz=whole_khz,
+            equalisation=2,
             keep=keep,
         )
-
-    def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
-        normal_ear = torch.zeros(8, device=clean.signals.device)
-        return clean.signals, ear_model.hair_cells(normal_ear)
 
     def _features(
         self,
@@ -174,7 +170,7 @@ class HaspiReference(Reference):
     ) -> _Channels:
         cochlea = ear_model.simulate_cochlea(sound, cells, channels, extent)
         delays = longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        levels = ear_model.nerve_levels(cochlea.power, cells.inner[channels])
+        levels = ear_model.nerve_levels(cochlea.power, cells[..., channels].inner)
         frames = envelopes.smooth_frames(levels, delays, extent)
         return _Channels(
             channels,
@@ -185,16 +181,16 @@ class HaspiReference(Reference):
         )
 
     def _compare(
-        self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
+        self, batch: PreparedBatch, output: Tensor, cells: HairCells, noise: Noise, seed: int
     ) -> Tensor:
         """Compute the ten features of HASPI, correlations, for each item. Shape: -> (items, 10).
 
         Raises:
             UnscorableError: Clean speech is inaudible to a normal ear.
         """
-        extent, ear = batch.clean.audible, ears[0][batch.clean.items]
+        extent = batch.clean.audible
         contributions = [
-            (clean.amplitude, clean.cepstrum, _cepstrum(clean, output, ear, extent))
+            (clean.amplitude, clean.cepstrum, _cepstrum(clean, output, cells, extent))
             for clean in batch.features
         ]
         amplitude, *cepstra = (reduce(add, parts) for parts in zip(*contributions, strict=True))
@@ -329,7 +325,5 @@ def _network(part: str) -> NDArray[np.float64]:
 
     Shape: (10, 4, 11) for ``"hidden"``, (10, 5) for ``"output"``, (1,) for ``"normalisation"``.
     """
-    stored = json.loads((Path(__file__).parent / "haspi_networks.json").read_text())
-    if part == "normalisation":
-        return np.array([stored[part]])
-    return np.array([network[part] for network in stored["networks"]])
+    networks = json.loads(Path(__file__).with_name("haspi_networks.json").read_text())
+    return np.array(networks[part])

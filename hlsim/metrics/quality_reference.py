@@ -14,24 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
-from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.prescription import nalr_gains_db
-from hlsim.dsp.fft import fft_length
-from hlsim.dsp.fir import filters_with_gains
 from hlsim.metrics.ear import alignment, fine_structure, model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import CHANNELS, HairCells
 from hlsim.metrics.ear.motion_noise import draw_motion_noise
-from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import Noise
 from hlsim.metrics.reference import PreparedBatch, Reference
 from hlsim.torchtools import Audio, Samples, as_type_of, constant
-
-NALR_ORDER = 140
-"""Order of the filter that amplifies the clean signal."""
 
 THRESHOLD_NOISE_DB = -10.0
 """Level of the noise on the motion of the basilar membrane, in dB over threshold."""
@@ -60,29 +50,6 @@ class QualityParts(NamedTuple):
     combined: Tensor
     nonlinear: Tensor
     linear: Tensor
-
-
-class _Comparison(NamedTuple):
-    """Features of a clean signal and of the output of an aid in some channels of one ear.
-
-    Attributes:
-        clean_levels, output_levels: Levels in dB over threshold, smoothed over segments of 16 ms
-            (HASQI) or 8 ms (HAAQI). Shape: (items, channels, segments).
-        coherence: Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape:
-            (items, channels, segments).
-        energy: Mean square of the envelope of the clean signal's fine structure in each segment of
-            16 ms, with the ear's noise if ``noise`` is ``"seeded"``; see ``segment_spectra``.
-            Shape: (items, channels, segments), with fewer segments than the levels of HAAQI.
-        clean_spectrum, output_spectrum: Long-term levels in dB over threshold. Shape: (items,
-            channels).
-    """
-
-    clean_levels: Tensor
-    output_levels: Tensor
-    coherence: Tensor
-    energy: Tensor
-    clean_spectrum: Tensor
-    output_spectrum: Tensor
 
 
 class QualityReference(Reference):
@@ -176,12 +143,6 @@ class QualityReference(Reference):
         """Amplitude of 20 uPa, that is 0 dB SPL, on the scale of the input."""
         return 10.0 ** (-self._full_scale_spl / 20.0)
 
-    def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
-        cells = ear_model.hair_cells(self._ears[clean.items])
-        if self._is_amplified:
-            return clean.signals, cells
-        return _amplify(clean.signals, self._ears[clean.items], clean.audible), cells
-
     def _features(
         self,
         sound: Tensor,
@@ -231,7 +192,7 @@ class QualityReference(Reference):
         return fine_structure.smooth_levels(delayed, extent, self.envelope_segment), motion
 
     def _compare(
-        self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
+        self, batch: PreparedBatch, output: Tensor, cells: HairCells, noise: Noise, seed: int
     ) -> Tensor:
         """Compute the score of each item, its nonlinear part and its linear part.
 
@@ -240,20 +201,18 @@ class QualityReference(Reference):
         extent = batch.clean.audible
         noises = _threshold_noise(noise, seed, extent, output)
         comparisons = [
-            self._compare_channels(clean, output, batch.cells, noises, extent)
-            for clean in batch.features
+            self._compare_channels(clean, output, cells, noises, extent) for clean in batch.features
         ]
-        joined = _Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
-        envelopes = fine_structure.envelope_correlation(
-            joined.clean_levels,
-            joined.output_levels,
-            fine_structure.segments_of(extent, self.envelope_segment),
-            self.split_by_rate,
+        clean_levels, levels, coherence, energy, clean_spectrum, spectrum = (
+            torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)
         )
-        counts = fine_structure.segments_of(extent)
-        fine = fine_structure.synchrony(joined.coherence, joined.energy, counts)
-        x = fine_structure.channel_shares(joined.clean_spectrum)
-        y = fine_structure.channel_shares(joined.output_spectrum)
+        counts = fine_structure.segments_of(extent, self.envelope_segment)
+        envelopes = fine_structure.envelope_correlation(
+            clean_levels, levels, counts, self.split_by_rate
+        )
+        fine = fine_structure.synchrony(coherence, energy, fine_structure.segments_of(extent))
+        x = fine_structure.channel_shares(clean_spectrum)
+        y = fine_structure.channel_shares(spectrum)
         return torch.stack(self._combine(envelopes, fine, x, y), -1)
 
     def _compare_channels(
@@ -263,7 +222,7 @@ class QualityReference(Reference):
         cells: HairCells,
         noises: tuple[Tensor | None, Tensor | None],
         extent: Extent,
-    ) -> _Comparison:
+    ) -> tuple[Tensor, ...]:
         """Compute the features of outputs in some channels, beside those of the clean signals.
 
         Args:
@@ -272,6 +231,16 @@ class QualityReference(Reference):
             cells: Hair cells of all channels.
             noises: Noise of clean signals and outputs, from ``_threshold_noise``.
             extent: Number of samples of each item before padding.
+
+        Returns:
+            - Levels of the clean signals, then of the outputs, in dB over threshold, smoothed over
+              segments of 16 ms (HASQI) or 8 ms (HAAQI). Shape: (items, channels, segments).
+            - Similarity of the fine structures in each segment of 16 ms, 0 to 1. Shape: (items,
+              channels, segments), with fewer segments than the levels of HAAQI.
+            - Mean square of the envelope of the clean signals' fine structure in these segments,
+              with the ear's noise if ``noise`` is ``"seeded"``; see ``segment_spectra``.
+            - Long-term levels of the clean signals, then of the outputs, in dB over threshold.
+              Shape: (items, channels).
         """
         channels, inner = clean.channels, cells[..., clean.channels].inner
         cochlea = ear_model.simulate_cochlea(output, cells, channels, extent, motion=True)
@@ -288,14 +257,9 @@ class QualityReference(Reference):
                 clean.adapted_motion, clean.delays, channels, clean_noise, extent
             )
         counts = fine_structure.segments_of(extent)
-        return _Comparison(
-            clean_levels=clean.smooth_levels,
-            output_levels=levels,
-            coherence=fine_structure.coherence(clean_segments, segments, counts),
-            energy=clean_segments[1],
-            clean_spectrum=clean.level,
-            output_spectrum=cochlea.level,
-        )
+        coherence = fine_structure.coherence(clean_segments, segments, counts)
+        energy = clean_segments[1]
+        return clean.smooth_levels, levels, coherence, energy, clean.level, cochlea.level
 
     def _segment_spectra(
         self,
@@ -421,21 +385,3 @@ def _threshold_noise(
 def _frozen_table() -> NDArray[np.float64]:
     """Return noise with a standard deviation of 1, (FROZEN_SAMPLES,), the same every time."""
     return np.random.RandomState(0).standard_normal(FROZEN_SAMPLES)
-
-
-# -- NAL-R -----------------------------------------------------------------------------------------
-
-
-def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
-    """Amplify signals by NAL-R for ears with thresholds in dB HL.
-
-    As in pyclarity, the first 140 samples of the filter's output are left out, so that the result
-    is 70 samples earlier than the signal.
-
-    Shape: (items, padded), (items, 8) -> (items, padded).
-    """
-    points = fft_length(extent.longest + NALR_ORDER, 2)
-    taps = filters_with_gains(nalr_gains_db(ears.double()), FREQUENCIES, RATE, NALR_ORDER)
-    spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(taps, points)
-    filtered = torch.fft.irfft(spectrum, points)[:, NALR_ORDER : NALR_ORDER + extent.longest]
-    return functional.pad(filtered, (0, extent.padded - extent.longest))

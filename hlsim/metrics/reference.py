@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from hlsim.audiogram import HIGHEST_LEVEL
+from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
+from hlsim.audiogram.prescription import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import (
@@ -22,12 +24,18 @@ from hlsim.checks import (
     check_rate,
     check_waveform,
 )
+from hlsim.dsp.fft import fft_length
+from hlsim.dsp.fir import filters_with_gains
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch
 from hlsim.metrics.ear.extent import Extent
 from hlsim.metrics.ear.model import HairCells
+from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.pair import SHORTEST_SECONDS, Equalisation, Noise, check_pair
 from hlsim.torchtools import Samples, as_samples, broadcast_shape, map_on_cores
+
+NALR_ORDER = 140
+"""Order of the filter that amplifies the clean signal."""
 
 
 class PreparedBatch(NamedTuple):
@@ -35,7 +43,8 @@ class PreparedBatch(NamedTuple):
 
     Attributes:
         clean: The clean signals.
-        cells: Hair cells of the ear, or of the ear of each item. Shape: (32,) or (items, 32).
+        cells: Hair cells of the ear of each item that receives the clean signals. Shape: (items,
+            32).
         features: Features of the clean signals, one object for each group of channels of the ear.
 
     >>> PreparedBatch._fields
@@ -61,8 +70,8 @@ class Reference(ABC):
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
-        equalisation: Mode of pyclarity for HASQI and HAAQI: 1 amplifies the clean signals by NAL-R,
-            2 takes signals that are amplified already.
+        equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R, 2 takes them as
+            they are: for HASPI not amplified, for HASQI and HAAQI amplified already.
         keep: Store the clean signals' features; otherwise they are computed, and the level is
             validated, for each score, which takes less memory.
 
@@ -88,7 +97,7 @@ class Reference(ABC):
         keep: bool = True,
     ) -> None:
         check_number("equalisation", equalisation, 1, 2, whole=True)
-        self._is_amplified = equalisation == 2
+        self._amplifies = equalisation == 1
         self._keeps_features = keep
         rate = check_rate(sample_rate)
         self._rate = 1000 * round(rate / 1000) if whole_khz else rate
@@ -140,7 +149,10 @@ class Reference(ABC):
         """Validate the clean signals of a range of items, and compute their features."""
         with torch.autocast(self._clean.device.type, enabled=False):
             clean = CleanBatch(self._rows, self._ends, items, self._rate, self._full_scale_spl)
-            at_ear, cells = self._sound_at_ear(clean)
+            ears, at_ear = self._ears[items], clean.signals
+            if self._amplifies:
+                at_ear = _amplify(at_ear, ears, clean.audible)
+            cells = ear_model.hair_cells(ears)
             sound = clean.through_middle_ear(at_ear)
             longest_delay = ear_model.longest_group_delay(sound, cells, clean.audible)
             features = [
@@ -148,18 +160,6 @@ class Reference(ABC):
                 for channels in ear_model.channel_chunks(sound)
             ]
         return PreparedBatch(clean, cells, features)
-
-    @abstractmethod
-    def _sound_at_ear(self, clean: CleanBatch) -> tuple[Tensor, HairCells]:
-        """Return the clean signals as they reach the reference's ear, and the ear's hair cells.
-
-        The ear of HASPI is normal. That of HASQI and HAAQI is the impaired one, for which the
-        signals are amplified by NAL-R unless they are already.
-
-        Returns:
-            Sound before the middle ear at 24 kHz, in multiples of 20 uPa, (items, padded); and hair
-            cells, (32,) or (items, 32).
-        """
 
     @abstractmethod
     def _features(
@@ -187,7 +187,7 @@ class Reference(ABC):
 
     @abstractmethod
     def _compare(
-        self, batch: PreparedBatch, output: Tensor, noise: Noise, seed: int, *ears: HairCells
+        self, batch: PreparedBatch, output: Tensor, cells: HairCells, noise: Noise, seed: int
     ) -> Tensor:
         """Compare outputs of aids with the clean signals of a batch.
 
@@ -195,22 +195,30 @@ class Reference(ABC):
             batch: The clean signals.
             output: Aligned outputs behind the middle ear at 24 kHz, in multiples of 20 uPa. Shape:
                 (items, padded).
+            cells: Hair cells of the ears that the outputs reach. Shape: (items, 32).
             noise: Kind of the internal noise of the ear.
             seed: Seed of the noise.
-            ears: For HASPI one argument, the hair cells of the impaired ears of all items, with
-                shape (all items, 32); none for HASQI and HAAQI, where the outputs reach the same
-                ears as the clean signals.
 
         Returns:
             For each item ten features of HASPI, or score, nonlinear and linear part of HASQI and
             HAAQI. Shape: (items, numbers).
         """
 
-    def _compare_all(self, output: Samples, noise: Noise, seed: int, *ears: HairCells) -> Tensor:
+    def _compare_all(
+        self, output: Samples, noise: Noise, seed: int, ears: HairCells | None = None
+    ) -> Tensor:
         """Validate outputs, and compare them with the clean signals of all groups.
 
-        The arguments are those of ``_compare``, but with outputs at the sample rate and on the
-        scale of the clean signals. Shape: (..., time) -> (..., numbers).
+        Args:
+            output: Outputs at the sample rate and on the scale of the clean signals. Shape: (...,
+                time).
+            noise: Kind of the internal noise of the ear.
+            seed: Seed of the noise.
+            ears: Hair cells of the ears that the outputs reach, (all items, 32); by default those
+                of the clean signals.
+
+        Returns:
+            Results of ``_compare``. Shape: (..., numbers).
 
         Raises:
             ValueError: The noise is unknown, the seed is out of range, or outputs have another
@@ -229,8 +237,24 @@ class Reference(ABC):
 
         def compare(group: int) -> Tensor:
             batch = self._batches[group] if self._batches else self._prepare(self._groups[group])
-            return self._compare(batch, batch.clean.align(rows), noise, seed, *ears)
+            cells = batch.cells if ears is None else ears[batch.clean.items]
+            return self._compare(batch, batch.clean.align(rows), cells, noise, seed)
 
         with torch.autocast(rows.device.type, enabled=False):
             numbers = map_on_cores(compare, range(len(self._groups)), rows)
         return torch.cat(numbers).reshape(*outputs.shape[:-1], -1)
+
+
+def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
+    """Amplify signals by NAL-R for ears with thresholds in dB HL.
+
+    As in pyclarity, the first 140 samples of the filter's output are left out, so that the result
+    is 70 samples earlier than the signal.
+
+    Shape: (items, padded), (items, 8) -> (items, padded).
+    """
+    points = fft_length(extent.longest + NALR_ORDER, 2)
+    taps = filters_with_gains(nalr_gains_db(ears.double()), FREQUENCIES, RATE, NALR_ORDER)
+    spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(taps, points)
+    filtered = torch.fft.irfft(spectrum, points)[:, NALR_ORDER : NALR_ORDER + extent.longest]
+    return functional.pad(filtered, (0, extent.padded - extent.longest))

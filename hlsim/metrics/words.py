@@ -123,8 +123,7 @@ def load_curve() -> Curve:
     >>> len(load_curve().coefficients)
     3
     """
-    path = Path(__file__).parent / "words.json"
-    return Curve(**json.loads(path.read_text(encoding="utf-8")))
+    return Curve(**json.loads(Path(__file__).with_suffix(".json").read_text()))
 
 
 def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = None) -> WordsChange:
