@@ -2,8 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,6 @@ from hlsim.audiogram.published import STANDARD
 from hlsim.audiogram.scale import EAR_NAMES, HIGHEST_LEVEL, HIGHEST_SIMULATED, EarName
 from hlsim.audiogram.value import Audiogram, ears_in_row
 from hlsim.files import check_spellings, convert_at, read_json, read_table
-
-_Builders = Mapping[str, Callable[[], Listener]]
-"""Functions without arguments that build listeners, under the names of the listeners."""
 
 _Row = tuple[str, dict[str, str]]
 """A row of a table: its place in the file, for messages, and its texts by column."""
@@ -97,19 +93,23 @@ def read_listeners(
     """
     is_file = isinstance(path, str | Path)
     is_json = is_file and str(path).lower().endswith(".json")
-    builders = _read_entries(path) if is_json else _group_rows(path)
+    records: Mapping[str, Any] = _read_entries(path) if is_json else _group_rows(path)
     source = path if is_file else "the table"
-    for name in names or ():
-        if name not in builders:
-            examples = ", ".join([*builders][:5])
+    listeners = {}
+    for name in records if names is None else names:
+        if name not in records:
+            examples = ", ".join([*records][:5])
             raise ValueError(f"{source}: no listener {name!r}; expected a name such as {examples}")
-    return {name: builders[name]() for name in (builders if names is None else names)}
+        if is_json:
+            place = f"{path}, listener {name}"
+            listeners[name] = convert_at(place, Listener.from_clarity, records[name])
+        else:
+            listeners[name] = _join_ears(name, records[name])
+    return listeners
 
 
-def _read_entries(path: str | Path) -> _Builders:
-    """Read Clarity's ``listeners.json``, and return functions that build the listeners by name.
-
-    The functions raise ValueError if an ear is missing or not valid.
+def _read_entries(path: str | Path) -> Mapping[str, Any]:
+    """Read the entries of Clarity's ``listeners.json``, each under the name of its listener.
 
     Raises:
         ValueError: The file does not exist, is no JSON, has a key twice, is not an object with
@@ -119,16 +119,11 @@ def _read_entries(path: str | Path) -> _Builders:
     if not isinstance(entries, Mapping) or not entries:
         raise ValueError(f"{path}: expected one entry per listener, as in Clarity's listeners.json")
     check_spellings([(str(path), {"listener": name}) for name in entries], "listener")
-    return {
-        name: partial(convert_at, f"{path}, listener {name}", Listener.from_clarity, entry)
-        for name, entry in entries.items()
-    }
+    return entries
 
 
-def _group_rows(path: str | Path | Any) -> _Builders:
-    """Read the rows of a table, and return functions that build the listeners.
-
-    The functions raise the errors of ``_join_ears``.
+def _group_rows(path: str | Path | Any) -> dict[str, list[_Row]]:
+    """Read the rows of a table, and group them by the name of the listener.
 
     Raises:
         ValueError: The table cannot be read, or a row has no name of a listener.
@@ -144,7 +139,7 @@ def _group_rows(path: str | Path | Any) -> _Builders:
         if not name:
             raise ValueError(f"{place}: expected a name in the column listener, got none; add it")
         rows.setdefault(name, []).append((place, row))
-    return {name: partial(_join_ears, name, rows_of_name) for name, rows_of_name in rows.items()}
+    return rows
 
 
 def _join_ears(listener: str, rows: Sequence[_Row]) -> Listener:
