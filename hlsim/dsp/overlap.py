@@ -47,10 +47,9 @@ class Block(NamedTuple):
 
         Shape: (..., time) -> (..., output_stop - output_start), or longer for the last block.
         """
-        start = self.output_start - self.input_start
-        if self.output_stop == self.input_stop:
-            return output[..., start:]
-        return output[..., start : self.output_stop - self.input_start]
+        is_last = self.output_stop == self.input_stop
+        stop = None if is_last else self.output_stop - self.input_start
+        return output[..., self.output_start - self.input_start : stop]
 
 
 def split_into_blocks(

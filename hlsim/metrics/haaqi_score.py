@@ -43,10 +43,10 @@ ENVELOPE_SEGMENT = 192
 ENVELOPE_RATE = 2 * RATE // ENVELOPE_SEGMENT
 """Number of segments per second, 250, because segments overlap by half."""
 
-MODULATION_EDGES = (20.0, 32.0, 50.0, 80.0)
-"""Lower edges in Hz of four bands of modulation: rates at which envelopes fluctuate.
+MODULATION_BANDS = (20.0, 32.0), (32.0, 50.0), (50.0, 80.0), (80.0,)
+"""Edges in Hz of four bands of modulation: rates at which envelopes fluctuate.
 
-The last band ends at 125 Hz.
+The last band ends at half of ``ENVELOPE_RATE``, 125 Hz.
 """
 
 MODULATION_ORDER = 128
@@ -136,13 +136,12 @@ def _split_by_rate(waves: Tensor) -> Tensor:
 @constant
 def _modulation_responses(points: int) -> NDArray[np.float64]:
     """Return the frequency responses of the bands of modulation. Shape: (4, points // 2 + 1)."""
-    filters = []
-    for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
-        edges = [low] if high is None else [low, high]
-        taps = scipy.signal.firwin(
+    filters = [
+        scipy.signal.firwin(
             MODULATION_ORDER + 1, edges, window="hann", pass_zero=False, fs=ENVELOPE_RATE
         )
-        filters.append(taps)
+        for edges in MODULATION_BANDS
+    ]
     return zero_phase_responses(filters, points)
 
 

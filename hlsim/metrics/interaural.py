@@ -85,12 +85,9 @@ def interaural(waveform: Samples, *, sample_rate: int = 16000) -> Interaural:
     left_power = left @ octaves
     right_power = right @ octaves
     coherence = correlation / (left_power * right_power).sqrt()
-    is_defined = coherence.isfinite()
-    return Interaural(
-        torch.where(is_defined, 10.0 * torch.log10(left_power / right_power), torch.nan),
-        torch.where(is_defined, delays[index].to(left), torch.nan),
-        torch.where(is_defined, coherence, torch.nan),
-    )
+    level = 10.0 * torch.log10(left_power / right_power)
+    differences = torch.stack((level, delays[index].to(left), coherence))
+    return Interaural(*torch.where(coherence.isfinite(), differences, torch.nan))
 
 
 def interaural_change(before: Samples, after: Samples, *, sample_rate: int = 16000) -> Interaural:

@@ -117,9 +117,9 @@ class Reference(ABC):
             )
         check_finite(self._rows, "clean")
         self._ears = self._thresholds(audiogram)
-        self._groups = [slice(0, items)]
-        if clean.device.type == "cpu":
-            self._groups = [slice(item, item + 1) for item in range(items)]
+        items_at_once = 1 if clean.device.type == "cpu" else items
+        starts = range(0, items, items_at_once)
+        self._groups = [slice(start, start + items_at_once) for start in starts]
         self._batches: list[PreparedBatch] = []
         if keep:
             self._batches = map_on_cores(self._prepare, self._groups, self._clean)
