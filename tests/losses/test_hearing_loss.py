@@ -666,3 +666,10 @@ def test_padding_does_not_change_the_level_to_which_loudness_belongs() -> None:
 def test_bad_loudness_is_rejected(options: dict[str, Any], match: str) -> None:
     with pytest.raises(ValueError, match=match):
         HearingLossLoss("N3", simulator="attenuation", **options)
+
+
+def test_output_and_clean_speech_of_other_shapes_or_devices_are_rejected() -> None:
+    loss = HearingLossLoss("N3", simulator="attenuation")
+    for output in (torch.zeros(800), torch.zeros(2, 400), torch.zeros(400, device="meta")):
+        with pytest.raises(ValueError, match="of the same shape on the same device"):
+            loss(output, torch.zeros(400))
