@@ -143,7 +143,7 @@ def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
     """Find the first and the last sample of each clean signal that is not silent.
 
     A sample is not silent if its magnitude is above a thousandth of the signal's maximum. If all
-    samples are zero, the results are ``time`` and -1.
+    samples are zero, the results are the ends of the signal.
 
     Args:
         references: Clean signals. Shape: (items, time).
@@ -155,7 +155,5 @@ def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
     (tensor([1]), tensor([3]))
     """
     magnitude = references.detach().abs()
-    time = references.shape[-1]
-    loud = magnitude > AUDIBLE_RATIO * magnitude.amax(-1, keepdim=True)
-    indices = torch.arange(time, device=references.device)
-    return torch.where(loud, indices, time).amin(-1), torch.where(loud, indices, -1).amax(-1)
+    is_loud = (magnitude > AUDIBLE_RATIO * magnitude.amax(-1, keepdim=True)).byte()
+    return is_loud.argmax(-1), is_loud.shape[-1] - 1 - is_loud.flip(-1).argmax(-1)
