@@ -188,13 +188,9 @@ class _MeanScore(_Metric):
         sides = output.shape[1] if output.ndim == 3 else 1
         scores_per_item = sides // self.ears_per_score
         time = output.shape[-1]
-        outputs, references = (
-            signal.double().reshape(-1, scores_per_item, self.ears_per_score, time)
-            for signal in (output, clean)
-        )
-        items = len(outputs)
+        items = output.numel() // (sides * time)
         audiogram = self.audiogram if audiogram is None else audiogram
-        ears = _thresholds(audiogram, items, sides).reshape(*outputs.shape[:3], -1)
+        ears = _thresholds(audiogram, items, sides)
         ends = torch.full((items,), time)
         if lengths is not None:
             ends = check_lengths(lengths, torch.Size((items, longest))).clamp_max(time)
@@ -205,17 +201,23 @@ class _MeanScore(_Metric):
             items = min(items, self.limit - first)
             if items <= 0:
                 return
+        count = items * scores_per_item
+        outputs, references, ears = (
+            values.reshape(-1, self.ears_per_score, values.shape[-1])[:count]
+            for values in (output.double(), clean.double(), ears)
+        )
         scores = scores_or_errors(
             type(self).score,
-            outputs[:items].flatten(0, 1),
-            references[:items].flatten(0, 1),
-            ears[:items].flatten(0, 1),
+            outputs,
+            references,
+            ears,
             ends[:items].repeat_interleave(scores_per_item).tolist(),
             sample_rate=self.sample_rate,
             full_scale_spl=self.full_scale_spl,
         )
         for item in range(items):
-            of_ears = scores[item * scores_per_item : (item + 1) * scores_per_item]
+            start = item * scores_per_item
+            of_ears = scores[start : start + scores_per_item]
             values = [float(score) for score in of_ears if isinstance(score, Tensor)]
             if len(values) < scores_per_item:
                 self.failed += 1
@@ -224,7 +226,7 @@ class _MeanScore(_Metric):
                 warnings.warn(message, stacklevel=2)
                 continue
             best = max(values)
-            samples = outputs[item, values.index(best), :, : ends[item]].flatten()
+            samples = outputs[start + values.index(best), :, : ends[item]].flatten()
             self.total += best
             self.total_level += float(level_spl(samples, self.full_scale_spl))
             self.count += 1
