@@ -68,7 +68,7 @@ class STFT:
         margin_after = margin - margin_before
         half = self.fft // 2
         padded = functional.pad(waveform, (half - margin_before, half - margin_after))
-        windowed = padded.unfold(-1, self.window, self.hop) * self._hann_window(waveform)
+        windowed = padded.unfold(-1, self.window, self.hop) * _hann(self.window, like=waveform)
         return rfft(functional.pad(windowed, (margin_before, margin_after)))
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
@@ -83,7 +83,7 @@ class STFT:
             spectrum: Spectra of the frames.
             length: Number of samples of the result.
         """
-        window = self._hann_window(spectrum.real)
+        window = _hann(self.window, like=spectrum)
         margin_before = (self.fft - self.window) // 2
         frames = torch.fft.irfft(spectrum, self.fft)
         windowed = frames[..., margin_before : margin_before + self.window] * window
@@ -107,10 +107,6 @@ class STFT:
             for part in range(parts)
         ]
         return sum(delayed[1:], start=delayed[0]).flatten(1)
-
-    def _hann_window(self, like: Tensor) -> Tensor:
-        """Hann window in the precision and on the device of a tensor. Shape: (window,)."""
-        return _hann(self.window, like=like)
 
 
 @constant

@@ -161,23 +161,16 @@ class FrozenSimulator:
         is_chosen = self.choice is not None and not reference.is_fixed
         is_normal = (self.choice if is_chosen else reference.signal) == "normal-hearing"
         target = self._limit_band(clean)
-        if is_normal and self._has_bank_phase and reference.normal_ear == "filter":
+        if is_normal and self.normal is not None:
+            target = check_shape(self.normal(target), "normal ear", target.shape)
+        elif is_normal and self._has_bank_phase and reference.normal_ear == "filter":
             return simulate_normal_ear(target, thresholds, self.sample_rate).expand(shape)
-        if is_normal:
-            target = self._simulate_normal_ear(target, lengths)
+        elif is_normal:
+            # Thresholds whose values the CPU knows, so that it need not wait for a GPU.
+            target = self.simulate(target, on_device(_normal_ear(), target.device), lengths)
         if self._has_bank_phase and reference.bank_phase:
             target = apply_bank_phase(target, thresholds, self.sample_rate, normal=is_normal)
         return target.expand(shape)
-
-    def _simulate_normal_ear(self, clean: Tensor, lengths: Tensor | None) -> Tensor:
-        """Compute what the normal ear perceives, by ``normal`` or by the simulator at 0 dB HL.
-
-        Shape: (..., time) -> (..., time).
-        """
-        if self.normal is not None:
-            return check_shape(self.normal(clean), "normal ear", clean.shape)
-        # Thresholds whose values the CPU knows, so that it need not wait for a GPU.
-        return self.simulate(clean, on_device(_normal_ear(), clean.device), lengths)
 
     def _limit_band(self, clean: Tensor) -> Tensor:
         """Remove frequencies above the highest one of the simulator's output.
