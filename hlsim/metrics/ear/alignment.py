@@ -63,7 +63,7 @@ def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> T
         spectrum = reference_spectrum * spectrum_for_alignment(output, extent).conj()
         covariance = torch.fft.irfft(spectrum, points).abs()
         # in order of the lag, from 1 - time to time - 1
-        by_lag = torch.cat((covariance[:, points - time + 1 :], covariance[:, :time]), -1)
+        by_lag = covariance.roll(time - 1, -1)[:, : 2 * time - 1]
         return by_lag.argmax(-1) - (time - 1) + HEADROOM
 
 
@@ -87,22 +87,23 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     >>> lag_spectrum(torch.zeros(1, 2, 128), Extent((128,))).shape
     torch.Size([1, 2, 1, 193])
     """
-    max_lag, (count, hop, points) = _max_lag(extent), _lag_blocks(extent)
+    max_lag, count, hop, points = _lag_blocks(extent)
     behind = count * hop - extent.longest + max_lag + 1
     steps = functional.pad(extent.cut(reference), (max_lag, behind)).diff()
     return torch.fft.rfft(steps.unfold(-1, hop + 2 * max_lag, hop), points)
 
 
-def _max_lag(extent: Extent) -> int:
-    """Return the largest delay of a channel in samples."""
-    return min(MAX_LAG, extent.longest)
+def _lag_blocks(extent: Extent) -> tuple[int, int, int, int]:
+    """Return the numbers that describe the blocks of ``lag_spectrum``.
 
-
-def _lag_blocks(extent: Extent) -> tuple[int, int, int]:
-    """Return the number of blocks of ``lag_spectrum``, samples per block, and transform length."""
+    Returns:
+        Largest delay of a channel in samples; number of blocks; samples per block; and length of
+        the transform of a block with all lags.
+    """
+    max_lag = min(MAX_LAG, extent.longest)
     count = max(1, round(extent.longest / LAG_BLOCK))
     hop = -(-extent.longest // count)
-    return count, hop, fft_length(hop + 2 * _max_lag(extent), 16)
+    return max_lag, count, hop, fft_length(hop + 2 * max_lag, 16)
 
 
 def align_channels(
@@ -131,7 +132,7 @@ def align_channels(
     True
     """
     with torch.no_grad():
-        max_lag, (count, hop, points) = _max_lag(extent), _lag_blocks(extent)
+        max_lag, count, hop, points = _lag_blocks(extent)
         padded = functional.pad(extent.cut(envelope), (0, count * hop - extent.longest))
         spectra = torch.fft.rfft(padded.unflatten(-1, (count, hop)), points)
         # in place, because these are large tensors
