@@ -47,8 +47,9 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     if not samples.any():
         raise ValueError("expected speech, got a waveform that is silent or empty")
     pole = math.exp(-1.0 / (sample_rate * _TIME_CONSTANT))
-    smoothed_once = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], np.abs(samples))
-    envelope = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], smoothed_once)
+    envelope = np.abs(samples)
+    for _ in range(2):
+        envelope = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], envelope)
     thresholds = _THRESHOLDS * envelope.max()
     # A sample is active if the envelope reaches the threshold there or within the hangover before.
     width = max(1, round(_HANGOVER * sample_rate))

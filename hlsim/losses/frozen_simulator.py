@@ -126,9 +126,10 @@ class FrozenSimulator:
         items = flatten_items(waveform, batch, waveform.dtype)
         ears = flatten_items(thresholds, batch, thresholds.dtype)
         outputs = []
-        for item, ear, end in zip(items, ears, lengths.expand(batch).flatten(), strict=True):
-            perceived = check_shape(self.simulator(item[:end], ear), "simulator", (int(end),))
-            outputs.append(functional.pad(perceived, (0, time - int(end))))
+        ends = lengths.expand(batch).flatten().tolist()
+        for item, ear, end in zip(items, ears, ends, strict=True):
+            perceived = check_shape(self.simulator(item[:end], ear), "simulator", (end,))
+            outputs.append(functional.pad(perceived, (0, time - end)))
         return torch.stack(outputs).reshape(*batch, time)
 
     def compute_reference(

@@ -65,7 +65,8 @@ class Reference(ABC):
     Args:
         clean: Clean signals. The scores are on their device, and float64 if they are, otherwise
             float32. Their gradient is not computed. Shape: (..., time).
-        audiogram: Ear that receives the clean signals; one ear, or one for each item.
+        audiogram: Ear that receives the clean signals, a normal one for HASPI and the impaired one
+            for HASQI and HAAQI; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
