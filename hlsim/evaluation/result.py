@@ -26,16 +26,12 @@ class ItemSounds:
     """Sounds of one item, in pascals.
 
     Attributes:
-        name: Name of the item.
+        title: Name of the item, for the heading of its player, with further facts.
         ear: Audiogram of the ear.
         sample_rate: Sample rate in Hz.
         groups: Signals as a dict from the heading of a group, which may be empty, to a dict from
             label to signal. Shape of each signal: (time,).
         failures: Reason why there is no sound, by label.
-        change: Change of the score between the two conditions of ``Evaluation.headline``; None if
-            items are not ranked by it.
-        rank: Place of the item when all items are sorted by ``change``, from 1 for the largest
-            rise, and the number of items; (0, 0) if items are not ranked.
 
     >>> import torch
     >>> signals = {"tone": torch.ones(8)}
@@ -43,13 +39,11 @@ class ItemSounds:
     {}
     """
 
-    name: str
+    title: str
     ear: Audiogram
     sample_rate: int
     groups: Mapping[str, Mapping[str, Tensor]]
     failures: Mapping[str, str] = field(default_factory=dict)
-    change: float | None = None
-    rank: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)

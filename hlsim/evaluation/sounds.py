@@ -30,9 +30,10 @@ def perceive_items(
 
     Items are ranked by how much their score changes between the two conditions of
     ``evaluation.headline``, the largest rise first. The returned items are evenly spaced in this
-    ranking. The sounds of an item, of at most 8 s, are what a normal ear perceives of the clean
-    speech, and what the impaired ear perceives of the output of each condition. A sound that
-    cannot be computed is missing; ``failures`` has the reason.
+    ranking, and their titles state the change and the rank. The sounds of an item, of at most 8 s,
+    are what a normal ear perceives of the clean speech, and what the impaired ear perceives of the
+    output of each condition. A sound that cannot be computed is missing; ``failures`` has the
+    reason.
 
     Args:
         evaluation: Evaluation with comparisons.
@@ -51,8 +52,8 @@ def perceive_items(
     >>> table = pandas.DataFrame(rows, columns=["item", "name", "condition", "haspi"])
     >>> evaluation = Evaluation([item], conditions, [], table, compare(table, ["haspi"]))
     >>> (sounds,) = perceive_items(evaluation, count=1)
-    >>> list(sounds.groups[""])
-    ['normal ear (the goal)', 'a', 'b']
+    >>> sounds.title, list(sounds.groups[""])
+    ('s01 (HASPI: change +0.200, rank 1 of 1)', ['normal ear (the goal)', 'a', 'b'])
     """
     headline = evaluation.headline
     if headline is None or not count:
@@ -69,17 +70,9 @@ def perceive_items(
         row = rows.loc[changes.index[place]]
         item = evaluation.items[int(row.get("source", row.name))].load()
         signals, failures = _perceive(item, chosen)
-        sounds.append(
-            ItemSounds(
-                row["name"],
-                item.ear,
-                item.sample_rate,
-                {"": signals},
-                failures,
-                change=float(changes.iloc[place]),
-                rank=(place + 1, len(changes)),
-            )
-        )
+        rank = f"change {changes.iloc[place]:+.3f}, rank {place + 1} of {len(changes)}"
+        title = f"{row['name']} ({headline.title}: {rank})"
+        sounds.append(ItemSounds(title, item.ear, item.sample_rate, {"": signals}, failures))
     return sounds
 
 

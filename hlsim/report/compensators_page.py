@@ -1,7 +1,6 @@
 """The page of ``evaluate-compensator``: it presents what ``evaluation.compensators`` computes."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from hlsim.calibration import Loudness
@@ -145,9 +144,7 @@ def compensators_page(evaluation: Evaluation) -> Page:
     about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE, HASQI_NOTE]
     sections = [
         Section("Scores", about, tables, means),
-        *listening_sections(
-            replace(evaluation, comparisons=next(iter(groups.values())).comparisons)
-        ),
+        *listening_sections(evaluation),
         Section("Gain", [_GAINS], pictures=_gain_pictures(evaluation)),
         *_digit_sections(evaluation),
         Section("Could it be worn?", [_WEARING], [_wearing_table(evaluation)]),

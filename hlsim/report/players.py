@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL, level_spl
-from hlsim.evaluation.comparison import ConditionComparison
 from hlsim.evaluation.result import Evaluation, ItemSounds
 from hlsim.extras import require
 from hlsim.progress import track
@@ -51,25 +50,15 @@ def listening_sections(evaluation: Evaluation, about: str = _EXPLANATION) -> lis
     ['a']
     """
     tracked = track(evaluation.sounds, "players", len(evaluation.sounds))
-    sections = [_item_section(evaluation.headline, sounds) for sounds in tracked]
+    sections = [_item_section(sounds) for sounds in tracked]
     return [Section("Listen", [about], sections=sections)] if sections else []
 
 
-def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> Section:
+def _item_section(sounds: ItemSounds) -> Section:
     """Return the section with the player of an item, and facts about its ear.
 
-    The heading has the name of the item, and the change of its score and its rank, if it has one.
     If all sounds are silent or have failed, there is no player.
-
-    Args:
-        headline: Comparison by which items are ranked, or None.
-        sounds: Sounds of the item.
     """
-    title = sounds.name
-    if headline is not None and sounds.change is not None:
-        place, count = sounds.rank
-        rank = f"change {sounds.change:+.3f}, rank {place} of {count}"
-        title += f" ({headline.title}: {rank})"
     ear = sounds.ear
     thresholds = ", ".join(f"{level:g}" for level in ear.thresholds)
     texts = [
@@ -78,8 +67,8 @@ def _item_section(headline: ConditionComparison | None, sounds: ItemSounds) -> S
     ]
     texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
     if not any(signal.any() for group in sounds.groups.values() for signal in group.values()):
-        return Section(title, [*texts, "There is no sound to play."])
-    return Section(title, texts, player=make_player(sounds.groups, sounds.sample_rate))
+        return Section(sounds.title, [*texts, "There is no sound to play."])
+    return Section(sounds.title, texts, player=make_player(sounds.groups, sounds.sample_rate))
 
 
 def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) -> Player:
