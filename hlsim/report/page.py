@@ -9,18 +9,15 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from hlsim.extras import require
-from hlsim.files import atomic_path, write_atomically
-from hlsim.progress import track
+from hlsim.files import write_atomically
 
 SPECTROGRAM_LEVELS = (0.0, 90.0)
 """Levels in dB SPL of a bin of 50 Hz at the lower and the upper end of the colour scale."""
@@ -260,58 +257,6 @@ class Page:
         Characters of the texts that have a meaning in Markdown are escaped.
         """
         return _render("page.md", page=self)
-
-
-def write_page(
-    page: Page,
-    data: Mapping[str, Any],
-    out: str | Path,
-    further_files: Mapping[str, str] | None = None,
-) -> Path:
-    """Write a page as ``report.html`` and ``report.md``, and its data as ``report.json``.
-
-    No file is replaced before all are on the disk, so that a full disk leaves all as they were.
-
-    Args:
-        page: Page to write.
-        data: Results for programs, such as those of ``Evaluation.to_dict``.
-        out: Folder of the files. Files of these names are replaced; others stay.
-        further_files: Texts of further files in the folder, by the name of the file.
-
-    Returns: The path of ``report.html``.
-
-    Raises:
-        ValueError: The files cannot be written, or the data contain NaN or infinity.
-        TypeError: The data contain an object that JSON cannot represent.
-        MissingExtraError: jinja2 is not installed, or for pictures matplotlib.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_page(Page("Aids", "", []), {"rows": []}, folder).name
-    'report.html'
-    """
-    pictures = [*_find_pictures(page.sections)]
-    for picture in track(pictures, "pictures", len(pictures)):
-        _ = picture.data
-    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
-    contents = {
-        "report.json": f"{text}\n",
-        "report.md": page.markdown(),
-        "report.html": page.html(),
-        **(further_files or {}),
-    }
-    folder = Path(out).absolute()
-    with ExitStack() as stack:  # Files are replaced at its end, when all are on the disk.
-        for name, content in contents.items():
-            stack.enter_context(atomic_path(folder / name)).write_text(content, encoding="utf-8")
-    return folder / "report.html"
-
-
-def _find_pictures(sections: Sequence[Section]) -> Iterator[Picture]:
-    """Yield the pictures of sections and of their inner sections."""
-    for section in sections:
-        yield from section.pictures
-        yield from _find_pictures(section.sections)
 
 
 @cache

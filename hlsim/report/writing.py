@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hlsim.audiogram.scale import FREQUENCIES
 from hlsim.evaluation.result import Evaluation
-from hlsim.report.page import Page, write_page
+from hlsim.files import atomic_path
+from hlsim.progress import track
+from hlsim.report.page import Page, Picture, Section
 from hlsim.report.verdict import limits, verdict
 
 if TYPE_CHECKING:
@@ -18,18 +23,19 @@ def write_results(page: Page, evaluation: Evaluation, out: str | Path) -> Path:
     """Write an evaluation as ``report.html``, ``report.md``, ``report.json`` and ``scores.csv``.
 
     ``report.json`` contains the settings, comparisons and scores, see ``Evaluation.to_dict``, and
-    each comparison in words. ``scores.csv`` has one row per item and condition. Either all files
-    are written or all stay as they were.
+    each comparison in words. ``scores.csv`` has one row per item and condition. No file is replaced
+    before all are on the disk, so that a full disk leaves all as they were.
 
     Args:
         page: Page of the evaluation.
         evaluation: Evaluation whose data are written.
-        out: Folder of the files.
+        out: Folder of the files. Files of these names are replaced; others stay.
 
     Returns: The path of ``report.html``.
 
     Raises:
         ValueError: The files cannot be written.
+        TypeError: The evaluation contains an object that JSON cannot represent.
         MissingExtraError: jinja2 is not installed, or for pictures matplotlib.
 
     >>> import pandas, tempfile
@@ -40,24 +46,32 @@ def write_results(page: Page, evaluation: Evaluation, out: str | Path) -> Path:
     0,aid,0.5
     """
     data = evaluation.to_dict()
-    data["comparisons"] = _add_words(evaluation, data["comparisons"])
-    for name, group in evaluation.groups.items():
-        data["groups"][name] = _add_words(group, data["groups"][name])
-    scores = scores_table(evaluation).to_csv(index=False, float_format="%.9g")
-    return write_page(page, data, out, {"scores.csv": scores})
+    parts = [(evaluation, data["comparisons"])]
+    parts += [(group, data["groups"][name]) for name, group in evaluation.groups.items()]
+    for part, comparisons in parts:
+        for c, values in zip(part.comparisons, comparisons, strict=True):
+            values["in_words"] = f"{verdict(c)} {limits(c)}"
+    pictures = [*_find_pictures(page.sections)]
+    for picture in track(pictures, "pictures", len(pictures)):
+        _ = picture.data
+    contents = {
+        "report.json": json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+        "report.md": page.markdown(),
+        "report.html": page.html(),
+        "scores.csv": scores_table(evaluation).to_csv(index=False, float_format="%.9g"),
+    }
+    folder = Path(out).absolute()
+    with ExitStack() as stack:  # Files are replaced at its end, when all are on the disk.
+        for name, content in contents.items():
+            stack.enter_context(atomic_path(folder / name)).write_text(content, encoding="utf-8")
+    return folder / "report.html"
 
 
-def _add_words(evaluation: Evaluation, comparisons: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the dicts of comparisons for ``report.json``, each with a text, ``in_words``.
-
-    Args:
-        evaluation: Evaluation with the comparisons.
-        comparisons: Dicts of these comparisons, in the same order.
-    """
-    return [
-        {**data, "in_words": f"{verdict(c)} {limits(c)}"}
-        for c, data in zip(evaluation.comparisons, comparisons, strict=True)
-    ]
+def _find_pictures(sections: Sequence[Section]) -> Iterator[Picture]:
+    """Yield the pictures of sections and of their inner sections."""
+    for section in sections:
+        yield from section.pictures
+        yield from _find_pictures(section.sections)
 
 
 def scores_table(evaluation: Evaluation) -> DataFrame:

@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 
+from hlsim.evaluation.result import Evaluation
 from hlsim.progress import ProgressLine
-from hlsim.report.page import Card, Page, Picture, Player, Section, Sound, Table, write_page
+from hlsim.report.page import Card, Page, Picture, Player, Section, Sound, Table
+from hlsim.report.writing import write_results
 
 VOID_TAGS = {"meta", "link", "img", "input", "br"}
 
@@ -113,10 +115,16 @@ def test_names_have_no_meaning_in_markdown() -> None:
     assert "[0.1, 0.2]" in Page("p", "an interval [0.1, 0.2]", []).markdown()
 
 
+def write(title: str, folder: Path, *sections: Section) -> None:
+    """Write a page without scores."""
+    table = pytest.importorskip("pandas").DataFrame()
+    write_results(Page(title, "", sections), Evaluation([], [], [], table), folder)
+
+
 def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_page(Page("first", "", []), {}, tmp_path)
+    write("first", tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     write_text = Path.write_text
 
@@ -127,7 +135,7 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
 
     monkeypatch.setattr(Path, "write_text", fill_disk)
     with pytest.raises(ValueError, match="No space left on device"):
-        write_page(Page("second", "", []), {}, tmp_path)
+        write("second", tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -159,4 +167,4 @@ def test_pictures_are_counted_while_they_are_drawn(
     pictures = [Picture(lambda: b"<svg/>", "quick"), Picture(draw, "slow")]
     inner = Section("Details", sections=[Section("Pictures", pictures=pictures)])
     with ProgressLine("scores"):
-        write_page(Page("Aids", "", [inner]), {}, tmp_path)
+        write("Aids", tmp_path, inner)
