@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import NEURO_RATE, level_spl, set_level
+from hlsim.calibration import NEURO_RATE, Loudness, level_spl, loudness_at, set_level
 from hlsim.evaluation.digits.psychometric import Estimate, subtract
 from hlsim.evaluation.digits.speech_reception import DigitTest
 from hlsim.evaluation.measures import NORMAL, perceive
@@ -187,7 +187,9 @@ def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     return 10.0 * ratio.log10()
 
 
-def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> dict[str, Any]:
+def measure_steady_tones(
+    aid: Aid, ear: Audiogram, levels: Sequence[float], loudness: Loudness = 0.0
+) -> dict[str, Any]:
     """Measure loudness errors and distortion of a hearing aid for steady tones.
 
     The frequencies of the tones are the six ``TONES``. Measurements with speech do not reveal an
@@ -197,10 +199,13 @@ def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> d
         aid: The hearing aid.
         ear: The audiogram.
         levels: Levels of the tones in dB SPL.
+        loudness: Loudness at which an output has no loudness error, in dB relative to a normal ear:
+            a number, or numbers by the level of the tone.
 
     Returns:
         ``loudness_error_db``, the level that the ear perceives of the output minus the level that a
-        normal ear perceives of the tone, by the exact MSBG; ``sidebands_db``, the power of the
+        normal ear perceives of the tone, by the exact MSBG, and minus ``loudness``;
+        ``sidebands_db``, the power of the
         output at more than 20 Hz from the tone relative to that near it, in dB; both are nested
         lists of shape (levels, frequencies). ``levels`` (dB SPL) and ``frequencies`` (Hz) are the
         axes.
@@ -212,9 +217,13 @@ def measure_steady_tones(aid: Aid, ear: Audiogram, levels: Sequence[float]) -> d
     hertz = torch.tensor(TONES).repeat_interleave(len(levels))
     aided = _aid_outputs(aid, sounds, ear)
     errors = _perceived_level(aided, ear) - _perceived_level(sounds, NORMAL)
-    values = {"loudness_error_db": errors, "sidebands_db": _sidebands_db(aided, hertz)}
-    by_level = {name: v.reshape(len(TONES), -1).T.tolist() for name, v in values.items()}
-    return {"levels": list(levels), "frequencies": list(TONES), **by_level}
+    targets = loudness_at(loudness, torch.tensor(levels, dtype=torch.float64))
+    return {
+        "levels": list(levels),
+        "frequencies": list(TONES),
+        "loudness_error_db": (errors.reshape(len(TONES), -1) - targets).T.tolist(),
+        "sidebands_db": _sidebands_db(aided, hertz).reshape(len(TONES), -1).T.tolist(),
+    }
 
 
 def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, Any]:

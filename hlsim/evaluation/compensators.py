@@ -233,17 +233,15 @@ def evaluate_compensators(
     # These measurements come first, because they reject an aid that fails.
     details = {
         "gain_curves": measure_aids(aids, ears_of_aids, measure_gain_curve, utterances, levels),
-        "steady_tones": measure_aids(with_unaided, ears_of_aids, measure_steady_tones, levels),
+        "steady_tones": measure_aids(
+            with_unaided, ears_of_aids, measure_steady_tones, levels, loudness
+        ),
         "wearing": measure_aids(wearable, ears_of_aids, measure_wearability, utterances[0]),
     }
     if srt:
         details["reception_thresholds"] = measure_reception_thresholds(
             with_unaided, ears_of_aids, UNAIDED, DigitTest.draw(seed=seed)
         )
-    targets = loudness_at(loudness, torch.tensor(levels, dtype=torch.float64)).tolist()
-    for row in details["steady_tones"]:
-        errors = zip(row["loudness_error_db"], targets, strict=True)
-        row["loudness_error_db"] = [[tone - target for tone in tones] for tones, target in errors]
     evaluation = Evaluation.run(
         drawn,
         conditions,
@@ -293,8 +291,8 @@ def _read_scene_clips(manifest: str | Path, root: str | Path | None, seconds: fl
     """
     folder = Path(manifest).parent if root is None else Path(root)
     rows = read_manifest(manifest, root)
-    rows_by_split = [[row for row in rows if row.split == split] for split in ("test", "valid")]
-    chosen_rows = rows_by_split[0] or rows_by_split[1]
+    chosen_rows = [row for row in rows if row.split == "test"]
+    chosen_rows = chosen_rows or [row for row in rows if row.split == "valid"]
     if not chosen_rows:
         raise ValueError(
             f"{manifest}: expected utterances in the split test or valid, got none; write test in "
