@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -199,36 +200,30 @@ class DigitTest:
         triplets = Triplets(*(values[part] for values in self.material))
         signals = present(triplets, torch.from_numpy(snr).float(), self.noise_spl)
 
-        def recognise(portion: slice) -> Tensor:
-            perceived = perceive(signals[portion], ear, self.simulator, triplets.internal[portion])
-            return self.listener(perceived).argmax(-1)
+        def recognise(portion: tuple[Tensor, Tensor]) -> Tensor:
+            sounds, internal = portion
+            return self.listener(perceive(sounds, ear, self.simulator, internal)).argmax(-1)
 
         # The portions do not depend on the number of cores, so that results do not, either.
         if aid is not None:
-            call = partial(_call_aid, aid, signals, ear)
+            call = partial(_call_aid, aid, ear)
             with one_thread() if not aid_in_threads else nullcontext():
-                outputs = map_on_cores(call, _portions(len(part), _AIDED_AT_ONCE), signals)
+                outputs = map_on_cores(call, signals.split(_AIDED_AT_ONCE), signals)
             signals = torch.cat(outputs)
-        portions = _portions(len(part), _PERCEIVED_AT_ONCE)
-        answers = torch.cat(map_on_cores(recognise, portions, signals))
+        parts = (values.split(_PERCEIVED_AT_ONCE) for values in (signals, triplets.internal))
+        answers = torch.cat(map_on_cores(recognise, [*zip(*parts, strict=True)], signals))
         return (answers == triplets.digits).sum(-1).double().numpy()
 
 
-def _portions(count: int, size: int) -> list[slice]:
-    """Return slices of ``size`` triplets that cover ``count`` triplets; the last may be shorter."""
-    return [slice(start, start + size) for start in range(0, count, size)]
+def _call_aid(aid: AidFunction, ear: Tensor, inputs: Tensor) -> Tensor:
+    """Compute the outputs of an aid for some triplets, and validate them.
 
-
-def _call_aid(aid: AidFunction, signals: Tensor, ear: Tensor, portion: slice) -> Tensor:
-    """Compute the outputs of an aid for a portion of the signals, and validate them.
-
-    Shape: (triplets, time), or (triplets, ..., time) for several microphones, and (8,) in dB HL
-        -> (triplets of the portion, time).
+    Shape: (8,) in dB HL and (triplets, time), or (triplets, ..., time) for several microphones
+        -> (triplets, time).
 
     Raises:
         ValueError: The outputs are no tensor, have another shape, or samples that are not finite.
     """
-    inputs = signals[portion]
     outputs = aid(inputs, ear)
     if not isinstance(outputs, Tensor):
         raise ValueError(f"expected the aid to return a tensor, got a {type(outputs).__name__}")
@@ -315,21 +310,15 @@ def reception_threshold(
     total = len(aids) * len(ears)
     estimates: list[Estimate] = []
     shipped = isinstance(aid, str | Path)
-    for tested_aid in aids:
-        for ear in ears:
-            show(len(estimates), total)
-            estimates.append(test.measure(ear, tested_aid, aid_in_threads=shipped))
+    for tested_aid, ear in product(aids, ears):
+        show(len(estimates), total)
+        estimates.append(test.measure(ear, tested_aid, aid_in_threads=shipped))
     show(total, total)
-
-    def in_shape_of_ears(values: Any) -> Any:
-        return np.array(values).reshape(thresholds.shape[:-1])[()]
-
-    conditions = [
-        Estimate(*map(in_shape_of_ears, zip(*estimates[start : start + len(ears)], strict=True)))
-        for start in range(0, total, len(ears))
-    ]
-    unaided = conditions[0]
-    aided = None if aid is None else conditions[1]
+    shape = thresholds.shape[:-1]
+    values = np.array(estimates).T.reshape(len(Estimate._fields), len(aids), *shape)
+    results = [Estimate(*values[:, number]) for number in range(len(aids))]
+    unaided = results[0]
+    aided = None if aid is None else results[1]
     benefit = None if aided is None else subtract(unaided, aided)
-    pta = in_shape_of_ears(ears.double()[:, _PTA].mean(-1).numpy())
+    pta = ears.double()[:, _PTA].mean(-1).numpy().reshape(shape)[()]
     return ReceptionThreshold(unaided, aided, benefit, pta, people_threshold(pta))
