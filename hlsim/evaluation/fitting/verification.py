@@ -150,15 +150,8 @@ def verify(
         )
     for name, signal in (("input_", input_), ("output", output)):
         check_finite(check_waveform(signal, name, full_scale_spl=full_scale_spl), name)
-    if not bool(input_.any()):
-        raise ValueError("input_ is silent; pass the sound that the aid received")
-    if not bool(output.any()):
-        raise ValueError("output is silent; pass the sound that the aid produced")
-    if min(len(input_), len(output)) < MIN_SECONDS * rate:
-        raise ValueError(
-            f"expected at least 1 s of sound, got {len(input_) / rate:.2g} s of input and "
-            f"{len(output) / rate:.2g} s of output; 15 s of speech and more are better"
-        )
+        if not bool(signal.any()):
+            raise ValueError(f"{name} is silent; pass the input and the output of the aid")
     if abs(len(input_) - len(output)) > rate:
         raise ValueError(
             f"input and output differ in length by more than 1 s, {len(input_)} and "
@@ -215,7 +208,8 @@ def _cut_to_common_sound(input_: Tensor, output: Tensor, rate: int) -> tuple[Ten
     samples = min(len(input_), len(output))
     if samples < MIN_SECONDS * rate:
         raise ValueError(
-            f"input and output have only {samples / rate:.1f} s in common; expected 1 s or more"
+            f"expected at least 1 s of sound that input and output have in common, got "
+            f"{samples / rate:.2g} s; 15 s of speech and more are better"
         )
     return input_[:samples], output[:samples], correlation
 
