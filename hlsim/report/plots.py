@@ -71,26 +71,12 @@ Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mappin
 """Horizontal values, vertical values, and matplotlib's properties of a line, such as ``color``."""
 
 
-def _draw_picture(
-    draw: Callable[[Any], None], title: str, note: str = "", height: float = 3.2
-) -> Picture:
-    """Return an SVG picture for a page, whose contents a function draws with matplotlib.
+def _draw_svg(draw: Callable[[Any], None], height: float = 3.2) -> bytes:
+    """Return the contents of an SVG file that a function draws with matplotlib.
 
     Args:
-        draw: Function that is called with matplotlib's axes when the picture is needed
-            (``Picture.data``).
-        title: Heading above the picture.
-        note: Sentence below the picture.
+        draw: Function that is called with matplotlib's axes.
         height: Height in inches.
-
-    >>> _draw_picture(lambda axes: axes.plot([1, 2]), "A line").title
-    'A line'
-    """
-    return Picture(partial(_draw_svg, draw, height), title, note)
-
-
-def _draw_svg(draw: Callable[[Any], None], height: float) -> bytes:
-    """Return the contents of an SVG file, see ``_draw_picture``.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -120,7 +106,7 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     names = [condition.name for condition in conditions]
     aided = [c.name for c in conditions if c.of not in names and c.kind != "unaided"]
     colours: dict[str, Any] = dict.fromkeys(names, UNAIDED_COLOUR)
-    colours |= {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(aided)}
+    colours.update(zip(aided, cycle(_COLOURS), strict=False))
     for condition in conditions:
         if condition.of in names:
             colours[condition.name] = (colours[condition.of], 0.6)
@@ -160,7 +146,7 @@ def curves_picture(
         axes.figure.legend(loc="outside lower left", **_LEGEND)
 
     height = 2.9 + _LEGEND_INCHES * ((len(curves) + 1) // 2)
-    return _draw_picture(draw, title, note=note, height=height)
+    return Picture(partial(_draw_svg, draw, height), title, note)
 
 
 def verification_picture(result: Verification) -> Picture:
@@ -245,11 +231,9 @@ def ears_picture(
     def draw(axes: Any) -> None:
         for number, aid in enumerate(aids):
             shift = 0.6 * (number + 0.5) / len(aids) - 0.3
-            points_of_aid = [
-                (ears.index(ear) + shift, value) for ear, name, value in values if name == aid
-            ]
-            places = [place for place, _ in points_of_aid]
-            points, low, high = np.array([value for _, value in points_of_aid]).T
+            values_of_aid = {ear: value for ear, name, value in values if name == aid}
+            places = [ears.index(ear) + shift for ear in values_of_aid]
+            points, low, high = np.array([*values_of_aid.values()]).T
             # A label that begins with an underscore would be hidden.
             axes.plot(places, points, "o", color=colours[aid], label=f" {fill(aid, 26)}")
             axes.vlines(places, low, high, colors=[colours[aid]])
@@ -259,7 +243,7 @@ def ears_picture(
         axes.figure.legend(loc="outside lower left", **_LEGEND)
 
     height = 2.9 + _LEGEND_INCHES * ((len(aids) + 1) // 2)
-    return _draw_picture(draw, title, height=height)
+    return Picture(partial(_draw_svg, draw, height), title)
 
 
 def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
@@ -307,7 +291,7 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
         "although their difference is significant, because each item is scored under both."
     )
     heading = f"{title} of all conditions" + (f", {part[0].lower()}{part[1:]}" if part else "")
-    return [_draw_picture(draw, heading, note, height=1.0 + 0.4 * len(means))]
+    return [Picture(partial(_draw_svg, draw, 1.0 + 0.4 * len(means)), heading, note)]
 
 
 def scores_pictures(evaluation: Evaluation) -> list[Picture]:
@@ -343,4 +327,4 @@ def scores_pictures(evaluation: Evaluation) -> list[Picture]:
         axes.set(xlim=axis_range, ylim=axis_range)
 
     note = "Each point is an item; both scores are equal on the dashed line."
-    return [_draw_picture(draw, f"{c.title} of the {len(before)} items", note)]
+    return [Picture(partial(_draw_svg, draw), f"{c.title} of the {len(before)} items", note)]
