@@ -194,17 +194,24 @@ def evaluate_scenes(
         for c in track(conditions, "conditions", len(conditions))
     }
     write = partial(_write_signals, Path(out), conditions, folders, microphones, rate)
-    parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
-    written = run_parallel(write, pairs, **parallel)
+    written = run_parallel(write, pairs, jobs=running.get("jobs"), dask=running.get("dask"))
     recordings = []
     for pair, files in track(written, "pairs of scene and listener", len(pairs)):
         if isinstance(files, Crash):
             files = {condition.name: ValueError(CRASH) for condition in conditions}
         for side, ear in pair.listener.ears().items():
-            item = RecordedItem(
-                pair.scene, _reference_file(Path(out), pair), files, ear, pair.name, side
+            recordings.append(
+                RecordedItem(
+                    pair.scene,
+                    _reference_file(Path(out), pair),
+                    files,
+                    ear,
+                    pair.name,
+                    side,
+                    full_scale_spl=full_scale_spl,
+                    seed=seed,
+                )
             )
-            recordings.append(replace(item, full_scale_spl=full_scale_spl, seed=seed))
     aid_names = [condition.name for condition in conditions if condition.kind == "aid"]
     evaluation = score_recordings(
         recordings,

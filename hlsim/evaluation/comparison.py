@@ -14,7 +14,7 @@ from hlsim.evaluation.measures import column_title
 from hlsim.evaluation.statistics import PairedComparison, holm, paired_comparison
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 PlannedComparison = tuple[str, str, str]
 """A comparison that was planned before the scores were known: measure and both conditions.
@@ -162,10 +162,6 @@ def _compare_pair(
         return None
     first, second = pairs.to_numpy(float).T
     rows = table.drop_duplicates("item").set_index("item").loc[pairs.index]
-    units = np.array([])
-    if unit in rows:
-        column = rows[unit].astype(object)
-        units = column.where(column.notna(), "").to_numpy()
     level_change = math.nan
     if "level" in table:
         levels = table.pivot(index="item", columns="condition", values="level").loc[pairs.index]
@@ -178,28 +174,26 @@ def _compare_pair(
         overall=overall,
         level_change=level_change,
         unit=unit,
-        unit_means=_compare_units(units, first, second),
+        unit_means=_compare_units(rows.reindex(columns=[unit])[unit], first, second),
         left_out=len(scores) - len(pairs),
         p_t=overall.p_t,
         p_w=overall.p_w,
     )
 
 
-def _compare_units(
-    units: np.ndarray, first: np.ndarray, second: np.ndarray
-) -> PairedComparison | None:
+def _compare_units(units: Series, first: np.ndarray, second: np.ndarray) -> PairedComparison | None:
     """Compare the mean scores of each unit, second minus first, where a unit is a group of items.
 
     Args:
-        units: Name of the unit of each item, empty if it is unknown. Shape: (items,), or empty if
-            the table has no units.
+        units: Name of the unit of each item; an empty text, None or NaN if it is unknown. Shape:
+            (items,).
         first, second: Scores under both conditions. Shape: (items,).
 
     Returns:
         The comparison; None if an item has no unit, or if there are fewer than two units.
     """
-    names = list(dict.fromkeys(units))
-    if "" in names or len(names) < 2:
+    names = units.unique()
+    if (units.isna() | (units == "")).any() or len(names) < 2:
         return None
     means = [[scores[units == name].mean() for name in names] for scores in (first, second)]
     return paired_comparison(*means)

@@ -301,19 +301,18 @@ def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
     if is_file and str(audiograms).lower().endswith(".json"):
         listeners = read_listeners(audiograms).items()
         return [(name, side, ear) for name, both in listeners for side, ear in both.ears().items()]
-    ears = []
+    ears: dict[tuple[str, str], Audiogram] = {}
     for number, (row, audiogram) in enumerate(read_audiograms(audiograms), start=1):
+        listener = row.get("listener") or f"row {number}"
         side = EAR_NAMES.get(row.get("ear", "").lower(), "")
-        ears.append((row.get("listener") or f"row {number}", side, audiogram))
-    source = audiograms if is_file else "the table"
-    names = [(listener, side) for listener, side, _ in ears]
-    for listener, side in names:
-        if names.count((listener, side)) > 1:
+        if (listener, side) in ears:
             raise ValueError(
-                f"{source}: expected one row for each ear, got several of listener {listener!r}, "
-                f"ear {side!r}; name the listener and the ear of each row"
+                f"{audiograms if is_file else 'the table'}: expected one row for each ear, got "
+                f"several of listener {listener!r}, ear {side!r}; name the listener and the ear of "
+                "each row"
             )
-    return ears
+        ears[listener, side] = audiogram
+    return [(*names, audiogram) for names, audiogram in ears.items()]
 
 
 def _files_by_name(folder: str | Path) -> dict[str, Path]:
@@ -447,8 +446,8 @@ def _read_row(
             "expected either thresholds or a name in the column audiogram, got both; remove one"
         )
     if has_thresholds:
-        ears = {str(name or ""): ear_of_row for name, ear_of_row in ears_in_row(row).items()}
-        audiogram = ears.get("") or ears.get(ear)
+        ears: dict[Any, Audiogram] = {**ears_in_row(row)}
+        audiogram = ears.get(None) or ears.get(ear)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
     elif listener in listeners:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -263,12 +264,10 @@ def _pair_ears(recordings: Sequence[RecordedItem]) -> list[int]:
         ValueError: Recordings that belong together are not one left and one right ear, or their
             clean files differ in speech or are shifted by more than 2 ms.
     """
-    groups: dict[Any, list[RecordedItem]] = {}
-    for recording in recordings:
-        groups.setdefault(recording.utterance_key, []).append(recording)
+    counts = Counter(recording.utterance_key for recording in recordings)
     utterances: dict[tuple[Any, ...], list[RecordedItem]] = {}
     for recording in recordings:
-        is_pair = len(groups[recording.utterance_key]) <= len(EARS)
+        is_pair = counts[recording.utterance_key] <= len(EARS)
         key = recording.utterance_key, None if is_pair else recording.clean
         utterances.setdefault(key, []).append(recording)
     numbers: dict[int, int] = {}
@@ -376,8 +375,7 @@ def _describe_unrelated(table: DataFrame) -> list[str]:
 
 def _describe_lags(table: DataFrame) -> list[str]:
     """Return a list with a note about outputs late or early by more than ``LATE_MS``, or []."""
-    lags = table.get("lag_ms", [])
-    late = table[[abs(lag) > LATE_MS for lag in lags]] if len(lags) else table[:0]
+    late = table[table.reindex(columns=["lag_ms"])["lag_ms"].abs() > LATE_MS]
     if late.empty:
         return []
     counts = [

@@ -129,13 +129,13 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     ['0, unaided', '0, aid', '5, unaided', '5, aid']
     """
     if not fact:
-        return {name: table[table["condition"] == name] for name in table["condition"].unique()}
+        return dict(iter(table.groupby("condition", sort=False)))
     rows = {}
-    values = table[fact].dropna().unique()
     degrees = {name: place for place, name in enumerate(SEVERITIES)}
+    values = dict(iter(table.groupby(fact, sort=False)))
     for value in sorted(values, key=lambda value: degrees.get(value, value)):
         heading = value if isinstance(value, str) else f"{value:g}"
-        for name, part in split_rows(table[table[fact] == value]).items():
+        for name, part in split_rows(values[value]).items():
             rows[f"{heading}, {name}"] = part
     return rows
 
