@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -221,11 +222,8 @@ def _warn_of_unusable(noun: str, clips: Clips) -> None:
 
 def _warn_of_silence(items: Sequence[Item]) -> None:
     """Warn if silence at the end of items lowers the level of the whole item."""
-    silent = 0
-    for item in items:
-        sound = item.clean.nonzero()
-        end = int(sound[-1]) + 1 if len(sound) else 0
-        silent += end < (1.0 - MAX_SILENT_END) * len(item.clean)
+    ends = [item.clean[-int(MAX_SILENT_END * len(item.clean)) - 1 :] for item in items]
+    silent = sum(not end.any() for end in ends)
     if silent:
         warnings.warn(
             f"{silent} of {len(items)} items end in silence for more than a tenth of their length, "
@@ -318,7 +316,7 @@ def apply_treatments(
         with torch.no_grad():
             signal = functions[treatment](item.signal, item.ear)
         facts = {**item.facts, "treatment": treatment}
-        treated.append(Item(item.name, item.clean, signal, item.ear, facts=facts))
+        treated.append(replace(item, signal=signal, facts=facts))
     return treated
 
 

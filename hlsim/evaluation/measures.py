@@ -155,13 +155,8 @@ def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
     for name, package, extra in (("stoi", "pystoi", "eval"), ("pesq", "pesq", "pesq")):
         if name in names:
             require(package, extra)
-    measures = []
-    for name in dict.fromkeys(names):
-        measure = MEASURES[name] if name in MEASURES else load_measure(name)
-        if precision != 32 and name in REFERENCES:
-            measure = _ear_measure(name, precision)
-        measures.append(measure)
-    return measures
+    known = MEASURES | {name: _ear_measure(name, precision) for name in REFERENCES}
+    return [known.get(name) or load_measure(name) for name in dict.fromkeys(names)]
 
 
 class _PluginMeasure:

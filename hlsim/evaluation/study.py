@@ -350,13 +350,13 @@ def run_measures(
     pandas = require("pandas", "eval")
     store = store or ScoreStore()
     report_progress = progress or (lambda finished, total: None)
-    facts = {fact for source in items for fact in source.facts}
+    columns_of_items = [*_RESERVED_COLUMNS, *{fact for source in items for fact in source.facts}]
     if not items:
         raise ValueError("expected items, got none; add some")
     _check_different("condition", [condition.name for condition in conditions])
     _check_different("measure", [measure.name for measure in measures])
-    _check_different("table column", [*_RESERVED_COLUMNS, *facts])
-    owners = dict.fromkeys([*_RESERVED_COLUMNS, *facts], "")
+    _check_different("table column", columns_of_items)
+    owners = dict.fromkeys(columns_of_items, "")
     results: _Results = {}
     tasks = []
     for number, source in track(enumerate(items), "items whose scores are looked up", len(items)):
@@ -384,11 +384,10 @@ def run_measures(
         for task, measured in run_parallel(_measure_item, tasks, **running):
             if isinstance(measured, Crash):
                 running["in_processes"] = True  # The next crash would end this process.
-            if isinstance(measured, Crash) and len(task.missing) > 1:
-                # Only one of the scores is to blame: each is computed again in a task of its own.
-                tasks_of_crashes += [task._replace(missing=[score]) for score in task.missing]
-                continue
-            if isinstance(measured, Crash):
+                if len(task.missing) > 1:
+                    # Only one score is to blame: each is computed again in a task of its own.
+                    tasks_of_crashes += [task._replace(missing=[score]) for score in task.missing]
+                    continue
                 measured = [CRASH]
             for (condition, measure, key), values in zip(task.missing, measured, strict=True):
                 results[task.number, condition.name, measure.name] = values
