@@ -92,9 +92,20 @@ def evaluate_trained_aid(
         required=["haspi", "level", "loudness_error"],
         **running,
     )
-    outputs, perceived = _process(items, conditions, audiogram)
+    with torch.no_grad():
+        outputs = {c.name: [c.output(item) for item in items] for c in conditions}
+    perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
+    for name, signals in track(outputs.items(), "conditions", len(outputs)):
+        perceived[name] = [perceive(signal, audiogram, NEURO_RATE) for signal in signals]
+    shortest = min(len(item.clean) for item in items)
     details = {
-        "gain_curves": _measure_gains(items, {NAL_R: nal_r, TRAINED: aid}, audiogram, ear_name),
+        "gain_curves": measure_aids(
+            {NAL_R: nal_r, TRAINED: aid},
+            {ear_name: audiogram},
+            measure_gain_curve,
+            torch.stack([item.clean[:shortest] for item in items]),
+            INPUT_LEVELS,
+        ),
         "perceived_levels": {
             name: mean_band_levels(signals) for name, signals in perceived.items()
         },
@@ -125,38 +136,6 @@ def _read_items(audiogram: Audiogram) -> list[Item]:
     return items
 
 
-def _process(
-    items: Sequence[Item], conditions: Sequence[Condition], audiogram: Audiogram
-) -> tuple[_Signals, _Signals]:
-    """Return the outputs of all conditions, and what the ear perceives of these outputs.
-
-    Both are dicts from the name of a condition to one signal per item, (time,) in pascals. The
-    first entry of the perceived signals is what a normal ear perceives of clean speech.
-    """
-    perceived = {NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]}
-    outputs = {}
-    with torch.no_grad():
-        for condition in track(conditions, "conditions", len(conditions)):
-            signals = [condition.output(item) for item in items]
-            outputs[condition.name] = signals
-            perceived[condition.name] = [
-                perceive(signal, audiogram, NEURO_RATE) for signal in signals
-            ]
-    return outputs, perceived
-
-
-def _measure_gains(
-    items: Sequence[Item], aids: Mapping[str, nn.Module], audiogram: Audiogram, ear_name: str
-) -> list[dict[str, Any]]:
-    """Return the gain curves of the aids for the utterances, see ``measure_aids``.
-
-    All utterances are cut to the length of the shortest one.
-    """
-    shortest = min(len(item.clean) for item in items)
-    utterances = torch.stack([item.clean[:shortest] for item in items])
-    return measure_aids(aids, {ear_name: audiogram}, measure_gain_curve, utterances, INPUT_LEVELS)
-
-
 def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
     """Compare the aid with NAL-R at its level by HASPI, over the mean scores of each voice.
 
@@ -173,6 +152,12 @@ def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) 
 
     The first group has what a normal ear perceives of clean speech and what the impaired ear
     perceives under each condition; the second one has clean speech and the outputs of the aids.
+
+    Args:
+        items: Items of the study.
+        outputs: Outputs of each condition, one per item.
+        perceived: What the ear perceives of these outputs, and under ``NORMAL_EAR`` what a normal
+            ear perceives of clean speech.
     """
     item = items[-1]
     aided = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
