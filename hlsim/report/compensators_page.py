@@ -223,12 +223,10 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
     rival = evaluation.settings["rival"]
     pictures = []
     for ear in dict.fromkeys(row["ear"] for row in curves):
-        of_ear = [row for row in curves if row["ear"] == ear]
-        has_rival = any(row["aid"] == rival for row in of_ear)
-        baseline = rival if has_rival else NAL_R  # the rule chose NAL-R for this ear
+        of_ear = {row["aid"]: row for row in curves if row["ear"] == ear}
+        baseline = of_ear.get(rival, of_ear[NAL_R])  # the rule may choose NAL-R for this ear
         for aid in [COMPRESSION, *evaluation.aids]:
-            rows = [row for row in of_ear if row["aid"] in (baseline, aid)]
-            pictures.append(gain_picture(f"{aid}, ear {ear}", rows, colours))
+            pictures.append(gain_picture(f"{aid}, ear {ear}", [baseline, of_ear[aid]], colours))
     return pictures
 
 
@@ -291,10 +289,17 @@ def _wearing_table(evaluation: Evaluation) -> Table:
     rows = []
     for row in evaluation.details["wearing"]:
         ear, aid = row["ear"], row["aid"]
-        cells = {"Ear, aid": f"{ear}, {aid}", "Look-ahead (ms)": f"{row['look_ahead_ms']:.1f}"}
-        for level, gain in zip(QUIET_LEVELS, row["quiet_gain_db"], strict=True):
-            cells[f"Gain for noise at {level:g} dB SPL (dB)"] = f"{gain:+.1f}"
-        cells["Worst sidebands (dB)"] = f"{sidebands[ear, aid]:.0f}"
-        cells["Time for a second (ms)"] = f"{row['cpu_ms']:.1f}"
-        rows.append(cells)
+        gains = {
+            f"Gain for noise at {level:g} dB SPL (dB)": f"{gain:+.1f}"
+            for level, gain in zip(QUIET_LEVELS, row["quiet_gain_db"], strict=True)
+        }
+        rows.append(
+            {
+                "Ear, aid": f"{ear}, {aid}",
+                "Look-ahead (ms)": f"{row['look_ahead_ms']:.1f}",
+                **gains,
+                "Worst sidebands (dB)": f"{sidebands[ear, aid]:.0f}",
+                "Time for a second (ms)": f"{row['cpu_ms']:.1f}",
+            }
+        )
     return Table.from_rows("Look-ahead, gain for quiet noise, sidebands and cost", rows)

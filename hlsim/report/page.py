@@ -70,8 +70,7 @@ class Table:
         NAL-R   0.9
         """
         frame = require("pandas", "eval").DataFrame(self.rows, columns=self.header)
-        text: str = frame.set_index(self.header[0]).rename_axis(None).to_string()
-        return text
+        return frame.set_index(self.header[0]).rename_axis(None).to_string()
 
 
 @dataclass(frozen=True)
@@ -287,8 +286,7 @@ def _environment() -> Any:
 
 
 def _render(template: str, **values: Any) -> str:
-    text: str = _environment().get_template(template).render(**values)
-    return f"{text}\n"
+    return _environment().get_template(template).render(**values) + "\n"
 
 
 def _escape_markdown(text: str) -> str:

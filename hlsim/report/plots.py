@@ -267,22 +267,20 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
     measure = evaluation.scores[0]
     title = column_title(measure)
     scores = evaluation.wide(measure).dropna(axis=1, how="all")
-    if len(scores.columns) < 2:
+    count = len(scores.columns)
+    if count < 2:
         return []
     colours = condition_colours(evaluation.conditions)
-    means: list[tuple[str, float, tuple[float, float] | None]] = []
-    for name in scores:
-        values = scores[name].dropna().to_numpy()
-        means.append((name, float(values.mean()), bootstrap_interval(values)))
 
     def draw(axes: Any) -> None:
-        for place, (name, mean, interval) in enumerate(means):
+        for place, name in enumerate(scores):
+            values = scores[name].dropna().to_numpy()
+            interval = bootstrap_interval(values)
             if interval is not None:
                 axes.plot(interval, [place, place], color=colours[name], linewidth=2.0)
-            axes.plot([mean], [place], "o", color=colours[name])
-        labels = [fill(name, 22) for name, _, _ in means]
-        axes.set_yticks(range(len(means)), labels)
-        axes.set(xlabel=title, ylim=(len(means) - 0.5, -0.5))
+            axes.plot([values.mean()], [place], "o", color=colours[name])
+        axes.set_yticks(range(count), [fill(name, 22) for name in scores])
+        axes.set(xlabel=title, ylim=(count - 0.5, -0.5))
         axes.grid(axis="x", alpha=0.4)
 
     note = (
@@ -291,7 +289,7 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
         "although their difference is significant, because each item is scored under both."
     )
     heading = f"{title} of all conditions" + (f", {part[0].lower()}{part[1:]}" if part else "")
-    return [Picture(partial(_draw_svg, draw, 1.0 + 0.4 * len(means)), heading, note)]
+    return [Picture(partial(_draw_svg, draw, 1.0 + 0.4 * count), heading, note)]
 
 
 def scores_pictures(evaluation: Evaluation) -> list[Picture]:

@@ -154,11 +154,14 @@ def _conditions_table(evaluation: Evaluation) -> Table:
     combined = evaluation.wide("combined").dropna(axis=1, how="all")
     scored = combined.notna().all(axis=1)
     table = evaluation.table[evaluation.table["item"].map(scored)]
-    scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
-    columns: Columns = {title: (statistic(score), ".3f") for title, score in scores.items()}
-    columns["Level (dB SPL)"] = (mean_level("combined"), ".1f")
     shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
     caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
     look_ahead = evaluation.details["look_ahead_ms"]
-    columns["Look-ahead (ms)"] = (lambda rows: look_ahead[rows["condition"].iloc[0]], ".1f")
+    columns: Columns = {
+        "HASPI": (statistic("haspi"), ".3f"),
+        "HASQI": (statistic("hasqi"), ".3f"),
+        "Combined": (statistic("combined"), ".3f"),
+        "Level (dB SPL)": (mean_level("combined"), ".1f"),
+        "Look-ahead (ms)": (lambda rows: look_ahead[rows["condition"].iloc[0]], ".1f"),
+    }
     return summary_table(caption, table, columns)

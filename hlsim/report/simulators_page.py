@@ -101,7 +101,7 @@ def simulators_page(evaluation: Evaluation) -> Page:
 
 def _teacher(evaluation: Evaluation) -> str:
     """Return words for the teacher in a sentence: its name, or "the exact MSBG"."""
-    teacher: str = evaluation.settings["teacher"]
+    teacher = evaluation.settings["teacher"]
     return "the exact MSBG" if teacher == "msbg" else teacher
 
 

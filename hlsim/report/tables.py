@@ -104,11 +104,14 @@ def score_columns(evaluation: Evaluation) -> Columns:
     >>> list(score_columns(evaluation))
     ['n', 'HASPI (mean ± std)', 'Output level (dB SPL)']
     """
-    columns: Columns = {"n": (statistic(evaluation.scores[0], "count"), "d")}
+    first, means = evaluation.scores[0], {}
     for score in evaluation.scores:
-        columns[f"{column_title(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
-    columns["Output level (dB SPL)"] = (mean_level(evaluation.scores[0]), ".1f")
-    return columns
+        means[f"{column_title(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
+    return {
+        "n": (statistic(first, "count"), "d"),
+        **means,
+        "Output level (dB SPL)": (mean_level(first), ".1f"),
+    }
 
 
 def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
@@ -238,12 +241,15 @@ def comparison_table(
     rows = []
     for c in comparisons:
         planned = " (planned)" if c.planned else ""
-        row = {"Comparison": f"{c.title}: {c.before} to {c.after}{planned}"}
-        row["Level change (dB)"] = format_number(c.level_change, "+.1f")
-        row |= _paired_cells(c.overall, c.p_t, c.p_w)
         means_p = None if c.unit_means is None else c.unit_means.p_t
-        row[f"t-test of {c.unit} means"] = "n/a" if means_p is None else format_p(means_p)
-        rows.append(row)
+        rows.append(
+            {
+                "Comparison": f"{c.title}: {c.before} to {c.after}{planned}",
+                "Level change (dB)": format_number(c.level_change, "+.1f"),
+                **_paired_cells(c.overall, c.p_t, c.p_w),
+                f"t-test of {c.unit} means": "n/a" if means_p is None else format_p(means_p),
+            }
+        )
     return Table.from_rows(caption, rows)
 
 
