@@ -362,8 +362,7 @@ class Enhanced(nn.Module):
             ValueError: The enhancer fails, or returns a signal of another shape, NaN or infinity.
         """
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
-        aided: Tensor = self.aid(enhanced, ear)
-        return aided
+        return self.aid(enhanced, ear)
 
 
 def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:

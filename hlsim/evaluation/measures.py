@@ -306,8 +306,7 @@ def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
     torch.Size([1600])
     """
     with torch.no_grad(), loud_outputs():
-        perceived: Tensor = load_simulator(EXACT, sample_rate=sample_rate)(signal, ear)
-    return perceived
+        return load_simulator(EXACT, sample_rate=sample_rate)(signal, ear)
 
 
 def _measure_perception(item: Item, output: Tensor) -> Values:

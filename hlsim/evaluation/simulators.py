@@ -131,8 +131,7 @@ def evaluate_simulators(
 def _teacher_output(teacher: nn.Module, item: Item) -> Tensor:
     """Return the output of a teacher for an item, without a gradient. Shape: (time,)."""
     with torch.no_grad(), loud_outputs():
-        output: Tensor = teacher(item.signal, item.ear)
-    return output
+        return teacher(item.signal, item.ear)
 
 
 def _fidelity_to(teacher_name: str) -> Measure:

@@ -139,8 +139,7 @@ def perceive(signals: Tensor, thresholds: Tensor, simulator: nn.Module, internal
     >>> perceive(sound, ears, load_simulator("msbg"), triplets.internal).shape
     torch.Size([1, 48000])
     """
-    perceived: Tensor = simulator(signals, thresholds)
-    return perceived + internal
+    return simulator(signals, thresholds) + internal
 
 
 def _draw_noise(count: int, amplitudes: Tensor, generator: torch.Generator) -> Tensor:

@@ -107,7 +107,7 @@ class DigitListener(nn.Module, HubModel):
         levels = (powers + _POWER_FLOOR).log10().mT
         pictures = torch.stack([levels[..., slot] for slot in self.slots], 1)
         pictures = pictures - pictures.mean((-2, -1), keepdim=True)
-        scores: Tensor = self.network(pictures.flatten(0, 1).unsqueeze(1))
+        scores = self.network(pictures.flatten(0, 1).unsqueeze(1))
         return scores.reshape(-1, DIGITS_PER_TRIPLET, 10)
 
     def _band_weights(self) -> Tensor:
@@ -138,5 +138,4 @@ def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
     >>> load_listener().config.bands
     40
     """
-    listener: DigitListener = read_checkpoint(name, [DigitListener])
-    return listener
+    return read_checkpoint(name, [DigitListener])
