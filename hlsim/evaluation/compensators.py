@@ -267,7 +267,7 @@ def evaluate_compensators(
     table = evaluation.table
     relative_loss = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0)
     item_targets = loudness_at(loudness, torch.tensor(table["input_level"].to_numpy(float)))
-    nal_r_levels = table[table["condition"] == NAL_R].set_index("item")["level"]
+    nal_r_levels = evaluation.wide("level")[NAL_R]
     table = table.assign(
         gap=relative_loss - 1.0,
         loudness_error=table["loudness_error"] - item_targets.numpy(),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hlsim.audiogram import Audiogram, as_audiogram
+from hlsim.audiogram import as_audiogram
 from hlsim.audiogram.scale import EARS
 from hlsim.audiogram.value import EarLike
 from hlsim.evaluation.comparison import PlannedComparison, compare
@@ -112,8 +112,8 @@ def haspi_report(
         MissingExtraError: The package of a measure is not installed.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
-    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
-    >>> report = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
+    >>> folder = EXAMPLE_FILE.parent
+    >>> report = haspi_report(folder, after=folder, audiogram="N3", measures=["stoi"], jobs=1)
     >>> round(float(report.table["stoi"].mean()), 3)
     1.0
     """
@@ -132,7 +132,13 @@ def haspi_report(
             raise ValueError(
                 "root (--root) has no effect on folders; leave it out, or pass a manifest"
             )
-        ears = _read_ears_of_folders(ear, audiograms)
+        if (ear is None) == (audiograms is None):
+            raise ValueError(
+                "expected the ear of the files in folders (audiogram, --audiogram) or a table of "
+                f"ears (audiograms, --audiograms), got {'none' if ear is None else 'both'}; pass "
+                "one of the two"
+            )
+        ears = read_named_ears(audiograms) if ear is None else [("", "", ear)]
         recordings = read_folders(clean, outputs, ears, **settings)
     elif manifest is not None and clean is None and not outputs:
         recordings = read_recordings(manifest, root, ear, audiograms, **settings)
@@ -160,28 +166,6 @@ def haspi_report(
         listen=listen,
         **running,
     )
-
-
-def _read_ears_of_folders(
-    audiogram: Audiogram | None, audiograms: Any
-) -> list[tuple[str, str, Audiogram]]:
-    """Return the ears of files in folders, as tuples (listener, ear, audiogram).
-
-    Names of listener and ear may be empty.
-
-    Raises:
-        ValueError: There is neither an audiogram nor a table of audiograms, or both; or the table
-            cannot be read or has several rows for an ear.
-    """
-    if (audiogram is None) == (audiograms is None):
-        raise ValueError(
-            "expected the ear of the files in folders (audiogram, --audiogram) or a table of ears "
-            f"(audiograms, --audiograms), got {'none' if audiogram is None else 'both'}; pass one "
-            "of the two"
-        )
-    if audiogram is not None:
-        return [("", "", audiogram)]
-    return read_named_ears(audiograms)
 
 
 def score_recordings(
@@ -222,6 +206,7 @@ def score_recordings(
             ears.
         MissingExtraError: The package of a measure is not installed.
 
+    >>> from hlsim import Audiogram
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> outputs = {"unaided": EXAMPLE_FILE}
     >>> recording = RecordedItem("s01", EXAMPLE_FILE, outputs, Audiogram.standard("N3"))
@@ -240,14 +225,15 @@ def score_recordings(
     }
     columns = [*find_measures(measures, precision), LEVELS, ALIGNMENT]
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
-    table, scores, names = evaluation.table, evaluation.scores, evaluation.names
-    notes = [*_describe_unrelated(table), *_describe_lags(table)]
+    scores, names = evaluation.scores, evaluation.names
+    notes = [*_describe_unrelated(evaluation.table), *_describe_lags(evaluation.table)]
     if better_ear:
-        table = _better_ears(table, utterances, scores)
-        replace(evaluation, table=table).check_scores()
+        table = _better_ears(evaluation.table, utterances, scores)
+        evaluation = replace(evaluation, table=table)
+        evaluation.check_scores()
     planned = planned or [(scores[0], names[0], names[-1])]
-    comparisons = compare(table, scores, baseline=baseline, planned=planned)
-    evaluation = replace(evaluation, table=table, notes=notes, comparisons=comparisons)
+    comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
+    evaluation = replace(evaluation, notes=notes, comparisons=comparisons)
     return replace(evaluation, sounds=perceive_items(evaluation, listen, played))
 
 

@@ -333,8 +333,8 @@ def run_measures(
         running: Arguments ``jobs`` and ``dask`` of ``run_study``.
 
     Returns:
-        The table of ``run_study``, and copies of the measures. Where ``scores`` of a measure is
-        None, that of its copy lists all columns that the measure has returned.
+        The table of ``run_study``, and the measures. A copy replaces a measure whose ``scores`` is
+        None; that of the copy lists all columns that the measure has returned.
 
     Raises:
         ValueError, MissingExtraError: See ``run_study``.
@@ -398,9 +398,11 @@ def run_measures(
                     store.append(key, values)
             report_progress(len(results), total)
         tasks = tasks_of_crashes
-    columns = {m.name: [c for c, owner in owners.items() if owner == m.name] for m in measures}
     measures = [
-        replace(m, scores=columns[m.name] if m.scores is None else m.scores) for m in measures
+        replace(m, scores=[column for column, owner in owners.items() if owner == m.name])
+        if m.scores is None
+        else m
+        for m in measures
     ]
     table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
     table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
