@@ -9,7 +9,7 @@ import csv
 import io
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
@@ -36,56 +36,19 @@ At higher rates it is larger, so that the filter lasts as long.
 
 TAPS_RATE = 48000
 
-_SETTINGS = {
-    "camilladsp": ("level", "sample_rate"),
-    "equalizer-apo": ("level",),
-    "openmha": ("sample_rate",),
-    "csv": (),
+_SETTINGS: dict[str, dict[str, Any]] = {
+    "camilladsp": {"level": 65.0, "sample_rate": TAPS_RATE},
+    "equalizer-apo": {"level": 65.0},
+    "openmha": {"sample_rate": TAPS_RATE},
+    "csv": {},
 }
-"""Settings of ``export_gains`` that change each format."""
+"""Settings of ``export_gains`` that change each format, with their default values."""
 
 _HERTZ = np.arange(1, RATE // 2 + 1)
 """Frequencies in Hz of ``speech_density`` and of the gains for the design of filters, (8000,)."""
 
 _FIT_STEPS = 10
 """Number of steps of ``_equaliser_points``, after which gains are within .01 dB of the aid's."""
-
-
-class _Fitting(NamedTuple):
-    """An aid that is fitted to one ear, with the settings of the export.
-
-    Attributes:
-        aid: Aid with the method ``gains``.
-        ear: Audiogram of one ear.
-        level: Level of speech in dB SPL, for formats with the gains for one level.
-        sample_rate: Sample rate in Hz of the other program.
-    """
-
-    aid: Aid
-    ear: Any
-    level: float
-    sample_rate: int
-
-    def gains(self, level: float) -> Array:
-        """Measure the insertion gains for speech at a level in dB SPL.
-
-        Shape: -> (8,) in dB, at ``FREQUENCIES``.
-
-        Raises:
-            ValueError: There are several ears, or an ear or the level is not valid.
-        """
-        gains = self.aid.gains(self.ear, level).double().cpu().numpy()
-        if gains.ndim != 1:
-            raise ValueError(f"expected one ear to export, got {len(gains)}; export one at a time")
-        return gains
-
-    def gain_table(self) -> Array:
-        """Measure the insertion gains in dB for speech at all ``LEVELS``, (levels, 8).
-
-        Raises:
-            ValueError: There are several ears, or an ear is not valid.
-        """
-        return np.stack([self.gains(level) for level in LEVELS])
 
 
 def export_gains(
@@ -121,15 +84,23 @@ def export_gains(
             f"no format {program!r}{suggest(program, PROGRAMS)}; expected one of "
             f"{', '.join(PROGRAMS)}"
         )
+    settings = {**_SETTINGS[program]}
     for name, value in {"level": level, "sample_rate": sample_rate}.items():
-        if value is not None and name not in _SETTINGS[program]:
+        if value is None:
+            continue
+        if name not in settings:
             option = "--" + name.replace("_", "-")
             raise ValueError(
                 f"{name} ({option}) has no effect on the format {program}; leave it out"
             )
-    rate = TAPS_RATE if sample_rate is None else sample_rate
-    check_number("sample_rate", rate, RATE, 192000, whole=True)
-    return PROGRAMS[program](_Fitting(aid, ear, 65.0 if level is None else level, rate))
+        settings[name] = value
+    check_number("sample_rate", settings.get("sample_rate", RATE), RATE, 192000, whole=True)
+    levels = [settings["level"]] if "level" in settings else LEVELS
+    gains = np.stack([aid.gains(ear, level).double().cpu().numpy() for level in levels])
+    if gains.ndim != 2:
+        ears = gains.shape[1]
+        raise ValueError(f"expected one ear to export, got {ears}; export one at a time")
+    return PROGRAMS[program](gains, **settings)
 
 
 def _equaliser_points(gains: Array) -> Array:
@@ -160,40 +131,54 @@ def _interpolate(points: Array) -> Array:
     return np.interp(np.log(_HERTZ), np.log(FREQUENCIES), points)
 
 
-def _write_csv(fitting: _Fitting) -> str:
-    """Return a CSV table of gains in dB, with one row per frequency and one column per level."""
+def _write_csv(gains: Array) -> str:
+    """Return a CSV table of gains in dB, with one row per frequency and one column per level.
+
+    Args:
+        gains: Insertion gains in dB for speech at all ``LEVELS``, (levels, 8).
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frequency_hz", *(f"gain_db_at_{level:g}" for level in LEVELS)])
-    for hertz, gains in zip(FREQUENCIES, fitting.gain_table().T, strict=True):
-        writer.writerow([f"{hertz:g}", *(f"{gain:.2f}" for gain in gains)])
+    for hertz, gains_of_levels in zip(FREQUENCIES, gains.T, strict=True):
+        writer.writerow([f"{hertz:g}", *(f"{gain:.2f}" for gain in gains_of_levels)])
     return text.getvalue()
 
 
-def _write_equalizer_apo(fitting: _Fitting) -> str:
-    """Return the configuration of Equalizer APO: gains in dB at the eight frequencies."""
-    points = _equaliser_points(fitting.gains(fitting.level))
+def _write_equalizer_apo(gains: Array, level: float) -> str:
+    """Return the configuration of Equalizer APO: gains in dB at the eight frequencies.
+
+    Args:
+        gains: Insertion gains in dB for speech at the level, (1, 8).
+        level: Level of speech in dB SPL.
+    """
+    points = _equaliser_points(gains[0])
     pairs = [f"{hz:g} {gain:.2f}" for hz, gain in zip(FREQUENCIES, points, strict=True)]
-    return f"# Gains for speech at {fitting.level:g} dB SPL\nGraphicEQ: {'; '.join(pairs)}\n"
+    return f"# Gains for speech at {level:g} dB SPL\nGraphicEQ: {'; '.join(pairs)}\n"
 
 
-def _write_camilladsp(fitting: _Fitting) -> str:
+def _write_camilladsp(gains: Array, level: float, sample_rate: int) -> str:
     """Return the configuration of CamillaDSP 3: a filter with the gains, from stdin to stdout.
 
     The filter has minimum phase, for the shortest delay.
+
+    Args:
+        gains: Insertion gains in dB for speech at the level, (1, 8).
+        level: Level of speech in dB SPL.
+        sample_rate: Sample rate in Hz of CamillaDSP.
     """
-    points = _equaliser_points(fitting.gains(fitting.level))
-    hertz = np.array([0, *_HERTZ, *[fitting.sample_rate / 2][: fitting.sample_rate > RATE]])
+    points = _equaliser_points(gains[0])
+    hertz = np.array([0, *_HERTZ, *[sample_rate / 2][: sample_rate > RATE]])
     response = 10.0 ** (np.interp(hertz, _HERTZ, _interpolate(points)) / 20.0)
     # A filter resolves low frequencies by its duration, which must not fall with a higher rate.
-    taps = (TAPS + 1) * math.ceil(fitting.sample_rate / TAPS_RATE) - 1
-    linear_phase = scipy.signal.firwin2(taps, hertz, response, fs=fitting.sample_rate)
+    taps = (TAPS + 1) * math.ceil(sample_rate / TAPS_RATE) - 1
+    linear_phase = scipy.signal.firwin2(taps, hertz, response, fs=sample_rate)
     filter_ = scipy.signal.minimum_phase(linear_phase, half=False)
     values = ", ".join(f"{value:.8g}" for value in filter_)
     return f"""\
-# Gains for speech at {fitting.level:g} dB SPL. Replace capture and playback by your devices.
+# Gains for speech at {level:g} dB SPL. Replace capture and playback by your devices.
 devices:
-  samplerate: {fitting.sample_rate}
+  samplerate: {sample_rate}
   chunksize: 256
   capture: {{type: Stdin, channels: 1, format: FLOAT32LE}}
   playback: {{type: Stdout, channels: 1, format: FLOAT32LE}}
@@ -206,23 +191,27 @@ pipeline:
 """
 
 
-def _write_openmha(fitting: _Fitting) -> str:
+def _write_openmha(gains: Array, sample_rate: int) -> str:
     """Return the part of openMHA's configuration for its filter bank and its compressor ``dc``.
 
     The compressor looks up the gain of a band by the level in this band. The aid's gains are
     measured by the overall level of speech, so each is entered at the level that the band has in
     average speech of this overall level.
+
+    Args:
+        gains: Insertion gains in dB for speech at all ``LEVELS``, (levels, 8).
+        sample_rate: Sample rate in Hz of openMHA.
     """
     edges = np.sqrt(np.multiply(FREQUENCIES[1:], FREQUENCIES[:-1]))
     powers = np.bincount(np.searchsorted(edges, _HERTZ), speech_density(RATE))
     bands_below_speech = 10.0 * np.log10(powers / powers.sum())
-    gains = [
+    band_gains = [
         np.interp(BAND_LEVELS, np.array(LEVELS) + below, column)
-        for below, column in zip(bands_below_speech, fitting.gain_table().T, strict=True)
+        for below, column in zip(bands_below_speech, gains.T, strict=True)
     ]
-    rows = ";".join(f"[{' '.join(f'{gain:.2f}' for gain in row)}]" for row in gains)
+    rows = ";".join(f"[{' '.join(f'{gain:.2f}' for gain in row)}]" for row in band_gains)
     return f"""\
-# Plugin mhachain inside overlapadd, one channel at {fitting.sample_rate} Hz
+# Plugin mhachain inside overlapadd, one channel at {sample_rate} Hz
 algos = [fftfilterbank dc combinechannels]
 fftfilterbank.unit = Hz
 fftfilterbank.f = [{" ".join(f"{hertz:g}" for hertz in FREQUENCIES)}]
@@ -239,10 +228,10 @@ combinechannels.outchannels = 1
 """
 
 
-PROGRAMS: dict[str, Callable[[_Fitting], str]] = {
+PROGRAMS: dict[str, Callable[..., str]] = {
     "camilladsp": _write_camilladsp,
     "equalizer-apo": _write_equalizer_apo,
     "openmha": _write_openmha,
     "csv": _write_csv,
 }
-"""Functions from a fitting to the text of a program's file, by the name of the format."""
+"""Functions from gains and the ``_SETTINGS`` to the text of a program's file, by the format."""
