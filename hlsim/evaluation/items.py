@@ -306,8 +306,9 @@ def apply_treatments(
         "compressed": lambda signal, ear: compress(signal[None], three_to_one, NEURO_RATE)[0],
     }
     if compensator is not None:
-        settings = {"sample_rate": NEURO_RATE, "full_scale_spl": PASCAL_SPL}
-        check_attributes(compensator, "a compensator", **settings)
+        check_attributes(
+            compensator, "a compensator", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL
+        )
         functions["compensated"] = compensator
     check_names(treatments, functions, "inputs (compensated needs a compensator)")
     treated = []

@@ -404,7 +404,7 @@ def run_measures(
         else m
         for m in measures
     ]
-    table: DataFrame = pandas.DataFrame(_make_rows(items, conditions, measures, results))
+    table = pandas.DataFrame(_make_rows(items, conditions, measures, results))
     table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
     return table, measures
 

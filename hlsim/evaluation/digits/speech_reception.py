@@ -294,8 +294,7 @@ def reception_threshold(
     aids: list[AidFunction | None] = [None]
     if aid is not None:
         function = load_compensator(aid) if isinstance(aid, str | Path) else aid
-        settings = {"sample_rate": NEURO_RATE, "full_scale_spl": PASCAL_SPL}
-        check_attributes(function, "an aid", **settings)
+        check_attributes(function, "an aid", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
         if getattr(function, "takes_microphones", False):
             raise ValueError(
                 "expected an aid with one microphone, because the test has one signal per ear; "

@@ -58,19 +58,15 @@ class ScoreStore:
         line = json.dumps(score, ensure_ascii=False, allow_nan=False)
         if self.path is not None:
             try:
-                self._write(self.path, line)
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                with open(self.path, "a+b") as file:
+                    # An interruption may have cut the last line short, which then has no end.
+                    file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
+                    line_break = "" if file.read(1) in (b"", b"\n") else "\n"
+                    file.write(f"{line_break}{line}\n".encode())
             except OSError as error:
                 raise ValueError(
                     f"{self.path}: a score cannot be written: {error.strerror or error}; correct "
                     "this, and run again to continue with the scores that are stored"
                 ) from error
         self.scores[key] = values
-
-    def _write(self, path: Path, line: str) -> None:
-        """Append a line to the file."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "a+b") as file:
-            # An interruption may have cut the last line short, which then has no end.
-            file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
-            line_break = "" if file.read(1) in (b"", b"\n") else "\n"
-            file.write(f"{line_break}{line}\n".encode())
