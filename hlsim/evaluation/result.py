@@ -26,7 +26,7 @@ class ItemSounds:
     """Sounds of one item, in pascals.
 
     Attributes:
-        title: Name of the item, for the heading of its player, with further facts.
+        name: Name of the item, with facts for the heading of its player.
         ear: Audiogram of the ear.
         sample_rate: Sample rate in Hz.
         groups: Signals as a dict from the heading of a group, which may be empty, to a dict from
@@ -39,7 +39,7 @@ class ItemSounds:
     {}
     """
 
-    title: str
+    name: str
     ear: Audiogram
     sample_rate: int
     groups: Mapping[str, Mapping[str, Tensor]]

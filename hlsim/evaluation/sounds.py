@@ -30,7 +30,7 @@ def perceive_items(
 
     Items are ranked by how much their score changes between the two conditions of
     ``evaluation.headline``, the largest rise first. The returned items are evenly spaced in this
-    ranking, and their titles state the change and the rank. The sounds of an item, of at most 8 s,
+    ranking, and their names state the change and the rank. The sounds of an item, of at most 8 s,
     are what a normal ear perceives of the clean speech, and what the impaired ear perceives of the
     output of each condition. A sound that cannot be computed is missing; ``failures`` has the
     reason.
@@ -52,7 +52,7 @@ def perceive_items(
     >>> table = pandas.DataFrame(rows, columns=["item", "name", "condition", "haspi"])
     >>> evaluation = Evaluation([item], conditions, [], table, compare(table, ["haspi"]))
     >>> (sounds,) = perceive_items(evaluation, count=1)
-    >>> sounds.title, list(sounds.groups[""])
+    >>> sounds.name, list(sounds.groups[""])
     ('s01 (HASPI: change +0.200, rank 1 of 1)', ['normal ear (the goal)', 'a', 'b'])
     """
     headline = evaluation.headline
@@ -71,8 +71,8 @@ def perceive_items(
         item = evaluation.items[int(row.get("source", row.name))].load()
         signals, failures = _perceive(item, chosen)
         rank = f"change {changes.iloc[place]:+.3f}, rank {place + 1} of {len(changes)}"
-        title = f"{row['name']} ({headline.title}: {rank})"
-        sounds.append(ItemSounds(title, item.ear, item.sample_rate, {"": signals}, failures))
+        name = f"{row['name']} ({headline.title}: {rank})"
+        sounds.append(ItemSounds(name, item.ear, item.sample_rate, {"": signals}, failures))
     return sounds
 
 

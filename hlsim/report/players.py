@@ -67,8 +67,8 @@ def _item_section(sounds: ItemSounds) -> Section:
     ]
     texts += [f"{name} cannot be played: {reason}." for name, reason in sounds.failures.items()]
     if not any(signal.any() for group in sounds.groups.values() for signal in group.values()):
-        return Section(sounds.title, [*texts, "There is no sound to play."])
-    return Section(sounds.title, texts, player=make_player(sounds.groups, sounds.sample_rate))
+        return Section(sounds.name, [*texts, "There is no sound to play."])
+    return Section(sounds.name, texts, player=make_player(sounds.groups, sounds.sample_rate))
 
 
 def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) -> Player:
