@@ -156,8 +156,8 @@ def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) 
     Args:
         items: Items of the study.
         outputs: Outputs of each condition, one per item.
-        perceived: What the ear perceives of these outputs, and under ``NORMAL_EAR`` what a normal
-            ear perceives of clean speech.
+        perceived: Signals that the ear perceives of these outputs, and under ``NORMAL_EAR`` those
+            that a normal ear perceives of clean speech.
     """
     item = items[-1]
     aided = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
