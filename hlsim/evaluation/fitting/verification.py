@@ -171,11 +171,12 @@ def verify(
     unaided_sii, aided_sii = (
         sii(_level(power.mean(0)) - _bandwidth_db(), thresholds=losses) for power in powers
     )
+    target_aid: Any = load_compensator(prescription)
     return Verification(
         hertz=hertz,
         input_levels=input_levels,
         output_levels=output_levels,
-        targets=prescribed_gains(load_compensator(prescription), audiogram, input_levels),
+        targets=prescribed_gains(target_aid, audiogram, input_levels),
         thresholds=losses + normal,
         uncomfortable=uncomfortable + normal,
         unaided_sii=unaided_sii,
