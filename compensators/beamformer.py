@@ -163,27 +163,20 @@ class AdaptiveBeamformer(FilterAndSum):
 
         Shape: (..., hops, signals, ears, FRAME) -> (..., hops, blocked signals, ears, bands).
         """
-        batch, hops = frames.shape[:-4], frames.shape[-4]
         bands, past = self.config.bands, weight_of_past(self.config.seconds)
-        if hops == 0:
+        if frames.shape[-4] == 0:
             empty = state["weights"][..., :0, :, :, :]
             return empty, {name: state[name] for name in ("levels", "covariance")}
         spectra = torch.fft.rfft(frames * _window(like=frames))
         products = spectra.unsqueeze(-4) * spectra.unsqueeze(-3).conj()
         covariances = filter_powers(products.real, bands)
         levels = level_db(filter_powers(spectra.abs().square(), bands)).flatten(-3)
-
-        def average(values: Tensor, name: str) -> Tensor:
-            rows = values.reshape(-1, hops, state[name].shape[-1])
-            averages = exponential_average(rows, state[name].reshape(len(rows), -1), past)
-            return averages.reshape(*batch, hops, -1)
-
-        averages = average(levels, "levels")
+        averages = exponential_average(levels, state["levels"], past)
         features = torch.cat(((averages - 40.0) / 20.0, (levels - averages) / 10.0), -1)
         decisions = self.decide(features.to(next(self.decide.parameters()))).to(frames)
         share, loading = decisions.unflatten(-1, (2, EARS, bands)).tanh().unbind(-3)
         weighted = covariances * (3.0 * share).exp()[..., None, None, :, :]
-        covariance = average(weighted.flatten(-4), "covariance")
+        covariance = exponential_average(weighted.flatten(-4), state["covariance"], past)
         memory = {"levels": averages[..., -1, :], "covariance": covariance[..., -1, :]}
         matrix = covariance.unflatten(-1, (SIGNALS, SIGNALS, EARS, bands))
         matrix = matrix.movedim((-2, -1), (-4, -3))  # (..., hops, ears, bands, signals, signals)

@@ -331,21 +331,19 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
         self.past_weight = math.exp(-1.0 / (self.sample_rate * seconds))
 
     def initial_state(self, waveform: Tensor) -> State:
-        powers = waveform.new_zeros(*waveform.shape[:-3], 2, waveform.shape[-2])
+        powers = waveform.new_zeros(*waveform.shape[:-3], 2 * waveform.shape[-2])
         return {**super().initial_state(waveform), "powers": powers}
 
     def process(self, waveform: Tensor, state: State) -> tuple[Tensor, State]:
         samples = torch.cat((state["past"], waveform), -1)
         to_front = self.filter(samples, self.taps)
         to_rear = self.filter(samples, self.taps.flip(1))
-        products = torch.stack((to_front * to_rear, to_rear.square()), -3)
-        flat = products.flatten(0, -2).T.unsqueeze(0)
-        averages = exponential_average(flat, state["powers"].reshape(1, -1), self.past_weight)
-        common, rear = averages[0].T.reshape(products.shape).unbind(-3)
+        products = torch.cat((to_front * to_rear, to_rear.square()), -2).mT
+        averages = exponential_average(products, state["powers"], self.past_weight)
+        common, rear = averages.mT.chunk(2, -2)
         share = (common / (rear + POWER_FLOOR)).clamp(0.0, 1.0)
-        powers = torch.stack((common, rear), -3)[..., -1]
         past = samples[..., waveform.shape[-1] :]
-        return to_front - share * to_rear, {"past": past, "powers": powers}
+        return to_front - share * to_rear, {"past": past, "powers": averages[..., -1, :]}
 
 
 class BinauralMVDR(FilterAndSum):

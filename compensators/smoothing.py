@@ -85,7 +85,7 @@ def exponential_average(values: Tensor, before: Tensor, past: float) -> Tensor:
         before: Average y before the first one.
         past: Weight of the past, 0 to below 1.
 
-    Shape: (items, frames, n), (items, n) -> (items, frames, n).
+    Shape: (..., frames, n), (..., n) -> (..., frames, n).
 
     >>> exponential_average(torch.ones(1, 3, 1), torch.zeros(1, 1), 0.5).flatten()
     tensor([0.5000, 0.7500, 0.8750])
@@ -93,13 +93,13 @@ def exponential_average(values: Tensor, before: Tensor, past: float) -> Tensor:
     if past == 0.0:
         return values
     averages = []
-    for block in values.split(BLOCK_FRAMES, 1):
-        frames = block.shape[1]
+    for block in values.split(BLOCK_FRAMES, -2):
+        frames = block.shape[-2]
         new = _weights(frames, past, like=values) @ block
-        old = _powers(frames, past, like=values) * before.unsqueeze(1)
+        old = _powers(frames, past, like=values) * before.unsqueeze(-2)
         averages.append(new + old)
-        before = averages[-1][:, -1]
-    return torch.cat(averages, 1)
+        before = averages[-1][..., -1, :]
+    return torch.cat(averages, -2)
 
 
 def _running_maximum(values: Tensor) -> Tensor:
