@@ -15,9 +15,8 @@ from compensators.directional import (
     DirectionalAid,
     FilterAndSum,
     MicrophoneStream,
-    front_blocking_taps,
+    beam_and_blocking_taps,
     look_ahead_samples,
-    mvdr_taps,
 )
 from compensators.filter_bank import FRAME, HISTORY, HOP, filter_powers, level_db
 from compensators.hearing_aid import HearingAid
@@ -90,10 +89,7 @@ class AdaptiveBeamformer(FilterAndSum):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         config = BeamformerConfig.resolve(config)
-        beams = mvdr_taps(config.loading, config.spacing, NEURO_RATE, LOOK_AHEAD_SAMPLES)
-        blocking = front_blocking_taps(beams, config.spacing, LOOK_AHEAD_SAMPLES)
-        beams = np.pad(beams, [(0, 0)] * 3 + [(0, blocking.shape[-1] - beams.shape[-1])])
-        taps = np.concatenate((beams[None], blocking))
+        taps = beam_and_blocking_taps(config.loading, config.spacing, LOOK_AHEAD_SAMPLES)
         super().__init__(taps.reshape(-1, *taps.shape[2:]), 2 * LOOK_AHEAD_SAMPLES, sample_rate)
         self.config = config
         self.full_scale_spl = check_full_scale(full_scale_spl)

@@ -22,7 +22,14 @@ from compensators.smoothing import exponential_average
 from compensators.wearable import State, Stream
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import NEURO_RATE
-from hlsim.checks import check_attributes, check_finite, check_number, check_rate, check_waveform
+from hlsim.checks import (
+    check_attributes,
+    check_finite,
+    check_names,
+    check_number,
+    check_rate,
+    check_waveform,
+)
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
 from hlsim.torchtools import Audio, as_samples, as_type_of, compute_once
@@ -285,15 +292,15 @@ class DifferentialMicrophone(FilterAndSum):
         lowest: float = 200.0,
         sample_rate: int = NEURO_RATE,
     ) -> None:
-        if pattern not in PATTERNS:
-            known = ", ".join(PATTERNS)
-            raise ValueError(f"expected a pattern out of {known}, got {pattern!r}")
+        check_names([pattern], PATTERNS, "patterns")
         check_number("spacing", spacing, 0.002, 0.1)
         check_number("lowest", lowest, 20.0, 2000.0)
         rate = check_rate(sample_rate)
-        one_side = differential_taps(PATTERNS[pattern], spacing, lowest, rate)
+        responses = differential_responses(PATTERNS[pattern], spacing, lowest, rate)
+        look_ahead = look_ahead_samples(rate)
+        one_side = _impulse_responses(responses, look_ahead, filter_length(rate))
         taps = np.einsum("ef,ml->emfl", np.eye(2), one_side)
-        super().__init__(taps, look_ahead_samples(rate), rate)
+        super().__init__(taps, look_ahead, rate)
 
 
 class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
@@ -374,7 +381,8 @@ class BinauralMVDR(FilterAndSum):
         check_number("loading", loading, 1e-6, 1.0)
         check_number("spacing", spacing, 0.002, 0.1)
         rate = check_rate(sample_rate)
-        super().__init__(mvdr_taps(loading, spacing, rate), look_ahead_samples(rate), rate)
+        look_ahead = look_ahead_samples(rate)
+        super().__init__(mvdr_taps(loading, spacing, rate, look_ahead), look_ahead, rate)
 
 
 class DirectionalAid(nn.Module):
@@ -498,10 +506,10 @@ def design_frequencies(sample_rate: int) -> NDArray[np.float64]:
     return np.linspace(0.0, sample_rate / 2.0, points // 2 + 1)
 
 
-def differential_taps(
+def differential_responses(
     delay: float, spacing: float, lowest: float, sample_rate: int
-) -> NDArray[np.float64]:
-    """Design the filters of the front and rear microphone of a differential microphone.
+) -> NDArray[np.complex128]:
+    """Compute the frequency responses of a differential microphone's filters.
 
     Args:
         delay: Delay of the rear microphone, relative to the time in which sound passes the spacing.
@@ -510,26 +518,8 @@ def differential_taps(
         sample_rate: Sample rate in Hz.
 
     Returns:
-        Impulse responses, (2, length).
-
-    >>> differential_taps(delay=1.0, spacing=0.01, lowest=200.0, sample_rate=16000).shape
-    (2, 144)
-    """
-    return _impulse_responses(
-        differential_responses(delay, spacing, lowest, sample_rate), sample_rate
-    )
-
-
-def differential_responses(
-    delay: float, spacing: float, lowest: float, sample_rate: int
-) -> NDArray[np.complex128]:
-    """Compute the frequency responses of ``differential_taps`` at ``design_frequencies``.
-
-    Args:
-        delay, spacing, lowest, sample_rate: See ``differential_taps``.
-
-    Returns:
-        Responses of the front and of the rear microphone, (2, frequencies).
+        Responses of the front and of the rear microphone at ``design_frequencies``, (2,
+        frequencies).
 
     >>> differential_responses(delay=1.0, spacing=0.01, lowest=200.0, sample_rate=16000).shape
     (2, 289)
@@ -545,22 +535,20 @@ def differential_responses(
 
 
 @compute_once
-def mvdr_taps(
-    loading: float, spacing: float, sample_rate: int, before: int | None = None
-) -> NDArray[np.float64]:
+def mvdr_taps(loading: float, spacing: float, sample_rate: int, before: int) -> NDArray[np.float64]:
     """Design the filters of ``BinauralMVDR`` by least squares over their coefficients (Frost 1972).
 
     Args:
         loading: Power of each microphone's own noise, relative to the diffuse noise.
         spacing: Distance between the microphones of a side in m.
         sample_rate: Sample rate in Hz.
-        before: Number of samples before time 0, by default ``look_ahead_samples(sample_rate)``.
+        before: Number of samples before time 0.
 
     Returns:
         Impulse responses from each microphone to each ear of the output, (ears of the output,
         microphones, ears of the microphones, length): front microphone first, left ear first.
 
-    >>> mvdr_taps(loading=1e-4, spacing=0.01, sample_rate=16000).shape
+    >>> mvdr_taps(loading=1e-4, spacing=0.01, sample_rate=16000, before=16).shape
     (2, 2, 2, 144)
     """
     frequencies = design_frequencies(sample_rate)
@@ -570,7 +558,6 @@ def mvdr_taps(
     covariance = np.einsum("dif,djf->ijf", noise, noise.conj()) / _NOISE_DIRECTIONS
     covariance += loading * np.eye(4)[..., None]
     covariance += _DISTORTION_WEIGHT * front[:, None] * front.conj()
-    before = look_ahead_samples(sample_rate) if before is None else before
     length = filter_length(sample_rate)
     lags = np.arange(length) - np.arange(length)[:, None]
     matrix = np.fft.irfft(covariance)[..., lags]
@@ -582,26 +569,26 @@ def mvdr_taps(
     return np.asarray(taps, dtype=np.float64).reshape(2, 2, 2, length)
 
 
-def front_blocking_taps(
-    beams: NDArray[np.float64], spacing: float, before: int
-) -> NDArray[np.float64]:
-    """Design filters at 16 kHz from whose outputs sound from the front is removed.
+def beam_and_blocking_taps(loading: float, spacing: float, before: int) -> NDArray[np.float64]:
+    """Design filters at 16 kHz of beams to the front, and of signals without sound from the front.
 
-    They are, at each side, a cardioid to the rear, and the difference of the beam and a cardioid to
-    the front. In front of a sphere, about -40 dB remain of both, and up to -28 dB near 8 kHz.
+    The beams are those of ``mvdr_taps``. The two other signals are, at each side, a cardioid to the
+    rear, and the difference of the beam and a cardioid to the front. Of sound in front of a sphere,
+    about -40 dB remain in both, and up to -28 dB near 8 kHz.
 
     Args:
-        beams: Impulse responses of beams to the front, from ``mvdr_taps``.
+        loading: Power of each microphone's own noise, see ``mvdr_taps``.
         spacing: Distance between the microphones of a side in m.
-        before: Number of samples of the beams before time 0.
+        before: Number of samples of the beams, and again of the other filters, before time 0.
 
     Returns:
-        Impulse responses, (2, ears of the output, microphones, ears, length), twice as long as the
-        beams.
+        Impulse responses, (3, ears of the output, microphones, ears, length), the beams first. They
+        are twice as long as those of ``mvdr_taps``.
 
-    >>> front_blocking_taps(np.zeros((2, 2, 2, 144)), 0.01, 8).shape
-    (2, 2, 2, 2, 288)
+    >>> beam_and_blocking_taps(loading=1e-4, spacing=0.01, before=8).shape
+    (3, 2, 2, 2, 288)
     """
+    beams = mvdr_taps(loading, spacing, NEURO_RATE, before)
     length = 2 * beams.shape[-1]
     frequencies = design_frequencies(NEURO_RATE)
     points = 2 * (len(frequencies) - 1)
@@ -610,20 +597,17 @@ def front_blocking_taps(
     cardioid = differential_responses(1.0, spacing, _LOWEST_BLOCKED, NEURO_RATE)
     to_rear = np.stack((-cardioid[0] * path, cardioid[0]))
     passed = cardioid[0] + cardioid[1] * path
-    to_front = _impulse_responses(cardioid, NEURO_RATE, before, length)
-    taps = np.zeros((2, 2, 2, 2, length))
-    taps[1] = _impulse_responses(np.fft.rfft(beams, points) * passed, NEURO_RATE, 0, length)
+    taps = np.zeros((3, 2, 2, 2, length))
+    taps[0, ..., : beams.shape[-1]] = beams
+    taps[2] = _impulse_responses(np.fft.rfft(beams, points) * passed, 0, length)
     for ear in range(2):
-        taps[0, ear, :, ear] = _impulse_responses(to_rear, NEURO_RATE, before, length)
-        taps[1, ear, :, ear] -= to_front
+        taps[1, ear, :, ear] = _impulse_responses(to_rear, before, length)
+        taps[2, ear, :, ear] -= _impulse_responses(cardioid, before, length)
     return taps
 
 
 def _impulse_responses(
-    responses: NDArray[np.complex128],
-    sample_rate: int,
-    before: int | None = None,
-    length: int | None = None,
+    responses: NDArray[np.complex128], before: int, length: int
 ) -> NDArray[np.float64]:
     """Convert frequency responses to impulse responses that begin before time 0.
 
@@ -631,9 +615,8 @@ def _impulse_responses(
 
     Args:
         responses: Responses at ``design_frequencies``.
-        sample_rate: Sample rate in Hz.
-        before: Number of samples before time 0, by default ``look_ahead_samples(sample_rate)``.
-        length: Number of samples of the result, by default ``filter_length(sample_rate)``.
+        before: Number of samples before time 0.
+        length: Number of samples of the result.
 
     Shape: (..., frequencies) -> (..., length).
     """
@@ -642,5 +625,4 @@ def _impulse_responses(
     fade = np.ones(bins)
     fade[-fade_bins:] = np.cos(np.linspace(0.0, 0.5 * np.pi, fade_bins)) ** 2
     impulses = np.fft.irfft(responses * fade)
-    before = look_ahead_samples(sample_rate) if before is None else before
-    return np.roll(impulses, before, -1)[..., : length or filter_length(sample_rate)]
+    return np.roll(impulses, before, -1)[..., :length]

@@ -279,7 +279,7 @@ def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
         DirectionalAid(front_end, "nalr")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"write BinauralMVDR\(\)"):
         DirectionalAid(BinauralMVDR, NALR())  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a pattern out of dipole"):
+    with pytest.raises(ValueError, match="unknown patterns: omni; expected some of dipole"):
         DifferentialMicrophone("omni")
     with pytest.raises(ValueError, match="spacing"):
         AdaptiveDifferentialMicrophone(spacing=1.0)
