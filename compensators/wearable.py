@@ -271,23 +271,36 @@ class Wearable(Aid):
         return output[::ears_per_gain]
 
     def process_portions(
-        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
+        self,
+        samples: Tensor,
+        fitted: Tensor,
+        sliders: Tensor,
+        state: State,
+        state_time: int | None,
     ) -> tuple[Tensor, Tensor, State]:
         """Compute the same as ``process_hops``, a portion of the hops at a time, to save memory.
 
+        Args:
+            samples, fitted, sliders, state: See ``process_hops``.
+            state_time: Time at which the state is returned, in samples and whole hops; by default
+                at the end.
+
         Returns:
-            The output and the state of ``process_hops``, and between them the linear gains minus 1
-            of the highest band: that before the first hop, then that at the end of each hop,
-            (items, hops + 1).
+            The output of ``process_hops``; the linear gains minus 1 of the highest band, that
+            before the first hop, then that at the end of each hop, (items, hops + 1); and the state
+            at ``state_time``.
         """
         outputs = []
         gains = [state["gains"][:, -1:, -1]]
+        states = []
         portion = max(1, BLOCK_SAMPLES // (len(samples) * HOP)) * HOP
-        for block in samples.split(portion, -1):
-            output, block_gains, state = self.process_hops(block, fitted, sliders, state)
-            outputs.append(output)
-            gains.append(block_gains)
-        return torch.cat(outputs, -1), torch.cat(gains, -1), state
+        for part in samples.tensor_split([] if state_time is None else [state_time], -1):
+            for block in part.split(portion, -1):
+                output, block_gains, state = self.process_hops(block, fitted, sliders, state)
+                outputs.append(output)
+                gains.append(block_gains)
+            states.append(state)
+        return torch.cat(outputs, -1), torch.cat(gains, -1), states[0]
 
     @not_compiled  # tracing unrolls the loops over hops, which takes many minutes
     def process_block(
@@ -338,13 +351,10 @@ class Wearable(Aid):
             low_time = low.shape[-1]
             signals = signals[:, lead:][:, : math.ceil(low_time * rate / RATE)]
 
-            parts = [samples] if state_time is None else samples.tensor_split([state_time], -1)
             start = state or self.initial_state(settings)
-            delayed, gains, state = self.process_portions(parts[0], fitted, settings, start)
-            for part in parts[1:]:
-                rest, rest_gains, _ = self.process_portions(part, fitted, settings, state)
-                delayed = torch.cat((delayed, rest), -1)
-                gains = torch.cat((gains, rest_gains[:, 1:]), -1)
+            delayed, gains, state = self.process_portions(
+                samples, fitted, settings, start, state_time
+            )
             output = resample(delayed[:, DELAY : DELAY + low_time], RATE, rate)
             if rate != RATE:
                 time = signals.shape[-1]
