@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from hlsim.checks import check_number
-from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
+from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase, number
 
 
 @dataclass(frozen=True)
@@ -36,19 +36,15 @@ class MappingConfig(NetworkConfig):
 
     start: Literal["nalr"] = "nalr"
     phase: Phase = "input"
-    bands: int = 20
-    reach_db: float = 40.0
-    limit_spl: float = 110.0
-    microphones: int = 1
+    bands: int = number(20, 4, 40)
+    reach_db: float = number(40.0, 0.1, 60.0)
+    limit_spl: float = number(110.0, 60.0, 140.0)
+    microphones: int = number(1, 1, 16)
     ears: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_number("microphones", self.microphones, 1, 16, whole=True)
         check_number("ears", self.ears, 1, min(2, self.microphones), whole=True)
-        check_number("bands", self.bands, 4, 40, whole=True)
-        check_number("limit_spl", self.limit_spl, 60.0, 140.0)
-        check_number("reach_db", self.reach_db, 0.1, 60.0)
 
 
 @dataclass(frozen=True)
@@ -84,33 +80,20 @@ class HearingAidConfig(ModelConfig):
     45.0
     """
 
-    bands: int = 20
-    bins: int = 40
-    width: int = 96
-    hidden: int = 256
-    inner: int = 192
-    reach_db: float = 20.0
-    reduction_db: float = 12.0
-    attack: float = 0.005
-    release: float = 0.1
-    opening: float = 0.0
-    closing: float = 0.03
-    cap_db: float = 45.0
-    quiet_spl: float = 40.0
-    limit_spl: float = 110.0
-
-    def __post_init__(self) -> None:
-        check_number("bands", self.bands, 4, 40, whole=True)
-        check_number("bins", self.bins, 0, 128, whole=True)
-        for name in ("width", "hidden", "inner"):
-            check_number(name, getattr(self, name), 1, 4096, whole=True)
-        for name in ("reach_db", "reduction_db", "cap_db", "quiet_spl"):
-            check_number(name, getattr(self, name), 0.0, 80.0)
-        for name in ("attack", "opening"):
-            check_number(name, getattr(self, name), 0.0, 1.0)
-        for name in ("release", "closing"):
-            check_number(name, getattr(self, name), 0.01, 2.0)
-        check_number("limit_spl", self.limit_spl, 60.0, 140.0)
+    bands: int = number(20, 4, 40)
+    bins: int = number(40, 0, 128)
+    width: int = number(96, 1, 4096)
+    hidden: int = number(256, 1, 4096)
+    inner: int = number(192, 1, 4096)
+    reach_db: float = number(20.0, 0.0, 80.0)
+    reduction_db: float = number(12.0, 0.0, 80.0)
+    attack: float = number(0.005, 0.0, 1.0)
+    release: float = number(0.1, 0.01, 2.0)
+    opening: float = number(0.0, 0.0, 1.0)
+    closing: float = number(0.03, 0.01, 2.0)
+    cap_db: float = number(45.0, 0.0, 80.0)
+    quiet_spl: float = number(40.0, 0.0, 80.0)
+    limit_spl: float = number(110.0, 60.0, 140.0)
 
 
 @dataclass(frozen=True)
@@ -132,16 +115,9 @@ class BeamformerConfig(ModelConfig):
     64
     """
 
-    bands: int = 20
-    hidden: int = 64
-    seconds: float = 0.06
-    loading: float = 1e-4
-    spacing: float = 0.01
+    bands: int = number(20, 4, 40)
+    hidden: int = number(64, 1, 512)
+    seconds: float = number(0.06, 0.01, 2.0)
+    loading: float = number(1e-4, 1e-6, 1.0)
+    spacing: float = number(0.01, 0.002, 0.1)
     aid: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_number("bands", self.bands, 4, 40, whole=True)
-        check_number("hidden", self.hidden, 1, 512, whole=True)
-        check_number("seconds", self.seconds, 0.01, 2.0)
-        check_number("loading", self.loading, 1e-6, 1.0)
-        check_number("spacing", self.spacing, 0.002, 0.1)

@@ -1,8 +1,8 @@
 """Settings of the networks: dataclasses that a checkpoint stores as JSON."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, Self, get_origin, get_type_hints
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal, Self, get_origin
 
 from hlsim.calibration import NEURO_RATE
 from hlsim.checks import check_choice, check_flag, check_names, check_number, describe
@@ -17,13 +17,44 @@ MAX_SIZE = 1024
 """Largest accepted value of each size. It protects from mistakes and from exhausted memory."""
 
 
+def number(default: float, lowest: float, highest: float) -> Any:
+    """Declare a setting of a ``ModelConfig`` that is a number in a range.
+
+    Args:
+        default: Default value.
+        lowest: Smallest accepted value.
+        highest: Largest accepted value.
+
+    >>> number(20, 4, 40).default
+    20
+    """
+    return field(default=default, metadata={"range": (lowest, highest)})
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Base class of the settings of a model, which can be converted to JSON and back.
 
+    Numbers, flags and settings of type ``Literal`` are validated. The range of a number is that of
+    ``number``, or from 1 to ``MAX_SIZE``.
+
+    Raises:
+        ValueError: A value is not accepted.
+
     >>> NeuroConfig.from_dict({"channels": 32}).to_dict()["channels"]
     32
     """
+
+    def __post_init__(self) -> None:
+        for setting in fields(self):
+            name, kind, value = setting.name, setting.type, getattr(self, setting.name)
+            if kind in (int, float):
+                limits = setting.metadata.get("range", (1, MAX_SIZE))
+                check_number(name, value, *limits, whole=kind is int)
+            elif kind is bool:
+                check_flag(name, value)
+            elif get_origin(kind) is Literal:
+                check_choice(name, value, kind)
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the settings to a dict that ``json.dumps`` accepts."""
@@ -103,7 +134,7 @@ class NetworkConfig(ModelConfig):
     window: int = 400
     hop: int = 100
     channels: int = 24
-    dense_depth: int = 0
+    dense_depth: int = number(0, 0, MAX_SIZE)
     stride: tuple[int, int] = (2, 3)
     block: Block = "cnn"
     blocks: int = 2
@@ -113,24 +144,17 @@ class NetworkConfig(ModelConfig):
     heads: int = 4
 
     def __post_init__(self) -> None:
-        for name, kind in get_type_hints(type(self)).items():
-            value = getattr(self, name)
-            if get_origin(kind) is tuple:
-                if not isinstance(value, list | tuple) or len(value) != 2:
-                    raise ValueError(
-                        f"expected {name} to be two whole numbers, for time and frequency, "
-                        f"got {describe(value)}"
-                    )
-                for size in value:
-                    check_number(name, size, 1, MAX_SIZE, whole=True)
-                object.__setattr__(self, name, tuple(value))
-            elif kind is int:
-                lowest = 0 if name == "dense_depth" else 1
-                check_number(name, value, lowest, MAX_SIZE, whole=True)
-            elif kind is bool:
-                check_flag(name, value)
-            elif get_origin(kind) is Literal:
-                check_choice(name, value, kind)
+        super().__post_init__()
+        for name in ("stride", "kernel"):
+            sizes = getattr(self, name)
+            if not isinstance(sizes, list | tuple) or len(sizes) != 2:
+                raise ValueError(
+                    f"expected {name} to be two whole numbers, for time and frequency, "
+                    f"got {describe(sizes)}"
+                )
+            for size in sizes:
+                check_number(name, size, 1, MAX_SIZE, whole=True)
+            object.__setattr__(self, name, tuple(sizes))
         if any(length % 2 == 0 for length in self.kernel):
             raise ValueError(f"expected odd lengths of kernel, got {self.kernel}")
         if self.block == "transformer" and self.channels % self.heads:
