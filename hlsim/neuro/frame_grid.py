@@ -232,9 +232,12 @@ def _analysis_matrices() -> NDArray[np.float64]:
     """Compute the matrices from the even and odd parts of frames to real and imaginary parts.
 
     Returns:
-        Matrices, (2, 48, 97), which apply MSBG's window.
+        Matrices for the samples after the middle of a frame, (2, 48, 97), which apply MSBG's
+        window.
     """
-    angles, window, _ = _frame_angles()
+    times = np.arange(2 * HOP, dtype=np.float64)[:, None] + 0.5
+    angles = 2.0 * np.pi / FFT_POINTS * times * np.arange(FFT_POINTS // 2 + 1)
+    window = np.cos(np.pi / (4 * HOP) * times) ** 2
     return np.stack((np.cos(angles), -np.sin(angles))) * window
 
 
@@ -246,24 +249,9 @@ def _synthesis_matrices() -> NDArray[np.float64]:
         Matrices, (2, 97, 48), which apply MSBG's window and divide by the sum of the squares of
         four overlapping windows, 1.5.
     """
-    angles, window, weights = _frame_angles()
-    matrices = np.stack((np.cos(angles), -np.sin(angles))) * window * weights / (1.5 * FFT_POINTS)
-    return matrices.swapaxes(1, 2)
-
-
-def _frame_angles() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return angles, windows and weights for the samples after the middle of a frame.
-
-    Returns:
-        Angles of the frequencies' oscillations, (48, 97); values of the window, (48, 1); and number
-        of times that an inverse transform counts each frequency, (97,).
-    """
-    times = np.arange(2 * HOP, dtype=np.float64)[:, None] + 0.5
-    angles = 2.0 * np.pi / FFT_POINTS * times * np.arange(FFT_POINTS // 2 + 1)
-    window = np.cos(np.pi / (4 * HOP) * times) ** 2
-    weights = np.full(FFT_POINTS // 2 + 1, 2.0)
+    weights = np.full(FFT_POINTS // 2 + 1, 2.0)  # Each frequency but the first and last is a pair.
     weights[[0, -1]] = 1.0
-    return angles, np.asarray(window, np.float64), weights
+    return (_analysis_matrices() * weights / (1.5 * FFT_POINTS)).swapaxes(1, 2)
 
 
 @constant
