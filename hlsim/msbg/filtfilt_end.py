@@ -11,9 +11,8 @@ are weighted sums of the last samples of the channel. With a severe loss, the os
 the last 50 ms by up to 1e-2 of the whole signal.
 """
 
-from functools import lru_cache
-
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
@@ -21,7 +20,7 @@ from torch.nn import functional
 from hlsim.msbg.envelope import STEP, envelope_filters
 from hlsim.msbg.filter_bank import FilterBank
 from hlsim.msbg.recruitment import AHEAD
-from hlsim.torchtools import constant
+from hlsim.torchtools import as_tensor, compute_once
 
 LOOK_BACK = 4096
 """Number of last samples with an influence. In this time the slowest low-pass decays by 107 dB."""
@@ -49,53 +48,33 @@ def end_correction(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
     Returns:
         Difference of the envelopes, one value for every 24 samples.
 
-    >>> import torch
     >>> from hlsim.msbg.filter_bank import BANKS
     >>> end_correction(torch.zeros(19, 240), BANKS["severe"], length=100).shape
     torch.Size([19, 10])
     """
-    weights = _amplitude_weights(bank, like=channels)
-    oscillations = _sampled_oscillations(bank, (length - 1) % STEP, like=channels)
+    weights, oscillations = _oscillations(bank, channels.dtype, channels.device)
+    # One value per step, up to three steps (``AHEAD``) after the last step of the signal
+    sampled = oscillations[:, (length - 1) % STEP :: STEP][:, : LOOK_BACK // STEP].flip(1)
     first = max(0, length - LOOK_BACK)
     last_samples = channels[..., first:length].abs().unsqueeze(-1)
     amplitudes = weights[..., -last_samples.shape[-2] :] @ last_samples
-    correction = (oscillations @ amplitudes).squeeze(-1)
+    correction = (sampled @ amplitudes).squeeze(-1)
     steps = channels.shape[-1] // STEP
     end = (length - 1) // STEP + AHEAD + 1
     correction = correction[..., -end:]
     return functional.pad(correction, (end - correction.shape[-1], steps - end))
 
 
-@constant
-def _amplitude_weights(bank: FilterBank) -> Array:
-    """Compute the weights of the last samples in the two amplitudes of each channel.
-
-    Returns:
-        Weights, (channels, 2, 4096), with the last sample last.
-    """
-    return _oscillations(bank)[0]
-
-
-@constant
-def _sampled_oscillations(bank: FilterBank, offset: int) -> Array:
-    """Compute the two free oscillations of each channel's low-pass once per step.
+@compute_once
+def _oscillations(
+    bank: FilterBank, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Compute the two free oscillations of each channel's low-pass, see ``_oscillation``.
 
     Args:
         bank: Filter bank to which the channels belong.
-        offset: Samples from the first sample of the last step to the last sample of the signal.
-
-    Returns:
-        Oscillations at the first sample of each step of 24 samples, in the order of time,
-        (channels, 170, 2). The last of the 170 steps is three steps (``AHEAD``) after the last step
-        of the signal.
-    """
-    sampled = _oscillations(bank)[1][:, offset::STEP]
-    return sampled[:, LOOK_BACK // STEP - 1 :: -1]
-
-
-@lru_cache(maxsize=4)
-def _oscillations(bank: FilterBank) -> tuple[Array, Array]:
-    """Compute the two free oscillations of each channel's low-pass, see ``_oscillation``.
+        dtype: Precision of the results.
+        device: Device of the results.
 
     Returns:
         Weights of the last 4096 samples of a signal in the amplitudes of the oscillations, the last
@@ -103,8 +82,8 @@ def _oscillations(bank: FilterBank) -> tuple[Array, Array]:
         after the end, (channels, 72 + 4096, 2).
     """
     results = [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
-    weights, oscillations = zip(*results, strict=True)
-    return np.stack(weights), np.stack(oscillations)
+    weights, oscillations = (np.stack(arrays) for arrays in zip(*results, strict=True))
+    return as_tensor(weights, dtype, device), as_tensor(oscillations, dtype, device)
 
 
 def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
