@@ -162,9 +162,9 @@ class _SmearAndAmplify(torch.autograd.Function):
             gain_factors = block.factors(gains, scaled, block.buffers[6:8])
             real_slope, imaginary_slope, power_slope = block.cut(*slopes)
             product = _multiply(factor, gain_factors, block.buffers[8:10])
-            _multiply_conjugate(outer, product, (real_slope, imaginary_slope))
-            product = _multiply_conjugate(outer, spectrum, block.buffers[8:10])
-            smeared = _multiply_conjugate(product, gain_factors, block.buffers[10:12])
+            _multiply(product, outer, (real_slope, imaginary_slope), -1.0)
+            product = _multiply(spectrum, outer, block.buffers[8:10], -1.0)
+            smeared = _multiply(gain_factors, product, block.buffers[10:12], -1.0)
             ratio_slope = smeared[0].mul_(factor[0]).addcmul_(smeared[1], factor[1], value=-1.0)
             ratio_slope.div_(size).div_(divisor)
             # p / d is 1 - |r| / MAX_FACTOR.
@@ -173,7 +173,7 @@ class _SmearAndAmplify(torch.autograd.Function):
             weight = ratio.mul_(ratio_slope)
             real_slope.addcmul_(spectrum[0], weight, value=-1.0)
             imaginary_slope.addcmul_(spectrum[1], weight, value=-1.0)
-            factor_slopes = _multiply_conjugate(product, factor, block.buffers[6:8])
+            factor_slopes = _multiply(factor, product, block.buffers[6:8], -1.0)
             block.add_slopes(factor_slopes, gains, scaled, gains_slope, matrix_slopes)
         if not needs_matrices:
             return (*slopes, gains_slope, None, None, None)
@@ -338,17 +338,10 @@ def _scale(values: Tensor) -> Tensor:
     return values * math.sqrt(0.125)
 
 
-def _multiply(first: Sequence[Tensor], second: Sequence[Tensor], out: Sequence[Tensor]) -> Planes:
-    """Multiply complex numbers."""
-    (a, b), (c, d) = first, second
-    real = torch.mul(a, c, out=out[0]).addcmul_(b, d, value=-1.0)
-    return real, torch.mul(a, d, out=out[1]).addcmul_(b, c)
-
-
-def _multiply_conjugate(
-    first: Sequence[Tensor], second: Sequence[Tensor], out: Sequence[Tensor]
+def _multiply(
+    first: Sequence[Tensor], second: Sequence[Tensor], out: Sequence[Tensor], sign: float = 1.0
 ) -> Planes:
-    """Multiply complex numbers by the conjugates of others."""
+    """Multiply complex numbers, or with the sign -1 the conjugates of the first ones, by others."""
     (a, b), (c, d) = first, second
-    real = torch.mul(a, c, out=out[0]).addcmul_(b, d)
-    return real, torch.mul(b, c, out=out[1]).addcmul_(a, d, value=-1.0)
+    real = torch.mul(a, c, out=out[0]).addcmul_(b, d, value=-sign)
+    return real, torch.mul(a, d, out=out[1]).addcmul_(b, c, value=sign)
