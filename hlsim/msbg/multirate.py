@@ -118,62 +118,37 @@ class MultirateBank:
 
 
 def _rate_and_detector(
-    centre: float, top: float, is_wide: bool, rate_divisor: int, highest: float
+    bank: FilterBank, centre: float, rate_divisor: int, highest: float
 ) -> tuple[int, str]:
     """Choose the sample rate of a channel, and the detector, from which its envelope is computed.
-
-    Args:
-        centre: Centre frequency in Hz.
-        top: Frequency in Hz up to which the channel is kept.
-        is_wide: Whether harmonics of the channel reach down to 0 Hz.
-        rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
-        highest: Highest frequency in Hz that the output needs.
-
-    Returns:
-        Number of samples between two values of the envelope, and the detector (see ``RateBand``).
-    """
-    steps_per_second = MSBG_RATE / _envelope_step(rate_divisor)
-    if centre < _RECTIFIED_BELOW_HZ:
-        return _FAST_SAMPLES, "itself"
-    if top <= _SLOW_SAMPLES * steps_per_second:
-        return (_FAST_SAMPLES, "harmonics") if is_wide else (_SLOW_SAMPLES, "modulus")
-    if rate_divisor == 2:
-        return int((highest + SKIRT_HZ) / steps_per_second) + 1, "modulus"
-    if top <= _FAST_SAMPLES * steps_per_second and not is_wide:
-        return _FAST_SAMPLES, "modulus"
-    return STEP, "itself"
-
-
-def _assign_rates(
-    bank: FilterBank, count: int, rate_divisor: int, highest: float
-) -> list[tuple[slice, int, str]]:
-    """Choose the sample rate and the detector of the lowest ``count`` channels of a filter bank.
 
     A rate is stated in samples per step. A step is the time between two values of an envelope: 24
     samples at 44.1 kHz, or 24.5 if the signals have 22.05 kHz.
 
     Args:
-        bank: Filter bank.
-        count: Number of channels, from the lowest up.
+        bank: Filter bank of the channel.
+        centre: Centre frequency of the channel in Hz.
         rate_divisor: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
         highest: Highest frequency in Hz that the output needs.
 
     Returns:
-        For each group of neighbouring channels with the same choice: their indices, the number of
-        samples per step, and the detector (see ``RateBand``).
+        Number of samples per step, and the detector (see ``RateBand``).
     """
-    centre_hz = np.array(bank.centre_frequencies)
-    top_hz = centre_hz + _BANDWIDTHS_ABOVE_CENTRE * bank.broadening * erb(centre_hz)
-    is_wide = bank.broadening > _MAX_BROADENING_WITHOUT_HARMONICS
-    choices = [
-        _rate_and_detector(centre, top, is_wide, rate_divisor, highest)
-        for centre, top in zip(centre_hz[:count], top_hz[:count], strict=True)
-    ]
-    groups = []
-    for choice, members in itertools.groupby(range(count), choices.__getitem__):
-        channels = list(members)
-        groups.append((slice(channels[0], channels[-1] + 1), *choice))
-    return groups
+    steps_per_second = MSBG_RATE / _envelope_step(rate_divisor)
+    bandwidth = float(erb(np.array(centre)))
+    top = centre + _BANDWIDTHS_ABOVE_CENTRE * bank.broadening * bandwidth
+    has_harmonics_at_0_hz = bank.broadening > _MAX_BROADENING_WITHOUT_HARMONICS
+    if centre < _RECTIFIED_BELOW_HZ:
+        return _FAST_SAMPLES, "itself"
+    if top <= _SLOW_SAMPLES * steps_per_second:
+        if has_harmonics_at_0_hz:
+            return _FAST_SAMPLES, "harmonics"
+        return _SLOW_SAMPLES, "modulus"
+    if rate_divisor == 2:
+        return int((highest + SKIRT_HZ) / steps_per_second) + 1, "modulus"
+    if top <= _FAST_SAMPLES * steps_per_second and not has_harmonics_at_0_hz:
+        return _FAST_SAMPLES, "modulus"
+    return STEP, "itself"
 
 
 @compute_once
@@ -208,9 +183,15 @@ def multirate_bank(
     # All channels far above the highest frequency make one.
     channels_below = sum(hz <= _MERGED_ABOVE * highest for hz in bank.centre_frequencies)
     count = min(bank.channels, channels_below + 1)
+    choices = [
+        _rate_and_detector(bank, centre, rate_divisor, highest)
+        for centre in bank.centre_frequencies[:count]
+    ]
     bands = []
     lowpasses = []
-    for channels, samples, detector in _assign_rates(bank, count, rate_divisor, highest):
+    for (samples, detector), members in itertools.groupby(range(count), choices.__getitem__):
+        indices = list(members)
+        channels = slice(indices[0], indices[-1] + 1)
         is_analytic = detector != "itself"
         band_points = steps * samples
         bins_of_band = band_points if is_analytic else band_points // 2 + 1
