@@ -293,7 +293,7 @@ class Prior(BandGains):
         levels = self.channel_levels(smeared_powers, severity)
         log_envelope = self.smooth(levels, severity).log()
         gain = self.log_gain(log_envelope, thresholds, severity).exp().mT
-        real, imaginary = self._corrected("relative")[:, severity]
+        real, imaginary = self.factor_matrices(severity)
         factor = torch.complex(gain @ real, gain @ imaginary)
         return factor * _smearing_factor(smeared_powers, powers)
 
