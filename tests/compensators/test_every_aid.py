@@ -21,6 +21,7 @@ from compensators import (
     save_compensator,
 )
 from compensators.beamformer import BeamformingAid
+from compensators.config import BeamformerConfig
 from compensators.limiter import soft_limit
 from hlsim import Audiogram, Listener
 from hlsim.calibration import set_level
@@ -156,6 +157,8 @@ BAD_SETTINGS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     (HearingAidConfig, {"bands": 20.0}),
     (HearingAidConfig, {"limit_spl": "loud"}),
     *((MappingConfig, {name: 200.0}) for name in ("bands", "reach_db", "limit_spl")),
+    *((MappingConfig, settings) for settings in ({"microphones": 17}, {"ears": 2})),
+    *((BeamformerConfig, {name: 20.0}) for name in ("bands", "seconds", "loading", "spacing")),
     (MappingConfig, {"start": 0.5}),
     (MappingConfig, {"phase": "minimum"}),
     (MappingConfig.from_dict, {"data": {"layers": 3}}),
