@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import warnings
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -127,30 +126,22 @@ class TrainingData:
             ValueError: The manifest is invalid, or has scenes although there is ``noise``.
         """
         folder = Path(manifest).parent if root is None else Path(root)
-        speech: dict[str, list[Path]] = defaultdict(list)
-        pairs: dict[str, list[tuple[Path, Path]]] = defaultdict(list)
-        scenes: dict[str, list[SceneFiles]] = defaultdict(list)
-        for row in read_manifest(manifest, root):
-            clean = folder / row.path
-            speech[row.split].append(clean)
-            if row.reference:
-                scenes[row.split].append(SceneFiles.from_utterance(row, folder))
-            elif row.noisy:
-                pairs[row.split].append((clean, folder / row.noisy))
-        sources: dict[str, Any] = {
-            "valid_speech": speech["valid"],
-            "noise": pairs["train"],
-            "valid_noise": pairs["valid"],
-            "scenes": scenes["train"],
-            "valid_scenes": scenes["valid"],
-        }
+        rows = read_manifest(manifest, root)
+        sources: dict[str, Any] = {}
+        for split, prefix in (("train", ""), ("valid", "valid_")):
+            part = [row for row in rows if row.split == split]
+            sources[f"{prefix}speech"] = [folder / row.path for row in part]
+            pairs = [row for row in part if row.noisy and not row.reference]
+            sources[f"{prefix}noise"] = [(folder / row.path, folder / row.noisy) for row in pairs]
+            scenes = [SceneFiles.from_utterance(row, folder) for row in part if row.reference]
+            sources[f"{prefix}scenes"] = scenes
         replacements = {name: value for name, value in attributes.items() if value}
-        if any(scenes.values()) and replacements.keys() & {"noise", "valid_noise"}:
+        if rows[0].reference and replacements.keys() & {"noise", "valid_noise"}:
             raise ValueError(
                 f"{manifest}: its noisy speech at several microphones contains the noise; leave "
                 "--noise and --valid-noise out"
             )
-        return cls(speech["train"], **(sources | replacements))
+        return cls(**(sources | replacements))
 
     def validation(self) -> TrainingData:
         """Return the data for validation as ``speech``, ``noise``, ``audiograms`` and ``scenes``.
@@ -204,9 +195,9 @@ class _RandomBatches(Dataset[Batch]):
     def __init__(self, recipe: TrainingRecipe, data: TrainingData, ear: Audiogram | None) -> None:
         self.recipe = recipe
         self.ear = None if ear is None else torch.tensor(ear.thresholds)
-        settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
-        self.speech = Clips(data.speech, **settings)
-        self.noise = Clips(data.noise, repeat=True, **settings) if data.noise else None
+        self.clip_settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
+        self.speech = Clips(data.speech, **self.clip_settings)
+        self.noise = Clips(data.noise, repeat=True, **self.clip_settings) if data.noise else None
         self.measured_ears: Tensor | None = None  # (ears, 8) dB HL
         if data.audiograms is not None:
             self.measured_ears = torch.tensor(_read_ears(data.audiograms))
@@ -287,8 +278,7 @@ class _CompensatorBatches(_RandomBatches):
         self.microphones, self.ears = _microphones_and_ears(recipe)
         self.scenes: SceneClips | None = None
         if data.scenes:
-            settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
-            self.scenes = SceneClips(data.scenes, **settings)
+            self.scenes = SceneClips(data.scenes, **self.clip_settings)
             numbers = (self.scenes.microphones, self.scenes.ears)
             if self.microphones > 1 and numbers != (self.microphones, self.ears):
                 raise ValueError(
@@ -309,32 +299,18 @@ class _CompensatorBatches(_RandomBatches):
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         if self.scenes is not None:
-            return self._draw_recorded_scenes(self.scenes, count, generator)
-        recipe = self.recipe
-        voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)
-        clips = self.replace_by_sounds(voices, generator)
-        clean = set_level(clips, draw_uniform(*recipe.levels, (count,), generator))
-        if self.microphones > 1:
-            return self._draw_scenes(clean, voices, generator)
-        signal = clean
-        if self.noise is not None:
-            noise = self.noise.draw(count, generator)
-            noise = equalise_share(noise, recipe.equalised, generator)
-            if recipe.babble:
-                noise = replace_share(noise, _babble(voices), recipe.babble, generator)
-            noisy = mix(clean, noise, draw_uniform(*recipe.snr, (count,), generator))
-            noisy = replace_share(clean, noisy, recipe.noisy, generator)
-            is_speech = (clips == voices).all(-1, keepdim=True)
-            signal = torch.where(is_speech, noisy, clean)
-        return self._complete_batch(clean, signal, self.draw_ears(count, generator), generator)
-
-    def _complete_batch(
-        self, clean: Tensor, signal: Tensor, ears: Tensor, generator: torch.Generator
-    ) -> Batch:
-        """Return a batch for one microphone, with a strength of noise reduction for hearing aids.
-
-        Shape: (items, time) twice, (items, 8).
-        """
+            clean, signal = self._draw_recorded_scenes(self.scenes, count, generator)
+        else:
+            clean, signal = self._draw_signals(count, generator)
+        ears = self.draw_ears(count, generator)
+        if signal.ndim == 4 and self.microphones == 1:
+            # The network gets the reference microphone, and each ear is an item.
+            ears = ears.repeat_interleave(clean.shape[1], 0)
+            clean, signal = clean.flatten(0, 1), signal[:, 0].flatten(0, 1)
+        elif signal.ndim == 4 and self.ears == 1:
+            clean, signal = clean[:, 0], signal[:, :, 0]
+        elif signal.ndim == 4:
+            ears = ears.unsqueeze(1).expand(-1, 2, -1)
         batch = {"clean": clean, "signal": signal, "thresholds": ears}
         if self.recipe.kind == "hearing-aid":
             is_reduced = torch.rand(len(clean), generator=generator) >= self.recipe.unreduced
@@ -343,51 +319,60 @@ class _CompensatorBatches(_RandomBatches):
 
     def _draw_recorded_scenes(
         self, scenes: SceneClips, count: int, generator: torch.Generator
-    ) -> Batch:
+    ) -> tuple[Tensor, Tensor]:
         """Draw clips of recorded scenes, in which the clean speech has the recipe's levels.
-
-        A network with one microphone gets that of the reference, and each ear is an item. A network
-        with several microphones of one ear, or of two, gets all of them.
 
         Args:
             scenes: Clips of recorded scenes.
             count: Number of scenes.
             generator: Source of the random numbers.
+
+        Returns:
+            The clean speech, (count, ears, time), and the signals, (count, microphones, ears,
+            time).
         """
         clean, signal = scenes.draw_scenes(count, generator)
         levels = draw_uniform(*self.recipe.levels, (count,), generator)
         gains = 10.0 ** ((levels - level_spl(clean.flatten(1))) / 20.0)
-        clean, signal = clean * gains[:, None, None], signal * gains[:, None, None, None]
-        ears = self.draw_ears(count, generator)
-        if self.microphones == 1:
-            ears = ears.repeat_interleave(scenes.ears, 0)
-            reference = signal[:, 0].flatten(0, 1)
-            return self._complete_batch(clean.flatten(0, 1), reference, ears, generator)
-        if self.ears == 1:
-            return {"clean": clean[:, 0], "signal": signal[:, :, 0], "thresholds": ears}
-        ears = ears.unsqueeze(1).expand(-1, 2, -1)
-        return {"clean": clean, "signal": signal, "thresholds": ears}
+        return clean * gains[:, None, None], signal * gains[:, None, None, None]
 
-    def _draw_scenes(self, clean: Tensor, voices: Tensor, generator: torch.Generator) -> Batch:
-        """Draw the tensors of a batch for several microphones and two equal ears.
+    def _draw_signals(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw clean and noisy speech, and tones and clicks: in scenes for several microphones.
 
-        Shape: (items, time) twice -> ``signal`` (items, microphones, 2, time), ``clean`` (items, 2,
-            time), ``thresholds`` (items, 2, 8).
+        Args:
+            count: Number of items.
+            generator: Source of the random numbers.
+
+        Returns:
+            Clean speech and input of the aid, (count, time) each; for several microphones, (count,
+            2, time) and (count, microphones, 2, time).
         """
-        recipe, count = self.recipe, len(clean)
+        recipe = self.recipe
+        voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)
+        clips = self.replace_by_sounds(voices, generator)
+        clean = set_level(clips, draw_uniform(*recipe.levels, (count,), generator))
         noise = self.noise.draw(count, generator) if self.noise is not None else None
-        snr = draw_uniform(*recipe.snr, (count,), generator)
-        is_noisy = torch.rand(count, generator=generator) < recipe.noisy
-        snr = torch.where(is_noisy, snr, _QUIET_SNR)
-        settings = {
-            "mismatch": recipe.mismatch,
-            "reverberation_time": recipe.reverberation_time,
-        }
-        if recipe.kind == "beamforming-aid":
-            settings["spacing"] = BeamformerConfig.from_dict(recipe.model).spacing
-        scenes = draw_scenes(clean, voices, noise, snr, generator, **settings)
-        ears = self.draw_ears(count, generator).unsqueeze(1).expand(-1, 2, -1)
-        return {"clean": scenes.reference, "signal": scenes.input, "thresholds": ears}
+        if self.microphones > 1:
+            snr = draw_uniform(*recipe.snr, (count,), generator)
+            is_noisy = torch.rand(count, generator=generator) < recipe.noisy
+            snr = torch.where(is_noisy, snr, _QUIET_SNR)
+            settings = {
+                "mismatch": recipe.mismatch,
+                "reverberation_time": recipe.reverberation_time,
+            }
+            if recipe.kind == "beamforming-aid":
+                settings["spacing"] = BeamformerConfig.from_dict(recipe.model).spacing
+            scenes = draw_scenes(clean, voices, noise, snr, generator, **settings)
+            return scenes.reference, scenes.input
+        if noise is None:
+            return clean, clean
+        noise = equalise_share(noise, recipe.equalised, generator)
+        if recipe.babble:
+            noise = replace_share(noise, _babble(voices), recipe.babble, generator)
+        noisy = mix(clean, noise, draw_uniform(*recipe.snr, (count,), generator))
+        noisy = replace_share(clean, noisy, recipe.noisy, generator)
+        is_speech = (clips == voices).all(-1, keepdim=True)
+        return clean, torch.where(is_speech, noisy, clean)
 
 
 def _microphones_and_ears(recipe: CompensatorRecipe) -> tuple[int, int]:
