@@ -2,7 +2,6 @@
 
 import copy
 import io
-import json
 import logging
 import math
 import sys
@@ -147,18 +146,14 @@ class StepProgress(L.Callback):
         if trainer.is_global_zero:
             self.line = ProgressLine("steps", "preparing the training", "validating").__enter__()
 
-    def teardown(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        self._close()
-
-    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
-        self._close()
-
-    def _close(self) -> None:
+    def teardown(self, *_: Any, **__: Any) -> None:
         if self.line is not None:
             self.line.__exit__()
             self.line = None
 
-    def _report(self, trainer: L.Trainer, module: Any) -> None:
+    on_exception = teardown
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         if self.line is None:
             return
         metrics = trainer.callback_metrics
@@ -166,11 +161,8 @@ class StepProgress(L.Callback):
         details = "".join(f"; {value}" for value in values)
         self.line(trainer.global_step, module.recipe.steps, details)
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
-        self._report(trainer, module)
-
     def on_validation_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
-        self._report(trainer, module)
+        self.on_train_batch_end(trainer, module)
 
     def on_validation_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
         clear_line(sys.stderr)  # The module prints the scores.
@@ -257,7 +249,7 @@ def train_network(
         record["devices"] = trainer.world_size
         is_resumption = state.exists()
         if not is_resumption:
-            _check_no_network(best.folder, record)
+            _check_no_network(best.folder)
         else:
             step = _check_state(state, record, best.folder)
             if step >= recipe.steps:
@@ -274,33 +266,24 @@ def train_network(
     return best.folder
 
 
-def _check_no_network(folder: Path, record: Mapping[str, Any]) -> None:
+def _check_no_network(folder: Path) -> None:
     """Raise ValueError if a folder without a state has a network that would be replaced.
 
     A network with 0 steps may be replaced: a training that ended before its first state leaves it.
 
     Args:
         folder: Folder of the best network.
-        record: Description of the training that should begin.
     """
     if not (folder / CONFIG).exists():
         return
-    about = read_record(folder).get("about", {})
-    steps = about.get("steps")
-    if steps == 0:
-        return
-    is_same = isinstance(about.get("recipe"), Mapping)
-    if is_same and not _differences(json.loads(json.dumps(record)), about):
+    steps = read_record(folder).get("about", {}).get("steps")
+    if steps != 0:
         raise ValueError(
-            f"{folder}: this training has saved its network after {steps} steps, but there is no "
-            f"state ({STATE}) from which it could continue, because it ended before its first "
-            "state was saved, or the state was removed; remove the folder to begin again, or "
+            f"{folder}: the network of a training ({steps} steps) would be replaced, and there is "
+            f"no state ({STATE}) from which this training could continue, because it ended before "
+            "its first state was saved, or the state was removed; move or remove the folder, or "
             "choose another output folder"
         )
-    raise ValueError(
-        f"{folder}: the network of another training would be replaced; move it, or choose "
-        "another output folder"
-    )
 
 
 def _differences(record: Mapping[str, Any], actual: Mapping[str, Any]) -> list[str]:
