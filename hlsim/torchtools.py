@@ -38,6 +38,11 @@ For each severity, MSBG's take 2 to 4 MiB per second of signal.
 
 _HOST = torch.device("cpu")
 
+_RESULTS: OrderedDict[Any, Any] = OrderedDict()
+"""Results of ``compute_once`` by function and arguments, in order of use."""
+
+_RESULTS_LOCK = Lock()
+
 
 def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a function that ``torch.compile`` must not compile.
@@ -209,7 +214,8 @@ class constant(Generic[P, Values]):
 def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a function whose results are computed once and then come from a store.
 
-    The store drops the results that were not used for the longest time.
+    Beyond ``STORE_BYTES``, the store drops the results that were not used for the longest time, but
+    never the latest result.
 
     Args:
         function: Function at the top level of a module, with hashable arguments.
@@ -226,10 +232,30 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
         # a program that is traced cannot use tensors from outside
         if torch.compiler.is_compiling():
             return function(*arguments, **options)
-        result: Result = _STORE.get_or_compute(function, *arguments, **options)
+        key = function, arguments, tuple(options.items())
+        with _RESULTS_LOCK:
+            if key in _RESULTS:
+                _RESULTS.move_to_end(key)
+                stored: Result = _RESULTS[key]
+                return stored
+        # The lock is open meanwhile, because a function may compute other constants.
+        result = without_modes(function, *arguments, **options)
+        with _RESULTS_LOCK:
+            _RESULTS[key] = result
+            while len(_RESULTS) > 1 and _count_bytes([*_RESULTS.values()]) > STORE_BYTES:
+                _RESULTS.popitem(last=False)
         return result
 
     return compute
+
+
+def _count_bytes(value: Any) -> int:
+    """Return the bytes of a tensor or an array, or of all in a list, a tuple or an object."""
+    if isinstance(value, Tensor | np.ndarray):
+        return value.nbytes
+    if not isinstance(value, list | tuple):
+        value = vars(value).values() if hasattr(value, "__dict__") else ()
+    return sum(map(_count_bytes, value))
 
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -346,24 +372,13 @@ def differentiable_once(gradient: Tensor, message: str) -> Tensor:
     >>> differentiable_once(torch.ones(2), "no second derivative")
     tensor([1., 1.])
     """
-    result: Tensor = _DifferentiableOnce.apply(gradient, message)
-    return result
 
+    def reject(_: Tensor) -> None:
+        raise RuntimeError(message)
 
-class _DifferentiableOnce(torch.autograd.Function):
-    """Identity that raises RuntimeError in its backward pass."""
-
-    @staticmethod
-    def forward(gradient: Tensor, message: str) -> Tensor:
-        return gradient.view_as(gradient)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, str], output: Tensor) -> None:
-        ctx.message = inputs[1]
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        raise RuntimeError(ctx.message)
+    if gradient.requires_grad:
+        gradient.register_hook(reject)
+    return gradient
 
 
 def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
@@ -495,51 +510,3 @@ def _add_copy(tensor: Tensor, copy: Tensor) -> None:
 def _can_be_remembered(tensor: Tensor) -> bool:
     # a compiled program must not hold values, and inference tensors do not count their changes
     return not (torch.compiler.is_compiling() or tensor.is_inference())
-
-
-# -- the store -------------------------------------------------------------------------------------
-
-
-class _Store:
-    """Results by function and arguments, in order of use.
-
-    The results that were not used for the longest time are dropped beyond a number of bytes, but
-    never the latest result.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self._results: OrderedDict[Any, Any] = OrderedDict()
-        self._lock = Lock()
-
-    def get_or_compute(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Return the stored result of a function for some arguments, or compute and store it."""
-        key = function, arguments, tuple(options.items())
-        with self._lock:
-            if key in self._results:
-                self._results.move_to_end(key)
-                return self._results[key]
-        # The lock is open meanwhile, because a function may compute other constants.
-        result = without_modes(function, *arguments, **options)
-        with self._lock:
-            self._results[key] = result
-            while len(self._results) > 1 and self.nbytes > self.limit:
-                self._results.popitem(last=False)
-        return result
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all results."""
-        return _count_bytes([*self._results.values()])
-
-
-def _count_bytes(value: Any) -> int:
-    """Return the bytes of a tensor or an array, or of all in a list, a tuple or an object."""
-    if isinstance(value, Tensor | np.ndarray):
-        return value.nbytes
-    if not isinstance(value, list | tuple):
-        value = vars(value).values() if hasattr(value, "__dict__") else ()
-    return sum(map(_count_bytes, value))
-
-
-_STORE = _Store(STORE_BYTES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         torchtools, "without_modes", lambda function, *args, **kwargs: function(*args, **kwargs)
     )
-    monkeypatch.setattr(torchtools, "_STORE", torchtools._Store(torchtools.STORE_BYTES))
+    monkeypatch.setattr(torchtools, "_RESULTS", OrderedDict())
     # so small that two items need several groups of channels
     monkeypatch.setattr(ear_model, "GPU_CHUNK", 2**19)
 

@@ -1,5 +1,8 @@
 """Constants are computed once for each type and device, and serve under any mode of torch."""
 
+from collections import OrderedDict
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -33,10 +36,24 @@ def test_constant_is_designed_once_for_each_type_and_device() -> None:
     assert make(2) == [1, 1]
 
 
+class SmallStore:
+    """A store for 4 MiB, which is empty before each test."""
+
+    limit = 4 * 2**20
+
+    def __init__(self) -> None:
+        self.results: OrderedDict[Any, Any] = OrderedDict()
+
+    @property
+    def nbytes(self) -> int:
+        return torchtools._count_bytes([*self.results.values()])
+
+
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> torchtools._Store:
-    store = torchtools._Store(4 * 2**20)
-    monkeypatch.setattr(torchtools, "_STORE", store)
+def small(monkeypatch: pytest.MonkeyPatch) -> SmallStore:
+    store = SmallStore()
+    monkeypatch.setattr(torchtools, "STORE_BYTES", store.limit)
+    monkeypatch.setattr(torchtools, "_RESULTS", store.results)
     return store
 
 
@@ -52,7 +69,7 @@ def test_complex_constants_and_those_like_a_tensor() -> None:
         assert make(3, like=torch.ones(1, dtype=expected)) is tensor
 
 
-def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Store) -> None:
+def test_memory_does_not_grow_with_the_number_of_lengths(small: SmallStore) -> None:
     model = MSBG("N3")
     signals = [0.01 * torch.ones(1, 3000 + 2000 * n) for n in range(8)]
     first = [model(signal) for signal in signals]
@@ -62,7 +79,7 @@ def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Stor
     assert small.nbytes <= small.limit
 
 
-def test_one_that_is_too_large_is_held_all_the_same(small: torchtools._Store) -> None:
+def test_one_that_is_too_large_is_held_all_the_same(small: SmallStore) -> None:
     arguments = (BANKS["severe"], 24 * 4000, 1, 22050.0, torch.float32, CPU)
     bank = multirate_bank(*arguments)
     assert multirate_bank(*arguments) is bank and small.nbytes > small.limit
@@ -71,7 +88,7 @@ def test_one_that_is_too_large_is_held_all_the_same(small: torchtools._Store) ->
 
 
 def test_constants_of_inference_mode_or_a_transform_serve_gradients_later(
-    small: torchtools._Store,
+    small: SmallStore,
 ) -> None:
     model = MSBG("N3")
     wave, gain = 0.03 * torch.randn(1, 1200), torch.tensor(1.0)
