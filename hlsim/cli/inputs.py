@@ -9,7 +9,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,6 @@ from hlsim.extras import is_installed, require
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
-    from hlsim.audiogram.discomfort import Points
     from hlsim.audiogram.listener import Listener
 
 PACKAGES = {
@@ -58,44 +57,10 @@ def parse_ear(options: argparse.Namespace) -> Audiogram | Listener | None:
         The ear or the listener, or None if both options are missing.
 
     Raises:
-        ValueError: There is no such file or listener, an audiogram is not valid, an ear is missing,
-            or the levels of ``--ucl`` are not valid or have no effect.
+        ValueError: See ``parse_ears``.
     """
-    from hlsim.audiogram import as_audiogram
-
-    ucl = _uncomfortable_levels(options, ears=int(options.audiogram is not None))
-    if getattr(options, "listener", None):
-        return _read_listener(options.listener)
-    return replace(as_audiogram(options.audiogram), ucl=ucl) if options.audiogram else None
-
-
-def _uncomfortable_levels(options: argparse.Namespace, ears: int) -> Points:
-    """Return the frequencies in Hz and levels in dB HL of ``--ucl``, none without the option.
-
-    Args:
-        options: Parsed options of a command, which need not have the option.
-        ears: Number of ears of ``--audiogram``.
-
-    Raises:
-        ValueError: The levels are not valid or have no effect, or there is not one ear.
-    """
-    from hlsim.audiogram.discomfort import read_points
-
-    ucl = read_points(getattr(options, "ucl", None))
-    if ucl and not getattr(options, "limit_to_ear", True):
-        raise ValueError("--ucl has no effect without --limit-to-ear; add it, or leave --ucl out")
-    if ucl and ears > 1:
-        raise ValueError(
-            f"--ucl has the levels of one ear of --audiogram, got {ears} ears; process each alone"
-        )
-    if ucl and ears == 0:
-        has_listener = hasattr(options, "listener")
-        option, column = ("listener", "left_500") if has_listener else ("audiograms", "500")
-        raise ValueError(
-            "--ucl has the levels of the ear of --audiogram, which is missing; write the levels "
-            f"into the file of --{option} instead, in columns such as ucl_{column}"
-        )
-    return ucl
+    ears = parse_ears(options, [options.audiogram] if options.audiogram else [])
+    return next(iter(ears.values()), None)
 
 
 def level_and_gain(power: float, options: argparse.Namespace) -> tuple[float, float]:
@@ -115,13 +80,16 @@ def level_and_gain(power: float, options: argparse.Namespace) -> tuple[float, fl
     return level, 0.0 if options.spl is None else options.spl - level
 
 
-def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
+def parse_ears(
+    options: argparse.Namespace, values: Sequence[Any]
+) -> dict[str, Audiogram | Listener]:
     """Return the ears of a repeated ``--audiogram``, or the listener of ``--listener``.
 
     Prints a warning if the compensator of the options was trained for another ear.
 
     Args:
         options: Parsed options of a command.
+        values: Values of ``--audiogram``, see ``ear`` of ``options.py``.
 
     Returns:
         Ears by their names. A standard ear has its own name, and any other ear one that consists
@@ -130,15 +98,24 @@ def parse_ears(options: argparse.Namespace) -> dict[str, Audiogram | Listener]:
 
     Raises:
         ValueError: There is no such file or listener, an audiogram is not valid, two have the same
-            name, or the levels of ``--ucl`` are not valid or have no effect.
+            name, or the levels of ``--ucl`` are not valid, have no effect, or are not for one ear.
     """
     from hlsim.audiogram import as_audiogram
+    from hlsim.audiogram.discomfort import read_points
 
+    ucl = read_points(getattr(options, "ucl", None))
+    if ucl and not getattr(options, "limit_to_ear", True):
+        raise ValueError("--ucl has no effect without --limit-to-ear; add it, or leave --ucl out")
+    if ucl and len(values) != 1:
+        raise ValueError(
+            f"--ucl has the levels of one ear of --audiogram, got {len(values)} ears; process each "
+            "alone, or write the levels into the file of --listener or --audiograms, in columns "
+            "such as ucl_left_500 or ucl_500"
+        )
     ears: dict[str, Audiogram | Listener] = {}
-    ucl = _uncomfortable_levels(options, ears=len(options.audiogram or ()))
-    if options.listener:
+    if getattr(options, "listener", None):
         ears["listener"] = _read_listener(options.listener)
-    for value in options.audiogram or ():
+    for value in values:
         if isinstance(value, str):
             name = value.upper()
         elif isinstance(value, dict):
@@ -276,6 +253,18 @@ def build_single_microphone_aid(options: argparse.Namespace, sample_rate: int) -
 
 
 def read_sliders(options: argparse.Namespace) -> dict[str, float]:
-    """Return the values of the sliders of a hearing aid that a user has set, by name."""
+    """Return the values of the sliders of a hearing aid that a user has set, by name.
+
+    Raises:
+        ValueError: A slider or another setting of an aid is set, and there is no aid.
+    """
     values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}
-    return {name: value for name, value in values.items() if value is not None}
+    sliders = {name: value for name, value in values.items() if value is not None}
+    has_aid = getattr(options, "compensator", None) and not getattr(options, "simulate", False)
+    settings = [*sliders, *(getattr(options, name, None) for name in ("loudness", "limit_to_ear"))]
+    if any(settings) and not has_aid:
+        raise ValueError(
+            "--noise-reduction, --amplification, --loudness and --limit-to-ear have no effect "
+            "without an aid; name one by --compensator, or leave them out"
+        )
+    return sliders

@@ -51,11 +51,6 @@ def listen(parser: Parser) -> None:
 
 def _listen(options: argparse.Namespace) -> None:
     sliders = read_sliders(options)
-    if (sliders or options.loudness) and not options.compensator:
-        raise ValueError(
-            "--noise-reduction, --amplification and --loudness have no effect without "
-            "--compensator; add it, or leave them out"
-        )
     use_one_thread()
     check_extras("eval")
     from hlsim.audio import scan_audio
@@ -63,7 +58,7 @@ def _listen(options: argparse.Namespace) -> None:
     from hlsim.report.page import Page
 
     check_output_file(options.out, options.files)
-    ears = parse_ears(options)
+    ears = parse_ears(options, options.audiogram or [])
     simulator = cache(partial(build_simulator, options))
     aid = cache(partial(build_single_microphone_aid, options))
 

@@ -4,12 +4,7 @@ import argparse
 import math
 from typing import Any
 
-from hlsim.cli.inputs import (
-    build_single_microphone_aid,
-    parse_ear,
-    read_sliders,
-    warn_of_other_ears,
-)
+from hlsim.cli.inputs import build_single_microphone_aid, parse_ear, read_sliders
 from hlsim.cli.options import AIDED_EARS, Parser, full_scale, positive_number
 
 
@@ -55,13 +50,6 @@ def _read_device(text: str) -> int | str:
 
 def _live(options: argparse.Namespace) -> None:
     sliders = read_sliders(options)
-    if options.simulate and (sliders or options.loudness):
-        raise ValueError(
-            "--noise-reduction, --amplification and --loudness have no effect with --simulate; "
-            "leave them out"
-        )
-    if options.simulate and options.limit_to_ear:
-        raise ValueError("--limit-to-ear has no effect with --simulate; leave it out")
     ears: Any = parse_ear(options)
     import torch
 
@@ -76,7 +64,6 @@ def _live(options: argparse.Namespace) -> None:
         stream = SimulatedStream(load_pretrained("neuro-msbg", full_scale_spl=scale), ears)
         block, latency = 12 * stream.block, stream.latency
     else:
-        warn_of_other_ears({options.compensator: options.compensator}, ears)
         aid = build_single_microphone_aid(options, NEURO_RATE)
         stream = aid.stream(ears, **sliders)
         block = latency = aid.latency

@@ -37,6 +37,8 @@ _EAR = re.compile(r"NH|[NS]\d|-?[\d.]+([,:]-?[\d.]+)+", re.IGNORECASE)
 class _StoreOnce(argparse.Action):
     """Action that stores the value of an option, and rejects the option if it is repeated.
 
+    Lists of values, of which ``Parser.series`` has one per word, are joined to one list.
+
     argparse would store the last value, so that, for example, the first of two folders of speech
     would be ignored.
     """
@@ -54,20 +56,9 @@ class _StoreOnce(argparse.Action):
             fix = "write all values after one of them" if self.nargs == "+" else "leave one out"
             raise argparse.ArgumentError(self, f"appears twice; {fix}")
         self.namespace = namespace
+        if isinstance(values, list) and isinstance(values[0], list):
+            values = [*chain.from_iterable(values)]
         setattr(namespace, self.dest, values)
-
-
-class _StoreSeries(_StoreOnce):
-    """Action that stores one list of values from lists of values."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        super().__call__(parser, namespace, [*chain.from_iterable(values)], option_string)
 
 
 class Parser(argparse.ArgumentParser):
@@ -151,9 +142,7 @@ class Parser(argparse.ArgumentParser):
             settings = {"action": _StoreOnce, "default": default, **settings}
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
-    def series(
-        self, name: str, kind: Callable[[str], Any], text: str, default: Any = None, **settings: Any
-    ) -> None:
+    def series(self, name: str, kind: Callable[[str], Any], text: str, default: Any) -> None:
         """Declare an option that takes several values, separated by spaces or commas.
 
         Args:
@@ -161,14 +150,12 @@ class Parser(argparse.ArgumentParser):
             kind: Function that converts the text of one value.
             text: Description for the help, which adds the default.
             default: Values if the option is missing.
-            settings: Further arguments of ``argparse.ArgumentParser.add_argument``.
         """
 
         def read_values(text: str) -> list[Any]:
             return [kind(value) for value in text.split(",")]
 
-        action = {"nargs": "+", "action": _StoreSeries}
-        self.option(name, read_values, text, default, **action, **settings)
+        self.option(name, read_values, text, default, nargs="+")
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
         """Declare an option without a value, which is True if a user passes it, else False.

@@ -34,7 +34,7 @@ def simulate(parser: Parser) -> None:
     """Declare the options of the command ``simulate``."""
     _declare_files(
         parser,
-        _simulate,
+        build_simulator,
         "speech.wav perceived.wav --audiogram N3 --spl 65",
         "scenes perceived --audiogram N2 --audiogram N4 --simulator neuro-msbg",
         ears=SIMULATED_EARS,
@@ -46,7 +46,7 @@ def compensate(parser: Parser) -> None:
     """Declare the options of the command ``compensate``."""
     _declare_files(
         parser,
-        _compensate,
+        build_compensator,
         "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
         "scenes aided --listener listeners.json:L0001 --compensator nalr --no-clipping",
         ears=AIDED_EARS,
@@ -64,17 +64,21 @@ def compensate(parser: Parser) -> None:
 
 
 def _declare_files(
-    parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str, ears: str
+    parser: Parser,
+    build_model: Callable[[argparse.Namespace, int], Any],
+    *examples: str,
+    ears: str,
 ) -> None:
     """Declare the options that both commands have.
 
     Args:
         parser: Parser of the command.
-        run: Function that is called with the parsed options.
+        build_model: Function from the options and a sample rate in Hz to a simulator or
+            compensator.
         examples: Options of each example in the help.
         ears: Names of the standard ears that the command accepts, for the help text.
     """
-    parser.set_command(run, *examples)
+    parser.set_command(partial(_process, build_model=build_model), *examples)
     text = "audio file of 16 to 48 kHz (wav, flac, ogg, mp3, ...), or a folder of such files"
     parser.option("input", input_path, text)
     text = "wav file (32-bit float) to write, or a folder for such files if the input is a folder"
@@ -86,14 +90,6 @@ def _declare_files(
         "them; the printed line says by how many dB"
     )
     parser.flag("--no-clipping", text)
-
-
-def _simulate(options: argparse.Namespace) -> None:
-    _process(options, build_simulator)
-
-
-def _compensate(options: argparse.Namespace) -> None:
-    _process(options, build_compensator)
 
 
 def _process(
@@ -114,7 +110,7 @@ def _process(
     use_one_thread()
     from hlsim.calibration import NEURO_RATE
 
-    ears = parse_ears(options)
+    ears = parse_ears(options, options.audiogram or [])
     sliders = read_sliders(options)
     tasks = _plan_outputs(options.input, options.output, [*ears])
     build = cache(partial(build_model, options))
@@ -221,9 +217,9 @@ def _plan_outputs(source: Path, target: Path, names: Sequence[str]) -> list[tupl
                 f"is inside {source} nor contains it"
             )
         files = {
-            path: target / path.relative_to(source) for path in find_audio(source, by_name=True)
+            path: (target / path.relative_to(source)).with_suffix(".wav")
+            for path in find_audio(source, by_name=True)
         }
-        files = {path: output.with_suffix(".wav") for path, output in files.items()}
     elif target.is_dir():
         raise ValueError(f"{target} is a folder; name the file to write, as {target / 'out.wav'}")
     else:

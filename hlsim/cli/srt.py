@@ -29,7 +29,8 @@ def srt(parser: Parser) -> None:
 
 
 def _srt(options: argparse.Namespace) -> None:
-    named_ears = parse_ears(options)
+    sliders: dict[str, Any] = {**read_sliders(options)}
+    named_ears = parse_ears(options, options.audiogram or [])
     from hlsim.audiogram import Audiogram
     from hlsim.calibration import NEURO_RATE
     from hlsim.evaluation.digits import reception_threshold
@@ -40,12 +41,7 @@ def _srt(options: argparse.Namespace) -> None:
             ears[name] = ear
         else:
             ears.update(ear.ears().items())
-    aid = None
-    if options.loudness and not options.compensator:
-        raise ValueError("--loudness has no effect without --compensator; add it, or leave it out")
-    if options.compensator:
-        aid = build_single_microphone_aid(options, NEURO_RATE)
-    sliders: dict[str, Any] = {**read_sliders(options)}
+    aid = build_single_microphone_aid(options, NEURO_RATE) if options.compensator else None
     with ProgressLine("tests") as progress:
         result = reception_threshold(
             [*ears.values()],

@@ -43,4 +43,4 @@ def test_options_of_an_aid_need_an_aid(
 ) -> None:
     call = ["listen", files[0], "--audiogram", "N2", "--out", str(tmp_path / "page.html")]
     assert main([*call, "--noise-reduction", "1"]) == 2
-    assert "without --compensator" in capsys.readouterr().err
+    assert "without an aid; name one by --compensator" in capsys.readouterr().err

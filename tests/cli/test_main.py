@@ -139,8 +139,8 @@ compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500 | such as 500:
 compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500:900 | got 900 at 500 Hz
 compensate {speech} {out} --audiogram N3 --compensator nalr --loudness -5 | leave out loudness
 compensate {speech} {out} --audiogram N3 --loudness 5 | expected a number from -40 to 0
-listen {speech} --audiogram N3 --loudness -5 --out {out} | no effect without --compensator
-srt --audiogram N3 --loudness -5 | no effect without --compensator
+listen {speech} --audiogram N3 --loudness -5 --out {out} | no effect without an aid
+srt --audiogram N3 --loudness -5 | no effect without an aid
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from hlsim.cli.inputs import build_compensator, parse_ear, use_one_thread, warn_of_other_ears
+from hlsim.cli.inputs import build_compensator, parse_ear, use_one_thread
 from hlsim.cli.options import SIMULATED_EARS, Parser, count, sound_level
 
 
@@ -38,7 +38,6 @@ def export_gains(parser: Parser) -> None:
 def _export_gains(options: argparse.Namespace) -> None:
     use_one_thread()
     ear = parse_ear(options)
-    warn_of_other_ears({options.compensator: options.compensator}, ear)
     from hlsim.calibration import NEURO_RATE
     from hlsim.evaluation.fitting.gain_tables import export_gains as write_gains
     from hlsim.files import write_atomically
