@@ -143,6 +143,20 @@ def write_atomically(path: str | Path, data: str | bytes) -> None:
         temporary.write_bytes(contents)
 
 
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Return the text of a CSV file.
+
+    Args:
+        rows: Values of each row, the names of the columns first.
+
+    >>> csv_text([["ear", "level"], ["N3", 40]])
+    'ear,level\\nN3,40\\n'
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
 def path_below(root: str | Path, name: str) -> Path:
     """Return the absolute path of a file that a manifest names, without ``..``.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import NEURO_RATE, level_spl, set_level
+from hlsim.calibration import NEURO_RATE, POWER_FLOOR, level_spl, set_level
 from hlsim.data.mixing import mix
 
 HIGHEST_LEVEL = 115.0
@@ -20,9 +20,6 @@ HIGHEST_LEVEL = 115.0
 
 _EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
 """Frequencies in Hz for which the random equaliser has gains."""
-
-_POWER_FLOOR = 1e-20
-"""Power in Pa^2 that keeps logarithms and divisors away from 0."""
 
 
 def draw_uniform(
@@ -114,7 +111,7 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     power = functional.avg_pool1d(squared, width, 1, width // 2, count_include_pad=False).squeeze(1)
     mean = power.mean(-1, keepdim=True)
     exponent = ((1.0 / ratio - 1.0) / 2.0).unsqueeze(-1)
-    return waveform * ((power + 1e-3 * mean + _POWER_FLOOR) / (mean + _POWER_FLOOR)) ** exponent
+    return waveform * ((power + 1e-3 * mean + POWER_FLOOR) / (mean + POWER_FLOOR)) ** exponent
 
 
 def equalise_share(signals: Tensor, share: float, generator: torch.Generator) -> Tensor:

@@ -86,9 +86,8 @@ class Clips:
         seconds: float,
         repeat: bool = False,
     ) -> None:
-        pairs = _find_pairs(source)
-        self.files = [file for _, file in pairs]
-        self._clean_files = [clean for clean, _ in pairs]
+        self._pairs = _find_pairs(source)
+        self.files = [file for _, file in self._pairs]
         if not self.files:
             raise ValueError("expected files of speech or noise, got an empty list; add some")
         self.sample_rate = sample_rate
@@ -195,7 +194,7 @@ class Clips:
             ValueError: A file cannot be read, the files of a pair do not fit together, or the first
                 channel or the noise is silent.
         """
-        file, clean_file = self.files[index], self._clean_files[index]
+        clean_file, file = self._pairs[index]
         waveform, rate = read_audio(clean_file or file)
         if clean_file is not None:
             waveform = _read_noise(file, waveform, rate)

@@ -327,9 +327,7 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
         ValueError: A file does not match the pattern, two folders are for the same split, two files
             have the same place in a pair, or, in a layout with pairs, a file lacks its counterpart.
     """
-    clean: dict[str, Utterance] = {}
-    noisy: dict[str, str] = {}
-    file_of: dict[tuple[str, str], str] = {}  # by condition and key
+    parts: dict[str, dict[str, Utterance]] = {"clean": {}, "noisy": {}}  # by condition and key
     folder_of: dict[str, str] = {}  # by split
     for file in files:
         match = re.fullmatch(pattern, file, re.IGNORECASE)
@@ -349,22 +347,21 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
                 f"the folders {folder_of[split]} and {folder} are both for the split {split}; "
                 "remove one of them, or rename it, for example to test"
             )
-        if condition not in ("clean", "noisy"):
+        if condition not in parts:
             continue
-        if file_of.setdefault((condition, key), file) != file:
+        row = Utterance(file, "", groups.get("speaker", ""), split)
+        first = parts[condition].setdefault(key, row)
+        if first is not row:
             raise ValueError(
-                f"{file_of[condition, key]} and {file} belong to one pair, because they differ in "
-                "their extension only; rename or remove one of them"
+                f"{first.path} and {file} belong to one pair, because they differ in their "
+                "extension only; rename or remove one of them"
             )
-        if condition == "clean":
-            clean[key] = Utterance(file, "", groups.get("speaker", ""), split)
-        else:
-            noisy[key] = file
-    unpaired = sorted(set(clean) ^ set(noisy))
+    clean, noisy = parts["clean"], {key: row.path for key, row in parts["noisy"].items()}
+    unpaired = sorted(clean.keys() ^ noisy.keys())
     if "(?P<condition>" in pattern and unpaired:
-        first = noisy.get(unpaired[0]) or clean[unpaired[0]].path
+        path = noisy.get(unpaired[0]) or clean[unpaired[0]].path
         raise ValueError(
             f"{len(unpaired)} files of clean or noisy speech lack a counterpart of the same "
-            f"name, such as {first}"
+            f"name, such as {path}"
         )
     return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]

@@ -1,14 +1,19 @@
 """Manifests: CSV files that list the utterances of a corpus, with their speakers and splits."""
 
-import csv
-import io
 import os
 import re
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from hlsim.files import convert_at, path_below, read_table, warn_of_unused, write_atomically
+from hlsim.files import (
+    convert_at,
+    csv_text,
+    path_below,
+    read_table,
+    warn_of_unused,
+    write_atomically,
+)
 
 SPLITS = ("train", "valid", "test")
 """Names of the splits: parts of a corpus for training, validation and test."""
@@ -104,11 +109,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
                 f"test in the column 'split', got {values}; correct the row"
             )
         for column in ("path", "noisy"):
-            if not values.get(column):
-                continue
-            texts = [values[column]]
-            if column == "noisy" and values.get("reference"):
-                texts = values[column].split(FILE_SEPARATOR)
+            texts = values[column].split(FILE_SEPARATOR) if values.get(column) else []
             files = [convert_at(place, path_below, folder, text.strip()) for text in texts]
             names = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
             values[column] = FILE_SEPARATOR.join(names)
@@ -149,11 +150,8 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     columns = COLUMNS if any(row.reference for row in utterances) else COLUMNS[:-1]
     if target.is_file() and not target.read_bytes().startswith(",".join(COLUMNS[:-1]).encode()):
         raise ValueError(f"{path}: would replace a file that is no manifest; choose another name")
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(astuple(utterance)[: len(columns)] for utterance in utterances)
-    write_atomically(path, text.getvalue())
+    rows = [astuple(utterance)[: len(columns)] for utterance in utterances]
+    write_atomically(path, csv_text([columns, *rows]))
 
 
 def check_utterances(utterances: Sequence[Utterance]) -> None:

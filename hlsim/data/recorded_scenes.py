@@ -91,16 +91,14 @@ class SceneFiles(NamedTuple):
             ValueError: A file cannot be read, or the files differ in sample rate or by more than
                 0.1 s, or have numbers of channels that do not fit.
         """
-        files = [read_audio(path) for path in (self.clean, *self.microphones)]
-        waveforms, rates = zip(*files, strict=True)
-        time = min(waveform.shape[-1] for waveform in waveforms)
-        longest = max(waveform.shape[-1] for waveform in waveforms)
-        if len({*rates}) > 1 or longest - time > _LARGEST_DIFFERENCE * rates[0]:
+        paths = (self.clean, *self.microphones)
+        waveforms, rates = zip(*map(read_audio, paths), strict=True)
+        lengths = [waveform.shape[-1] for waveform in waveforms]
+        time = min(lengths)
+        if len({*rates}) > 1 or max(lengths) - time > _LARGEST_DIFFERENCE * rates[0]:
             sizes = [
-                f"{path.name} with {rate} Hz and {waveform.shape[-1]} samples"
-                for path, rate, waveform in zip(
-                    (self.clean, *self.microphones), rates, waveforms, strict=True
-                )
+                f"{path.name} with {rate} Hz and {length} samples"
+                for path, rate, length in zip(paths, rates, lengths, strict=True)
             ]
             raise ValueError(
                 f"{self.clean}: expected the sample rate of its noisy version and its length "

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,7 +42,7 @@ def _verify(options: argparse.Namespace) -> None:
     from hlsim.audio import read_audio
     from hlsim.calibration import full_scale_at
     from hlsim.evaluation.fitting.verification import verify as verify_aid
-    from hlsim.files import check_output_file, write_atomically
+    from hlsim.files import check_output_file, csv_text, write_atomically
 
     for file in filter(None, (options.csv, options.plot)):
         check_output_file(file, [options.input, options.output])
@@ -68,11 +66,8 @@ def _verify(options: argparse.Namespace) -> None:
     )
     _print_result(result)
     if options.csv:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, [*result.rows()[0]], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(result.rows())
-        write_atomically(options.csv, text.getvalue())
+        rows = result.rows()
+        write_atomically(options.csv, csv_text([rows[0], *(row.values() for row in rows)]))
     if options.plot:
         from hlsim.report.plots import verification_picture
 

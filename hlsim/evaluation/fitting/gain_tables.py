@@ -5,8 +5,6 @@ compressor ``dc``. CamillaDSP and Equalizer APO are linear: a file has the gains
 level.
 """
 
-import csv
-import io
 import math
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +17,7 @@ from compensators.aid import Aid, thirds_of_octave
 from compensators.filter_bank import RATE, speech_density
 from hlsim.audiogram import FREQUENCIES
 from hlsim.checks import check_number, suggest
+from hlsim.files import csv_text
 
 Array = NDArray[np.float64]
 
@@ -137,12 +136,10 @@ def _write_csv(gains: Array) -> str:
     Args:
         gains: Insertion gains in dB for speech at all ``LEVELS``, (levels, 8).
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["frequency_hz", *(f"gain_db_at_{level:g}" for level in LEVELS)])
+    rows = [["frequency_hz", *(f"gain_db_at_{level:g}" for level in LEVELS)]]
     for hertz, gains_of_levels in zip(FREQUENCIES, gains.T, strict=True):
-        writer.writerow([f"{hertz:g}", *(f"{gain:.2f}" for gain in gains_of_levels)])
-    return text.getvalue()
+        rows.append([f"{hertz:g}", *(f"{gain:.2f}" for gain in gains_of_levels)])
+    return csv_text(rows)
 
 
 def _write_equalizer_apo(gains: Array, level: float) -> str:
