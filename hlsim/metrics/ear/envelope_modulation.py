@@ -102,9 +102,7 @@ def _smoothing() -> NDArray[np.float64]:
     It is zero-padded and has nine successive taps per column. Shape: (STRIDE, WINDOW_STRIDES).
     """
     window = np.hanning(WINDOW_SAMPLES + 2)[1:-1]
-    padded = np.concatenate(
-        (np.zeros(WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES), window / window.sum())
-    )
+    padded = np.pad(window / window.sum(), (WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES, 0))
     return padded.reshape(WINDOW_STRIDES, STRIDE).T
 
 
@@ -289,10 +287,8 @@ def zero_phase_responses(
     >>> zero_phase_responses([np.array([0.25, 0.5, 0.25])], 4)
     array([[1. , 0.5, 0. ]])
     """
-    centred = np.zeros((len(filters), points))
-    for row, taps in zip(centred, filters, strict=True):
-        row[: len(taps)] = taps
-        row[:] = np.roll(row, -(len(taps) // 2))
+    padded = [np.pad(taps, (0, points - len(taps))) for taps in filters]
+    centred = [np.roll(row, -(len(taps) // 2)) for row, taps in zip(padded, filters, strict=True)]
     return np.fft.rfft(centred).real
 
 

@@ -229,9 +229,7 @@ def _windows() -> NDArray[np.float64]:
     zero-padded.
     """
     window = np.hanning(SEGMENT)
-    falling = np.concatenate((window[HALF_SEGMENT:], np.zeros(HALF_SEGMENT)))
-    rising = np.concatenate((window[:HALF_SEGMENT], np.zeros(HALF_SEGMENT)))
-    return np.stack((falling, window, rising))
+    return np.stack((np.roll(window, HALF_SEGMENT), window, window)) * _inside()
 
 
 @constant
@@ -295,12 +293,8 @@ def _lag_weights() -> NDArray[np.float64]:
     A weight is 1 over the autocorrelation of the window. The rows are the kinds of segments; the
     columns are lags of 0 to 24, then -24 to -1 samples. Shape: (3, 49).
     """
-    lags = np.abs(_LAGS)
-    rows = []
-    for window in _windows():
-        autocorrelation = np.correlate(window, window, "full")[SEGMENT - 1 :]
-        rows.append(1.0 / autocorrelation[lags])
-    return np.stack(rows)
+    autocorrelations = np.stack([np.correlate(window, window, "full") for window in _windows()])
+    return 1.0 / autocorrelations[:, SEGMENT - 1 + np.abs(_LAGS)]
 
 
 def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor:
