@@ -230,7 +230,7 @@ def score_recordings(
     if better_ear:
         table = _better_ears(evaluation.table, utterances, scores)
         evaluation = replace(evaluation, table=table)
-        evaluation.check_scores()
+        evaluation.check_values(scores)
     planned = planned or [(scores[0], names[0], names[-1])]
     comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
     evaluation = replace(evaluation, notes=notes, comparisons=comparisons)

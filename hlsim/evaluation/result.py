@@ -116,14 +116,10 @@ class Evaluation:
         evaluation = cls(items, conditions, measures, table, settings=settings)
         for column in required:
             evaluation.check_values([column], f"has a value of {column}")
-        evaluation.check_scores()
+        evaluation.check_values(evaluation.scores)
         return evaluation
 
-    def check_scores(self) -> None:
-        """Raise ValueError if the table has no score at all."""
-        self.check_values(self.scores, "could be scored")
-
-    def check_values(self, columns: Sequence[str], predicate: str) -> None:
+    def check_values(self, columns: Sequence[str], predicate: str = "could be scored") -> None:
         """Raise ValueError if the table has no value in any of some columns.
 
         Args:
