@@ -228,7 +228,7 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
     """
 
     @wraps(function)
-    def compute(*arguments: P.args, **options: P.kwargs) -> Result:
+    def get_or_compute(*arguments: P.args, **options: P.kwargs) -> Result:
         # a program that is traced cannot use tensors from outside
         if torch.compiler.is_compiling():
             return function(*arguments, **options)
@@ -246,7 +246,7 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
                 _RESULTS.popitem(last=False)
         return result
 
-    return compute
+    return get_or_compute
 
 
 def _count_bytes(value: Any) -> int:
