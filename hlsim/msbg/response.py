@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES, severity_index
 from hlsim.dsp.fir import filter_without_delay
@@ -85,7 +86,9 @@ def apply_bank_phase(
     torch.Size([1, 1600])
     """
     severity = severity_index(thresholds)
-    taps = _taps(rate, "difference" if normal else "phase", like=waveform)[severity]
+    filters = _taps(rate, "difference" if normal else "phase", like=waveform)
+    # Indexing by a tensor without dimensions, the severity of one ear, synchronises with a GPU.
+    taps = functional.embedding(severity, filters)
     filtered = filter_without_delay(waveform, taps)
     if not normal:
         return filtered
@@ -114,7 +117,8 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
     >>> simulate_normal_ear(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
     torch.Size([1, 1600])
     """
-    taps = _taps(rate, "normal ear", like=waveform)[severity_index(thresholds)]
+    filters = _taps(rate, "normal ear", like=waveform)
+    taps = functional.embedding(severity_index(thresholds), filters)
     return filter_without_delay(waveform, taps)
 
 
