@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.audiogram.published import SPEECH_SPECTRUM
+from hlsim.audiogram.scale import interpolate_over_log
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power
@@ -237,7 +238,7 @@ def speech_density(points: int) -> NDArray[np.float64]:
     third_octave = 10.0 * np.log10(2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0))
     thirds = np.array(list(SPEECH_SPECTRUM), dtype=float)
     density = np.array(list(SPEECH_SPECTRUM.values())) - 10.0 * np.log10(thirds) - third_octave
-    return 10.0 ** (np.interp(np.log(frequencies), np.log(thirds), density) / 10.0)
+    return 10.0 ** (interpolate_over_log(frequencies, thirds, density) / 10.0)
 
 
 @constant

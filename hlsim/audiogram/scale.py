@@ -1,12 +1,12 @@
 """Frequencies and ranges of thresholds, severities of hearing loss, and interpolation."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Numbers = Sequence[float] | NDArray[np.float64]
+Numbers = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 """Frequencies or levels in one dimension."""
 
 EarName = Literal["left", "right"]

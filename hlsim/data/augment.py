@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.scale import interpolate_over_log
 from hlsim.calibration import NEURO_RATE, POWER_FLOOR, level_spl, set_level
 from hlsim.data.mixing import mix
 
@@ -82,8 +83,8 @@ def equalise(
     """
     time = waveform.shape[-1]
     points = 2 * time
-    log_hz = np.log(np.fft.rfftfreq(points, 1.0 / sample_rate).clip(1.0))
-    gain_db = np.stack([np.interp(log_hz, np.log(frequencies), gains) for gains in gains_db])
+    hertz = np.fft.rfftfreq(points, 1.0 / sample_rate)
+    gain_db = np.stack([interpolate_over_log(hertz, frequencies, row.numpy()) for row in gains_db])
     gain = torch.from_numpy(10.0 ** (gain_db / 20.0)).to(waveform.dtype)
     return torch.fft.irfft(torch.fft.rfft(waveform, points) * gain, points)[..., :time]
 

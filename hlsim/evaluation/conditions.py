@@ -21,6 +21,7 @@ from compensators.nalr import NALR, NALRP
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.audiogram.prescription import PROFOUND_FROM
+from hlsim.audiogram.scale import interpolate_over_log
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL, gain_to_pascals, level_spl, set_level
 from hlsim.checks import check_choice
 from hlsim.data.bundled import EXAMPLE_FILE
@@ -271,7 +272,7 @@ def _equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
     Returns: Filtered signals. Shape: (..., time).
     """
     hertz = np.linspace(0.0, NEURO_RATE / 2.0, _EQUALISER_TAPS)
-    gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
+    gains = interpolate_over_log(hertz, band_centres(), gains_db)
     taps = scipy.signal.firwin2(_EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
     return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
 

@@ -74,7 +74,7 @@ class NeuroMSBG(EarNetwork, HubModel):
             the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         compute_prior: Compute the constants of MSBG's formulae, which takes up to half a second for
-            the first network. With False, they are undefined until a state dict is loaded.
+            the first network. With False, they are NaN until a state dict is loaded.
 
     Attributes:
         emulates_msbg: True, because the simulator emulates MSBG.

@@ -82,7 +82,7 @@ class BandGains(nn.Module):
     Args:
         stft: Transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
         rate: Sample rate in Hz of the signals that are transformed.
-        compute: Compute the constants. With False, they are undefined until a state dict is loaded.
+        compute: Compute the constants. With False, they are NaN until a state dict is loaded.
 
     Attributes:
         receptive_field: Number of input samples before and after an output sample that influence
@@ -115,8 +115,8 @@ class BandGains(nn.Module):
                 self.get_buffer(f"{name}_known").copy_(torch.from_numpy(values))
 
     def _add_buffer(self, name: str, shape: tuple[int, ...]) -> None:
-        """Register an uninitialised float32 buffer."""
-        self.register_buffer(name, torch.empty(shape, dtype=torch.float32))
+        """Register a float32 buffer of NaN, which no checkpoint accepts."""
+        self.register_buffer(name, torch.full(shape, torch.nan, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
         """Return constants with their learned correction.
@@ -243,7 +243,7 @@ class Prior(BandGains):
 
     Args:
         stft: Transform at 16 kHz whose window is about as short as MSBG's smearing frame, 5.8 ms.
-        compute: Compute the constants. With False, they are undefined until a state dict is loaded.
+        compute: Compute the constants. With False, they are NaN until a state dict is loaded.
 
     >>> stft = STFT(128, 128, 32)
     >>> factor = Prior(stft)(torch.ones(1, 50, 65), torch.full((1, 8), 40.0), torch.tensor([2]))

@@ -1,5 +1,7 @@
 """The prior agrees with MSBG, and the network on bands corrects it."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch.nn import functional
@@ -97,3 +99,10 @@ def test_gradients_through_bands_are_exact() -> None:
 
     assert torch.autograd.gradcheck(simulate, waveform, fast_mode=True, atol=1e-6)
     assert torch.autograd.gradgradcheck(simulate, waveform, fast_mode=True, atol=1e-6)
+
+
+def test_constants_that_are_not_computed_cannot_be_saved(tmp_path: Path) -> None:
+    network = NeuroMSBG(compute_prior=False)
+    assert network(torch.randn(1600), "N3").isnan().all()
+    with pytest.raises(ValueError, match="NaN"):
+        network.save_pretrained(tmp_path)

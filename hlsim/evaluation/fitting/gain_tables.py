@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from compensators.aid import Aid, thirds_of_octave
 from compensators.filter_bank import RATE, speech_density
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.scale import interpolate_over_log
 from hlsim.checks import check_number, suggest
 from hlsim.files import csv_text
 
@@ -127,7 +128,7 @@ def _equaliser_points(gains: Array) -> Array:
 
 def _interpolate(points: Array) -> Array:
     """Return the equaliser's gains in dB at 1, 2, ..., 8000 Hz. Shape: (8,) -> (8000,)."""
-    return np.interp(np.log(_HERTZ), np.log(FREQUENCIES), points)
+    return interpolate_over_log(_HERTZ, FREQUENCIES, points)
 
 
 def _write_csv(gains: Array) -> str:

@@ -16,6 +16,7 @@ from compensators.aid import Aid
 from compensators.filter_bank import SPEECH_SPECTRUM
 from hlsim.audiogram import FREQUENCIES, Audiogram, as_audiogram
 from hlsim.audiogram.prescription import FREE_FIELD_THRESHOLD_SPL
+from hlsim.audiogram.scale import interpolate_over_log
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
 from hlsim.checks import check_finite, check_rate, check_waveform
 from hlsim.evaluation.measures import CORRELATION_FLOOR, correlate
@@ -165,7 +166,7 @@ def verify(
     input_levels, output_levels = (
         np.percentile(_level(power), PERCENTILES, axis=0) for power in powers
     )
-    losses = _interpolate(audiogram.levels, audiogram.frequencies)
+    losses = interpolate_over_log(SII_BANDS, audiogram.frequencies, audiogram.levels)
     normal = np.array([FREE_FIELD_THRESHOLD_SPL[band] for band in SII_BANDS])
     uncomfortable = np.array(audiogram.uncomfortable_levels(hertz.tolist()))
     unaided_sii, aided_sii = (
@@ -270,7 +271,10 @@ def prescribed_gains(aid: Aid, audiogram: Audiogram, band_levels: Array) -> Arra
     first, last = speech_levels.min(), speech_levels.max()
     steps = np.linspace(first, last, 1 + int(np.ceil((last - first) / TARGET_STEP)))
     gains = np.stack(
-        [_interpolate(aid.gains(audiogram, level).tolist(), FREQUENCIES) for level in steps]
+        [
+            interpolate_over_log(SII_BANDS, FREQUENCIES, aid.gains(audiogram, level).tolist())
+            for level in steps
+        ]
     )
     bands = range(len(SII_BANDS))
     return np.stack(
@@ -321,11 +325,3 @@ def _bandwidth_db() -> Array:
 def _level(power: Array) -> Array:
     """Convert powers in Pa^2 to levels in dB SPL, element by element."""
     return PASCAL_SPL + 10.0 * np.log10(np.maximum(power, POWER_FLOOR))
-
-
-def _interpolate(values: Any, frequencies: Any) -> Array:
-    """Interpolate values at frequencies in Hz to the third octaves ``SII_BANDS``, (18,).
-
-    The interpolation is linear over log frequency, and constant below and above the frequencies.
-    """
-    return np.interp(np.log(SII_BANDS), np.log(frequencies), np.asarray(values, dtype=float))
