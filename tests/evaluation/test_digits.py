@@ -26,7 +26,7 @@ from hlsim.evaluation.digits.material import (
 )
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
-from hlsim.evaluation.digits.recogniser import load_listener
+from hlsim.evaluation.digits.recogniser import DigitListenerConfig, load_listener
 from hlsim.simulators import Attenuation, load_simulator
 from tests.helpers import load_figure
 
@@ -111,6 +111,12 @@ def test_a_threshold_that_is_never_reached_is_infinite() -> None:
     assert estimate == (np.inf, np.inf, np.inf)
     assert np.isnan(subtract(estimate, estimate).value)
     assert subtract(estimate, Estimate(1.0, 0.0, 2.0)).value == np.inf
+
+
+@pytest.mark.parametrize("settings", [{"bands": 7}, {"channels": 257}, {"bands": 8.5}])
+def test_sizes_of_a_listener_are_checked(settings: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="whole number"):
+        DigitListenerConfig(**settings)
 
 
 def test_shipped_listener_is_small_and_hears_what_was_measured() -> None:

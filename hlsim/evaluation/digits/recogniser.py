@@ -10,13 +10,12 @@ from torch import Tensor, nn
 
 from hlsim.calibration import NEURO_RATE
 from hlsim.checkpoint import DIGIT_LISTENER, HubModel, read_checkpoint
-from hlsim.checks import check_number
 from hlsim.data.bundled import SLOT_SAMPLES
 from hlsim.dsp.erb import erb_frequency, erb_number
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
 from hlsim.evaluation.digits.material import DIGITS_PER_TRIPLET, LEAD_SAMPLES
-from hlsim.neuro.config import ModelConfig
+from hlsim.neuro.config import ModelConfig, number
 
 _LOWEST_HZ, _HIGHEST_HZ = 80.0, 7800.0
 """Lower edge of the lowest band and upper edge of the highest one in Hz."""
@@ -46,12 +45,8 @@ class DigitListenerConfig(ModelConfig):
     8
     """
 
-    bands: int = 40
-    channels: int = 32
-
-    def __post_init__(self) -> None:
-        check_number("bands", self.bands, 8, 80, whole=True)
-        check_number("channels", self.channels, 1, 256, whole=True)
+    bands: int = number(40, 8, 80)
+    channels: int = number(32, 1, 256)
 
 
 class DigitListener(nn.Module, HubModel):
