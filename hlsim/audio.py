@@ -249,7 +249,8 @@ def write_parts(
 
     Raises:
         ValueError: The extension is not .wav, the sample rate is not supported, the signal is too
-            long for a WAV file (4 GB), samples are NaN or infinite, or the file cannot be written.
+            long for a WAV file (4 GB), samples are NaN or infinite, the parts have another number
+            of channels or samples, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -285,7 +286,16 @@ def write_parts(
                     "infinite; correct the signal before it is written"
                 )
             written += values.shape[-1]
+            if len(values) != channels:
+                raise ValueError(
+                    f"{path}: expected parts with {channels} channels, got {len(values)}"
+                )
             file.write(values.mT.contiguous().numpy().astype("<f4", copy=False).tobytes())
+        if written != samples:
+            raise ValueError(
+                f"{path}: nothing was written, because the parts have {written} samples together, "
+                f"expected {samples}"
+            )
 
 
 def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:

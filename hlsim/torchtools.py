@@ -250,11 +250,15 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def _count_bytes(value: Any) -> int:
-    """Return the bytes of a tensor or an array, or of all in a list, a tuple or an object."""
+    """Return the bytes of a tensor or an array, or of all in a list, tuple, dict or object."""
     if isinstance(value, Tensor | np.ndarray):
         return value.nbytes
-    if not isinstance(value, list | tuple):
-        value = vars(value).values() if hasattr(value, "__dict__") else ()
+    if hasattr(value, "__dict__"):
+        value = vars(value)
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        return 0
     return sum(map(_count_bytes, value))
 
 

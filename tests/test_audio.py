@@ -253,6 +253,18 @@ def test_a_tensor_with_the_negative_bit_is_written(tmp_path: Path) -> None:
     assert torch.equal(read_audio(tmp_path / "a.wav")[0][0], signal)
 
 
+@pytest.mark.parametrize(
+    ("channels", "samples", "words"),
+    [(2, 20, "parts with 2 channels, got 1"), (1, 30, "20 samples together, expected 30")],
+)
+def test_parts_of_another_size_than_stated_leave_no_file(
+    tmp_path: Path, channels: int, samples: int, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        write_parts(tmp_path / "a.wav", torch.zeros(2, 1, 10), channels, samples, 16000)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_first_invalid_sample_is_placed(tmp_path: Path) -> None:
     parts = torch.zeros(3, 2, 16000)
     parts[1, 1, 4000] = torch.nan

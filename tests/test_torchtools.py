@@ -69,6 +69,11 @@ def test_complex_constants_and_those_like_a_tensor() -> None:
         assert make(3, like=torch.ones(1, dtype=expected)) is tensor
 
 
+def test_arrays_in_dicts_and_objects_count_in_the_store() -> None:
+    values = {"taps": np.zeros(3), "layer": torch.nn.Linear(2, 1, bias=False)}
+    assert torchtools._count_bytes(values) == 3 * 8 + 2 * 4
+
+
 def test_memory_does_not_grow_with_the_number_of_lengths(small: SmallStore) -> None:
     model = MSBG("N3")
     signals = [0.01 * torch.ones(1, 3000 + 2000 * n) for n in range(8)]

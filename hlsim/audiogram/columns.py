@@ -182,7 +182,7 @@ def _read_hz(number: str, kilo: str) -> float:
         kilo: ``"k"`` if the number is in kHz, otherwise an empty text.
     """
     if kilo:
-        return 1000.0 * float(number.replace(" ", "").replace(",", "."))
+        return 1000.0 * float(re.sub("[ ']", "", number).replace(",", "."))
     if re.fullmatch(r"\d{1,3}([ ,.']\d{3})+", number):
         return float(re.sub(r"\D", "", number))
     return float(number.replace(",", "."))

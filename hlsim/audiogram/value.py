@@ -77,9 +77,10 @@ class Audiogram:
             frequency and a level. See ``uncomfortable_levels``.
 
     Raises:
-        ValueError: The numbers of levels and frequencies differ, no level was measured, one is out
-            of range, an uncomfortable level is below the threshold, or the frequencies do not
-            ascend, or all lie below 250 or above 8000 Hz.
+        ValueError: Levels, frequencies or ``ucl`` are no numbers, the numbers of levels and
+            frequencies differ, no level was measured, one is out of range, an uncomfortable level
+            below 115 dB HL is below the threshold, ``ucl`` has a frequency twice, or the
+            frequencies do not ascend, or all lie below 250 or above 8000 Hz.
 
     Example:
         >>> from hlsim import Audiogram

@@ -82,7 +82,8 @@ def find_arrivals(room: Room, azimuth: float) -> Arrivals:
         azimuth: Azimuth of the source in degrees, 0 in front, 90 on the left.
 
     Returns:
-        The direct sound and all echoes within the reverberation time, in no order.
+        The direct sound and the echoes within the reverberation time, in no order. The weakest
+        echoes, of high orders, are missing; they have less than a millionth of the energy.
 
     Raises:
         MissingExtraError: pyroomacoustics is not installed.

@@ -267,6 +267,9 @@ def sound_at_microphones(
 def _filter_sounds(signals: Tensor, responses: NDArray[np.float64], sample_rate: int) -> Tensor:
     """Filter sounds by impulse responses of their directions, and add them up.
 
+    The responses begin 2 ms before time 0. The result has no such lead and no gradients, and is as
+    long as the signals.
+
     Shape: (..., directions, time), (directions, microphones, ears, length) -> (..., microphones,
         ears, time).
     """

@@ -517,8 +517,14 @@ def _reference_file(out: Path, pair: _Pair) -> Path:
 def _read_microphones(pair: _Pair, rate: int, numbers: Sequence[int]) -> Tensor:
     """Return the signals of the microphones of a scene. Shape: (microphones, 2, time).
 
+    Args:
+        pair: Files of the scene.
+        rate: Sample rate in Hz that the files must have.
+        numbers: Numbers of the microphones, of which 1 is the front one.
+
     Raises:
-        ValueError: A file is broken, or has another rate or length than the first one.
+        ValueError: A file is broken, has another rate or not two channels, or the lengths of the
+            microphones differ.
     """
     signals = [_read_channels(pair.microphone(number), rate, [2]) for number in numbers]
     lengths = {signal.shape[-1] for signal in signals}

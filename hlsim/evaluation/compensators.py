@@ -287,7 +287,8 @@ def _read_scene_clips(manifest: str | Path, root: str | Path | None, seconds: fl
     """Return clips of the scenes in the split test of a manifest, or else in its split valid.
 
     Raises:
-        ValueError: The manifest is not valid, or has no scenes in these splits.
+        ValueError: The manifest is not valid or has no scenes in these splits, a scene has no noisy
+            recording, its files are not valid, or scenes differ in their number of ears.
     """
     folder = Path(manifest).parent if root is None else Path(root)
     rows = read_manifest(manifest, root)

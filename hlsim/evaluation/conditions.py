@@ -360,7 +360,8 @@ class Enhanced(nn.Module):
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: The enhancer fails, or returns a signal of another shape, NaN or infinity.
+            ValueError: The enhancer fails, or its output is no floating-point tensor of this shape,
+                or is NaN or infinite.
         """
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
         return self.aid(enhanced, ear)

@@ -61,7 +61,8 @@ def draw_simulator_items(
     Args:
         speech: Folder of recordings of clean speech.
         noise: Folder of recordings of noise, or None.
-        audiograms: CSV file of ears, or ``"standard"`` for Bisgaard's, see ``read_audiograms``.
+        audiograms: CSV file of ears with thresholds up to 100 dB HL, or ``"standard"`` for
+            Bisgaard's except N7, see ``read_audiograms``.
         items: Number of items, 1 or more.
         seconds: Length of each item in seconds, 0.02 or more.
         seed: Seed of all random draws.
@@ -189,7 +190,7 @@ def draw_scene_items(
     >>> item.clean.shape, item.signal.shape
     (torch.Size([16000]), torch.Size([1, 1, 16000]))
     """
-    check_number("items", items, 1)
+    check_number("items", items, 1, whole=True)
     check_number("seconds", seconds, 0.02)
     generator = torch.Generator().manual_seed(seed)
     drawn = []
@@ -336,7 +337,7 @@ def _draw_clips(
     Raises:
         ValueError: A number is out of range, or a folder has no usable audio.
     """
-    check_number("items", items, 1)
+    check_number("items", items, 1, whole=True)
     check_number("seconds", seconds, 0.02)
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
     noises = None
@@ -357,13 +358,20 @@ def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float,
     Args:
         ear: Number of the ear, or of the kind of ear.
         turn: Number of earlier items with this ear.
-        levels: Levels in dB SPL.
+        levels: Levels in dB SPL, -20 to 140.
+
+    Raises:
+        ValueError: There is no level, or one is out of range.
 
     Returns:
         The level in dB SPL; the SNR in dB; and an offset in the cycle of the SNRs, which is already
         part of the SNR. With an even number of levels, the offset rises by 1 per cycle of the
         levels, because some combinations would otherwise never occur. With an odd number, it is 0.
     """
+    if not levels:
+        raise ValueError("expected one or more levels, got none; write levels=[65.0]")
+    for level in levels:
+        check_number("a level", level, -20.0, 140.0)
     shift = 0 if len(levels) % 2 else turn // len(levels)
     number = ear + turn
     return levels[number % len(levels)], _SNRS_DB[(number + shift) % len(_SNRS_DB)], shift

@@ -88,7 +88,9 @@ def evaluate_simulators(
 
     Raises:
         ValueError: Data or settings are not valid, or no item has an SNR.
-        MissingExtraError: pandas or pystoi is not installed. Without pesq, PESQ is left out.
+        MissingExtraError: pandas, joblib or pystoi is not installed, or distributed for ``dask``.
+            Without pesq, PESQ is left out.
+        OSError: The store of scores cannot be read.
 
     >>> from hlsim import MSBG
     >>> from hlsim.data.bundled import EXAMPLE_FILE

@@ -54,7 +54,8 @@ class FrozenSimulator:
     that the loss that owns it does not register these parameters.
 
     Args:
-        simulator: Name, folder or module, see ``load_simulator``.
+        simulator: Name, folder or module, see ``load_simulator``. A module is changed, not copied,
+            and so is ``normal``.
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of RMS 1.0.
         normal: Normal ear that belongs to the simulator. By default, the filter of MSBG's normal
@@ -63,11 +64,11 @@ class FrozenSimulator:
             ``"normal-hearing"``, what the normal ear perceives of it. By default, each criterion
             has its own.
         checkpoint: Whether activations of the simulator are computed again in the backward pass
-            instead of stored.
+            instead of stored. It has no effect on exact models.
 
     Raises:
-        ValueError: There is no such simulator, or it was built for another rate or level, or delays
-            its output.
+        ValueError: There is no such simulator, it is not valid, was built for another rate or
+            level, or delays its output, or the rate or the level is out of range.
 
     >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, choice=None)
     >>> frozen.simulator.training

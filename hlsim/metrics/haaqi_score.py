@@ -71,8 +71,8 @@ def haaqi(
 
     The score compares the output with clean music that NAL-R has amplified for the same impaired
     ear, and is differentiable in ``output``. The delay of an output is removed, to whole samples at
-    24 kHz. Stereo signals
-    have one score per channel: take the better one by ``.amax(-1)`` or the mean by ``.mean(-1)``.
+    24 kHz. Stereo signals have one score per channel: take the better one by ``.amax(-1)`` or the
+    mean by ``.mean(-1)``.
 
     Args:
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).

@@ -341,10 +341,11 @@ class MBSTOI(_MeanScore):
 
     MBSTOI assumes normal hearing: for a listener with a hearing loss, apply a simulator to the
     outputs first. The arguments and attributes are those of ``HASPI`` without ``audiogram``. The
-    level is that of both ears together.
+    attribute ``level`` is that of both ears together.
 
     Raises:
-        ValueError: A value is out of range, or an audiogram is passed.
+        ValueError: A value is out of range, an audiogram is passed, or ``dist_sync_on_step`` is
+            true.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000].expand(2, -1), MBSTOI()

@@ -50,8 +50,9 @@ _MAX_COMMON_PERIOD = 10000
 def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
     """Choose the length of the Fourier transforms with which MSBG filters a signal.
 
-    If this costs little, the length also spans a whole number of samples at the sample rate of the
-    output. Then a spectrum can be converted to that rate without returning to the time domain.
+    The length spans whole envelope steps. Unless ``common_period`` is 0, it also spans a whole
+    number of samples at the sample rate of the output. Then a spectrum can be converted to that
+    rate without returning to the time domain.
 
     Args:
         length: Number of samples of the signal at 44.1 kHz.

@@ -401,7 +401,8 @@ def _smearing_matrix(severity: str, stft: STFT, rate: float) -> NDArray[np.float
         rate: Sample rate in Hz.
 
     Returns:
-        Matrix for power spectra behind the middle ear, (frequencies, frequencies).
+        Matrix that multiplies a power spectrum behind the middle ear from the left, with a row for
+        each smeared frequency, (frequencies, frequencies).
     """
     spacing = rate / stft.fft
     count = FFT // 2

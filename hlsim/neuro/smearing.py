@@ -68,10 +68,12 @@ class _Power(torch.autograd.Function):
 def smear_and_amplify(
     spectrum: Planes, smeared_power: Tensor, gains: Tensor, matrices: Planes, step: int
 ) -> Planes:
-    """Smear spectra so that they have some powers, and multiply them by the factors of gains.
+    """Smear spectra so that they have given powers, and multiply them by the factors of gains.
 
-    The phase of a spectrum remains, apart from that of the factors; it turns by 90 degrees where
-    the smeared power is negative.
+    The powers are met up to 40 dB above that of the spectrum (``MAX_FACTOR``), and level off 30 dB
+    below it (``MIN_FACTOR``). Well above this floor, the phase of the spectrum remains, apart from
+    that of the factors. Near it, the phase turns smoothly: by 45 degrees where the smeared power is
+    0, and towards 90 degrees where it is negative.
 
     Args:
         spectrum: Spectrum of each frame in Pa, (items, frames, frequencies).

@@ -112,6 +112,7 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
         ("hl_250,hl_500\n,NA\n", ["line 2", "measured"]),
         ("hl_250,hl_8000dB\n10,20\n", ["line 2", "hl_8000dB"]),
         ("hl_500,0.5 kHz\n10,20\n", ["line 2", "hl_500", "0.5 kHz"]),
+        ("hl_500,1'000 kHz\n10,20\n", ["line 2", "1'000 kHz"]),
         ("0.5,1,2\n10,20,30\n", ["line 2", "0.5", "multiply kHz by 1000"]),
         ("250,500,1,2,4,8\n10,20,30,40,50,60\n", ["line 2", "'1'", "multiply kHz by 1000"]),
         ("hl_250,hl_1\n10,20\n", ["line 2", "hl_1"]),

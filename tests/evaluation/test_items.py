@@ -91,6 +91,22 @@ def test_every_kind_of_ear_of_simulators_has_every_level_and_ratio(
     assert len({ear for ear, _ in standard}) == 4 and len(standard) > 4
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"levels": []}, "one or more levels"),
+        ({"levels": [65.0, 500.0]}, "a level"),
+        ({"items": 1.5}, "items"),
+    ],
+)
+def test_numbers_of_simulator_items_are_checked(
+    speech_dir: Path, ears_file: Path, changes: dict[str, Any], words: str
+) -> None:
+    settings = {"items": 2, "seconds": 0.1, "seed": 0, **changes}
+    with pytest.raises(ValueError, match=words):
+        draw_simulator_items(speech_dir / "valid", None, ears_file, **settings)
+
+
 @pytest.mark.parametrize("judged", [True, False])
 def test_items_depend_on_the_seed_and_have_their_level_and_ratio(
     speech_dir: Path, ears_file: Path, judged: bool
