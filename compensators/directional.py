@@ -54,7 +54,7 @@ _DISTORTION_WEIGHT = 1e3
 """Weight of the power of the error of sound from the front, relative to that of diffuse noise."""
 
 _LOWEST_BLOCKED = 100.0
-"""Frequency in Hz at which the cardioids of ``front_blocking_taps`` are 3 dB softer."""
+"""Frequency in Hz at which the cardioids of ``beam_and_blocking_taps`` are 3 dB softer."""
 
 POWER_FLOOR = 1e-12
 """Power in Pa^2, about -26 dB SPL, that is added to powers by which others are divided."""

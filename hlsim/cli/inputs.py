@@ -265,6 +265,6 @@ def read_sliders(options: argparse.Namespace) -> dict[str, float]:
     if any(settings) and not has_aid:
         raise ValueError(
             "--noise-reduction, --amplification, --loudness and --limit-to-ear have no effect "
-            "without an aid; name one by --compensator, or leave them out"
+            "without an aid; name one by --compensator (without --simulate), or leave them out"
         )
     return sliders

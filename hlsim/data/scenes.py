@@ -12,7 +12,7 @@ from torch import Tensor
 from hlsim.calibration import NEURO_RATE, set_level
 from hlsim.checks import check_number, check_rate, check_waveform
 from hlsim.data.mixing import mix
-from hlsim.data.rooms import Room, draw_room, find_arrivals
+from hlsim.data.rooms import REVERBERATION_TIMES, Room, draw_room, find_arrivals
 from hlsim.dsp.sphere import evenly_spread_directions, head_responses, unit_vectors
 from hlsim.torchtools import compute_once
 
@@ -84,7 +84,8 @@ def make_scene(
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         sample_rate: Sample rate of all signals in Hz, 16000 to 48000.
         seed: Seed of the parts of the recording for diffuse noise, 0 or more.
-        room: Room with echoes of the talker and the maskers; none by default, as in the open.
+        room: Room with echoes of the talker and the maskers, but not of diffuse noise; none by
+            default, as in the open. Echoes make sounds louder, by about 3 dB at 0.3 s.
 
     Returns:
         The scene. Direct sound from the front arrives at the time it has in ``target``.
@@ -92,8 +93,8 @@ def make_scene(
     Raises:
         MissingExtraError: There is a room, and pyroomacoustics is not installed.
         ValueError: A signal is not valid, silent or too short, there is no masker and no diffuse
-            noise, there is not one azimuth for each masker, a number is out of range, or a source
-            is outside the room.
+            noise, there is not one azimuth for each masker, a number is out of range, ``room`` is
+            no room, or a source is outside the room.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()
@@ -115,6 +116,8 @@ def make_scene(
         raise ValueError(
             f"expected one azimuth for each of {len(maskers)} maskers, got {len(azimuths)}"
         )
+    if not isinstance(room, Room | None):
+        raise ValueError(f"expected a room, got {room!r}; write Room()")
     if not maskers and diffuse is None:
         raise ValueError("expected a masker or diffuse noise; pass one of them")
     check_waveform(target, "target")
@@ -171,8 +174,8 @@ def draw_scenes(
         generator: Source of the random numbers.
         mismatch: Standard deviation in dB of the gains of the microphones.
         spacing: Distance between the two microphones of a side in m.
-        reverberation_time: Longest reverberation time in s of random rooms, in which half of the
-            scenes are; 0 for no rooms.
+        reverberation_time: Longest reverberation time in s of random rooms, 0.2 to 1.5, in which
+            half of the scenes are; 0 for no rooms.
 
     Returns:
         Scenes with leading dimension (items,). The gains of the microphones are those of ``input``
@@ -180,8 +183,8 @@ def draw_scenes(
 
     Raises:
         MissingExtraError: There are rooms, and pyroomacoustics is not installed.
-        ValueError: There is only one item, which would be its own masker, or ``make_scene`` rejects
-            a signal.
+        ValueError: There is only one item, which would be its own masker, the reverberation time is
+            out of range, or ``make_scene`` rejects a signal.
 
     >>> voices = torch.randn(2, 8000)
     >>> scenes = draw_scenes(voices, voices, None, torch.zeros(2), torch.Generator())
@@ -192,6 +195,8 @@ def draw_scenes(
     def draw(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator))
 
+    if reverberation_time != 0.0:
+        check_number("reverberation_time", reverberation_time, *REVERBERATION_TIMES)
     count = len(targets)
     if count < 2:
         raise ValueError(
@@ -209,7 +214,7 @@ def draw_scenes(
         diffuse = None
         if noise is not None and is_diffuse:
             diffuse = set_level(noise[item], draw(59.0, 71.0))
-        has_room = reverberation_time > 0.0 and draw(0.0, 1.0) < 0.5
+        has_room = reverberation_time != 0.0 and draw(0.0, 1.0) < 0.5
         scene = make_scene(
             target,
             maskers,
@@ -307,7 +312,7 @@ def room_impulse_responses(
     delays, amplitudes, directions = find_arrivals(room, azimuth)
     height, turn = directions[:, 2], np.arctan2(directions[:, 1], directions[:, 0])
     row = np.minimum(ECHO_HEIGHTS * (0.5 + 0.5 * height), ECHO_HEIGHTS - 1).astype(int)
-    column = np.floor(ECHO_AZIMUTHS * turn / (2.0 * np.pi)).astype(int) % ECHO_AZIMUTHS
+    column = np.rint(ECHO_AZIMUTHS * turn / (2.0 * np.pi)).astype(int) % ECHO_AZIMUTHS
     area = ECHO_AZIMUTHS * row + column
     area[delays.argmin()] = ECHO_HEIGHTS * ECHO_AZIMUTHS  # the direct sound, after all areas
     lead = int(_LEAD_SECONDS * sample_rate)
@@ -331,7 +336,7 @@ def _echo_impulse_responses(spacing: float, sample_rate: int) -> NDArray[np.floa
     Shape: () -> (areas, microphones, ears, length), see ``head_impulse_responses``.
     """
     height = (2.0 * np.arange(ECHO_HEIGHTS) + 1.0) / ECHO_HEIGHTS - 1.0
-    flat = unit_vectors(360.0 * (np.arange(ECHO_AZIMUTHS) + 0.5) / ECHO_AZIMUTHS)
+    flat = unit_vectors(360.0 * np.arange(ECHO_AZIMUTHS) / ECHO_AZIMUTHS)
     directions = np.sqrt(1.0 - height[:, None, None] ** 2) * flat
     directions[..., 2] = height[:, None]
     responses = head_impulse_responses(directions.reshape(-1, 3), spacing, sample_rate)

@@ -205,10 +205,9 @@ def measure_steady_tones(
     Returns:
         ``loudness_error_db``, the level that the ear perceives of the output minus the level that a
         normal ear perceives of the tone, by the exact MSBG, and minus ``loudness``;
-        ``sidebands_db``, the power of the
-        output at more than 20 Hz from the tone relative to that near it, in dB; both are nested
-        lists of shape (levels, frequencies). ``levels`` (dB SPL) and ``frequencies`` (Hz) are the
-        axes.
+        ``sidebands_db``, the power of the output at more than 20 Hz from the tone relative to that
+        near it, in dB; both are nested lists of shape (levels, frequencies). ``levels`` (dB SPL)
+        and ``frequencies`` (Hz) are the axes.
 
     >>> measure_steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
     0.0

@@ -59,11 +59,16 @@ def check_pair(output: Tensor, clean: Tensor) -> None:
 
     >>> check_pair(torch.ones(2, 9000), torch.ones(2, 9000))
     """
-    if output.shape != clean.shape or output.device != clean.device:
+    if output.device != clean.device:
         raise ValueError(
-            f"expected output and clean of the same shape on the same device, got "
-            f"{tuple(output.shape)} on {output.device} and {tuple(clean.shape)} on "
-            f"{clean.device}; pass one clean signal for each output"
+            "expected output and clean on the same device, got "
+            f"{output.device} and {clean.device}; write clean.to(output.device)"
+        )
+    if output.shape != clean.shape:
+        raise ValueError(
+            f"expected output and clean of the same shape, got {tuple(output.shape)} and "
+            f"{tuple(clean.shape)}; pass one clean signal for each output, and cut both to one "
+            "length"
         )
 
 

@@ -210,7 +210,8 @@ class CompensatorRecipe(TrainingRecipe):
         return (*CRITERIA, *_NOISE_REDUCTION_CRITERIA)
 
     def __post_init__(self) -> None:
-        from hlsim.data.rooms import REVERBERATION_TIMES  # imports torch
+        from hlsim.checks import check_number  # imports torch
+        from hlsim.data.rooms import REVERBERATION_TIMES
         from hlsim.metrics.pair import SHORTEST_SECONDS  # imports torch
 
         super().__post_init__()
@@ -227,10 +228,8 @@ class CompensatorRecipe(TrainingRecipe):
         has_rooms = self.reverberation_time != 0.0
         expected = "beamforming-aid, or ears: 2 in model, because only random scenes have rooms"
         self._require("kind", has_two_ears or not has_rooms, expected)
-        shortest, longest = REVERBERATION_TIMES
-        is_in_range = shortest <= self.reverberation_time <= longest
-        expected = f"0, or {shortest:g} to {longest:g} s"
-        self._require("reverberation_time", is_in_range or not has_rooms, expected)
+        if has_rooms:
+            check_number("reverberation_time", self.reverberation_time, *REVERBERATION_TIMES)
         expected = "0 for two ears, because their scenes have other voices in any case"
         self._require("babble", not self.babble or not has_two_ears, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:

@@ -279,7 +279,7 @@ def _check_no_network(folder: Path) -> None:
     steps = read_record(folder).get("about", {}).get("steps")
     if steps != 0:
         raise ValueError(
-            f"{folder}: the network of a training ({steps} steps) would be replaced, and there is "
+            f"{folder}: the trained network in this folder would be replaced, and there is "
             f"no state ({STATE}) from which this training could continue, because it ended before "
             "its first state was saved, or the state was removed; move or remove the folder, or "
             "choose another output folder"

@@ -376,7 +376,7 @@ def test_blocks_give_the_output_and_the_gradient_of_the_whole(
     monkeypatch: pytest.MonkeyPatch, rate: int, aligned: bool
 ) -> None:
     monkeypatch.setattr("hlsim.msbg.overlapping_blocks._BLOCK_SECONDS", 3.2)
-    time = torch.arange(5.5 * rate) / rate
+    time = torch.arange(7 * rate) / rate
     # White noise with the rhythm of syllables. It has double precision, because the rounding of
     # single precision depends on the FFT grid and amounts to 1e-5.
     noise = torch.randn(len(time), dtype=torch.float64)
