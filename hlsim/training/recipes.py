@@ -210,8 +210,7 @@ class CompensatorRecipe(TrainingRecipe):
         return (*CRITERIA, *_NOISE_REDUCTION_CRITERIA)
 
     def __post_init__(self) -> None:
-        from hlsim.checks import check_number  # imports torch
-        from hlsim.data.rooms import REVERBERATION_TIMES
+        from hlsim.data.rooms import Room  # imports torch
         from hlsim.metrics.pair import SHORTEST_SECONDS  # imports torch
 
         super().__post_init__()
@@ -229,7 +228,7 @@ class CompensatorRecipe(TrainingRecipe):
         expected = "beamforming-aid, or ears: 2 in model, because only random scenes have rooms"
         self._require("kind", has_two_ears or not has_rooms, expected)
         if has_rooms:
-            check_number("reverberation_time", self.reverberation_time, *REVERBERATION_TIMES)
+            Room(reverberation_time=self.reverberation_time)  # rejects what is out of range
         expected = "0 for two ears, because their scenes have other voices in any case"
         self._require("babble", not self.babble or not has_two_ears, expected)
         if self.trains_noise_reduction() or self.unreduced > 0.0:

@@ -1,6 +1,7 @@
 """Tests of rooms with echoes, from image sources."""
 
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,6 +168,7 @@ def test_recipes_take_rooms_for_random_scenes_alone() -> None:
     assert CompensatorRecipe(kind="beamforming-aid", reverberation_time=0.5)
     with pytest.raises(ValueError, match="only random scenes have rooms"):
         CompensatorRecipe(reverberation_time=0.5)
-    for seconds in (0.1, "0.4", None, True):
+    times: tuple[Any, ...] = (0.1, "0.4", None, True)
+    for seconds in times:
         with pytest.raises(ValueError, match="reverberation_time"):
-            CompensatorRecipe(kind="beamforming-aid", reverberation_time=seconds)  # type: ignore[arg-type]
+            CompensatorRecipe(kind="beamforming-aid", reverberation_time=seconds)
