@@ -278,8 +278,9 @@ def _check_no_network(folder: Path) -> None:
         return
     steps = read_record(folder).get("about", {}).get("steps")
     if steps != 0:
+        network = "the network" if steps is None else f"the network of a training ({steps} steps)"
         raise ValueError(
-            f"{folder}: the trained network in this folder would be replaced, and there is "
+            f"{folder}: {network} would be replaced, and there is "
             f"no state ({STATE}) from which this training could continue, because it ended before "
             "its first state was saved, or the state was removed; move or remove the folder, or "
             "choose another output folder"
