@@ -16,7 +16,7 @@ _PAIRS_AT_A_TIME = 16384
 
 @compute_once  # the conditions, the ears and the scores of an item have the same noise
 def draw_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> Tensor:
-    """Draw the noise of one item, which takes a sixth of the time of a HASQI with this noise.
+    """Draw the noise of one item, which takes a fifth of the time of a HASQI or more.
 
     Args:
         seed: Seed of the generator.
@@ -38,7 +38,7 @@ def draw_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> Tensor:
 
 @lru_cache(maxsize=256)  # the conditions and the ears of an item have the same state
 def state_after_motion_noise(seed: int, samples: int) -> Any:
-    """Return the state of NumPy's generator after the noise, in half the time of drawing it.
+    """Return the state of NumPy's generator after the noise, in less time than drawing it.
 
     NumPy makes two normal numbers of each pair of uniform ones that lies in a circle (Marsaglia's
     polar method), and rejects the other pairs. To find the state, it is enough to count.
