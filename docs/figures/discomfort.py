@@ -6,8 +6,9 @@ The table has one row per person, see ``examples/people_recruitment.py``; every 
 uncomfortable level below 115 dB HL is used. The sounds are speech at 80 dB SPL, music (chords of
 decaying harmonic tones) at 80 dB SPL and a slam, a decaying noise with a peak of 100 dB SPL. An
 ear is exceeded if the 99th percentile of the levels of a third of an octave, over 125 ms, is above
-its uncomfortable level at 500, 1000, 2000 or 4000 Hz. HASPI and HASQI of speech at 65 dB SPL are
-those of the standard ears N2 to N5.
+its uncomfortable level at 500, 1000, 2000 or 4000 Hz. HASPI, HASQI and the output level of speech
+at 65 dB SPL are means of the standard ears N2 to N5. Predicted levels are used with several
+margins, the first of which is that of the aids.
 """
 
 import sys
@@ -20,8 +21,9 @@ import hlsim
 from compensators import load_compensator
 from examples.people_recruitment import NOT_REACHED, read_uncomfortable_levels
 from hlsim import Audiogram
+from hlsim.audiogram import discomfort as prediction
 from hlsim.audiogram.prescription import FREE_FIELD_THRESHOLD_SPL
-from hlsim.calibration import PASCAL_SPL, set_level
+from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.metrics import haspi, hasqi
 
 RATE = 16000
@@ -29,6 +31,7 @@ WINDOW = RATE // 8
 AIDS = ("hearing-aid", "wdrc")
 PERCENTILE = 0.99
 EARS_AT_ONCE = 16
+MARGINS = (prediction.PREDICTION_MARGIN_DB, 12.0, 16.0, 20.0, 24.0, 28.0, 32.0)  # dB
 
 
 def make_sounds() -> dict[str, Tensor]:
@@ -90,12 +93,14 @@ def main(path: str, stride: str = "1") -> None:
     thresholds_only = [Audiogram(ear.levels, ear.frequencies) for ear in ears]
     speech = hlsim.example_speech()[: 3 * RATE]
     print(f"{len(ears)} ears")
+    margins = [("predicted levels", True, thresholds_only, margin) for margin in MARGINS]
     for name in AIDS:
-        for label, limit, fitted in (
-            ("no limit", False, ears),
-            ("measured levels", True, ears),
-            ("predicted levels", True, thresholds_only),
+        for label, limit, fitted, margin in (
+            ("no limit", False, ears, MARGINS[0]),
+            ("measured levels", True, ears, MARGINS[0]),
+            *margins,
         ):
+            prediction.PREDICTION_MARGIN_DB = margin  # aids read it when they are called
             aid = load_compensator(name, limit_to_ear=limit)
             counts = []
             for sound in sounds.values():
@@ -118,7 +123,8 @@ def main(path: str, stride: str = "1") -> None:
                 score(outputs, speech.expand(4, -1), standard).mean() for score in (haspi, hasqi)
             ]
             print(
-                f"{name}, {label}: {shares}; HASPI {scores[0]:.4f}, HASQI {scores[1]:.4f}",
+                f"{name}, {label}, margin {margin} dB: {shares}; HASPI {scores[0]:.4f}, "
+                f"HASQI {scores[1]:.4f}, {level_spl(outputs).mean():.1f} dB SPL",
                 flush=True,
             )
 
