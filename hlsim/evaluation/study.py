@@ -8,6 +8,7 @@ measure scores the output. ``haspi-report``, ``evaluate-compensator``, ``evaluat
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -28,6 +29,7 @@ from hlsim.evaluation.running.parallel import (
     Progress,
     check_scheduler,
     describe_error,
+    record_warnings,
     run_parallel,
 )
 from hlsim.evaluation.running.store import ScoreStore
@@ -288,7 +290,7 @@ def run_study(
         store: Scores of earlier runs, to which new scores are added. A score is computed again only
             if the item, the condition, the measure or the code of hlsim has changed, or if one of
             them cannot be hashed (``fingerprint`` is None). The name and the facts of an item count
-            only for measures that use them.
+            only for measures that use them. Warnings that a stored score has caused are repeated.
         jobs: Number of processes; all cores by default. With 1, everything runs in this process, as
             debuggers need it, and a crash of your own compiled code ends the process. A study with
             a measure that may crash, such as PESQ, runs in another process even then.
@@ -358,12 +360,21 @@ def run_measures(
     _check_different("table column", columns_of_items)
     owners = dict.fromkeys(columns_of_items, "")
     results: _Results = {}
+    warned: set[str] = set()
+
+    def warn_once(texts: Sequence[str]) -> None:
+        for text in texts:
+            if text not in warned:
+                warned.add(text)
+                warnings.warn(text, stacklevel=4)
+
     tasks = []
     for number, source in track(enumerate(items), "items whose scores are looked up", len(items)):
         task = _Task(number, source, [])
         for condition in conditions:
             for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
                 if key in store.scores:
+                    warn_once(store.warnings.get(key, ()))
                     _claim_columns(owners, measure, store.scores[key])
                     results[number, condition.name, measure.name] = store.scores[key]
                 else:
@@ -388,14 +399,16 @@ def run_measures(
                     # Only one score is to blame: each is computed again in a task of its own.
                     tasks_of_crashes += [task._replace(missing=[score]) for score in task.missing]
                     continue
-                measured = [CRASH]
-            for (condition, measure, key), values in zip(task.missing, measured, strict=True):
+                measured = [(CRASH, [])]
+            scores = zip(task.missing, measured, strict=True)
+            for (condition, measure, key), (values, texts) in scores:
+                warn_once(texts)
                 results[task.number, condition.name, measure.name] = values
                 if isinstance(values, str):
                     continue
                 _claim_columns(owners, measure, values)
                 if key:
-                    store.append(key, values)
+                    store.append(key, values, texts)
             report_progress(len(results), total)
         tasks = tasks_of_crashes
     measures = [
@@ -468,41 +481,58 @@ def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure])
 
 @one_thread()
 @torch.no_grad()
-def _measure_item(task: _Task) -> list[Values | str]:
+def _measure_item(task: _Task) -> list[tuple[Values | str, list[str]]]:
     """Compute the missing values of one item.
 
     Returns:
         For each member of ``task.missing``, the values by column, or the text of the error because
-        of which there are none.
+        of which there are none; and the texts of the warnings for users, of which those of the item
+        and of the condition's output belong to each of their scores.
     """
+    texts_of_item: list[str] = []
     try:
-        item = task.source.load()
-        check_waveform(item.clean, "clean speech", full_scale_spl=item.full_scale_spl)
+        with record_warnings(texts_of_item):
+            item = task.source.load()
+            check_waveform(item.clean, "clean speech", full_scale_spl=item.full_scale_spl)
     except Exception as error:  # A failure must not end the study.
-        return [describe_error(error)] * len(task.missing)
-    results: list[Values | str] = []
+        return [(describe_error(error), texts_of_item)] * len(task.missing)
+    results: list[tuple[Values | str, list[str]]] = []
     pairs: dict[str, tuple[Item, Tensor]] = {}
+    texts_of_pairs: dict[str, list[str]] = {}
     for condition, measure, _ in task.missing:
+        texts = texts_of_pairs.setdefault(condition.name, [*texts_of_item])
+        texts_of_measure: list[str] = []
         try:
             if condition.name not in pairs:
-                pairs[condition.name] = _item_and_output(condition, item)
-            with loud_outputs():
-                item_of_output, output = pairs[condition.name]
+                with record_warnings(texts):
+                    pairs[condition.name] = _item_and_output(condition, item)
+            item_of_output, output = pairs[condition.name]
+            with loud_outputs(), record_warnings(texts_of_measure):
                 # A measure that changes the output in place must not change that of the next one.
                 values = dict(measure.compute(item_of_output, output.clone()))
-            for name, value in values.items():
-                if isinstance(value, str):
-                    continue
-                number = float(value)  # of a number of NumPy or torch, for example
-                if not math.isfinite(number):
-                    raise ValueError(
-                        f"expected a finite number for {name} from {measure.name}, got {value}"
-                    )
-                values[name] = number
-            results.append(values)
+            outcome: Values | str = _check_values(measure, values)
         except Exception as error:
-            results.append(describe_error(error))
+            outcome = describe_error(error)
+        results.append((outcome, [*texts, *texts_of_measure]))
     return results
+
+
+def _check_values(measure: Measure, values: dict[str, Any]) -> Values:
+    """Return the values of a measure with numbers as floats.
+
+    Raises:
+        ValueError: A number is NaN or infinite.
+    """
+    for name, value in values.items():
+        if isinstance(value, str):
+            continue
+        number = float(value)  # of a number of NumPy or torch, for example
+        if not math.isfinite(number):
+            raise ValueError(
+                f"expected a finite number for {name} from {measure.name}, got {value}"
+            )
+        values[name] = number
+    return values
 
 
 def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:

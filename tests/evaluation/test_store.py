@@ -20,6 +20,10 @@ def test_records_are_read_again(tmp_path: Path) -> None:
     assert again.scores == store.scores == {"a": {"score": 0.1 + 0.2}, "b": {"file": "ü"}}
     again.append("a", {"score": 0.5})
     assert ScoreStore(path).scores == {"a": {"score": 0.5}, "b": {"file": "ü"}}
+    again.append("a", {"score": 0.5}, ["too short"])
+    assert ScoreStore(path).warnings == again.warnings == {"a": ["too short"]}
+    again.append("a", {"score": 0.75})
+    assert ScoreStore(path).warnings == again.warnings == {}
 
 
 @pytest.mark.parametrize("cut", [2, 20])

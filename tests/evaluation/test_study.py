@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +36,15 @@ class Gain:
         if self.factor == 0.0:
             raise RuntimeError("no battery")
         return self.factor * signal
+
+
+class Short:
+    """Condition that loses a sample."""
+
+    fingerprint = "short"
+
+    def __call__(self, signal: Tensor, ear: Audiogram) -> Tensor:
+        return signal[..., :-1]
 
 
 def count_call(name: str, value: Tensor) -> Tensor:
@@ -309,6 +319,29 @@ def test_only_missing_values_are_computed(items: list[Item], tmp_path: Path) -> 
         CALLS.clear()
         run_study(*arguments, store=ScoreStore(path), jobs=1)
         assert CALLS.count("peak") == computed
+
+
+def test_warnings_of_stored_scores_are_repeated(items: list[Item], tmp_path: Path) -> None:
+    def warn(item: Item, output: Tensor) -> dict[str, float]:
+        count_call("odd", output)
+        warnings.warn(f"{item.name} is odd", stacklevel=1)
+        return {"odd": 1.0}
+
+    def run(*conditions: Condition) -> list[str]:
+        store = ScoreStore(tmp_path / "scores.jsonl")
+        measures = [MEASURES[0], Measure("odd", warn)]
+        with pytest.warns(UserWarning) as warned:
+            run_study(items, conditions, measures, store=store, jobs=1)
+        return sorted(str(warning.message) for warning in warned)
+
+    short, whole = Condition("short", Short()), *gains(1)
+    texts = run(short, whole)
+    odd = [f"{item.name} is odd" for item in items]
+    assert [text for text in texts if "both are cut" not in text] == odd
+    assert len(texts) == len(odd) + 1 and CALLS.count("odd") == 6
+    assert run(short, whole) == texts
+    assert run(whole) == odd
+    assert CALLS.count("odd") == 6, "all scores were stored"
 
 
 def test_scores_of_recorded_outputs_are_stored_by_the_output(items: list[Item]) -> None:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
@@ -90,7 +90,7 @@ def run_parallel(
             jobs = None
         stack.enter_context(joblib.parallel_config(**settings))
         pool = joblib.Parallel(n_jobs=jobs or -1, return_as="generator")
-        call = joblib.delayed(partial(_record_warnings, function))
+        call = joblib.delayed(partial(_call_and_record, function))
         calls = [call(task) for task in tasks]
         finished = 0
         alone = len(tasks) if in_processes and jobs == 1 else 0
@@ -137,11 +137,31 @@ def check_scheduler(address: str | None) -> None:
         _connect(address).close()
 
 
-def _record_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[str]]:
-    """Return the result of a function for a task, and the texts of its warnings for users."""
+@contextmanager
+def record_warnings(texts: list[str]) -> Iterator[None]:
+    """Append the texts of warnings for users (``UserWarning``) to a list when the context ends.
+
+    Warnings are not shown, and those of other types are lost.
+
+    >>> texts = []
+    >>> with record_warnings(texts):
+    ...     warnings.warn("the battery is low")
+    >>> texts
+    ['the battery is low']
+    """
     with warnings.catch_warnings(record=True) as caught:
+        try:
+            yield
+        finally:
+            texts += [str(w.message) for w in caught if w.category is UserWarning]
+
+
+def _call_and_record(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[str]]:
+    """Return the result of a function for a task, and the texts of its warnings for users."""
+    texts: list[str] = []
+    with record_warnings(texts):
         result = function(task)
-    return result, [str(w.message) for w in caught if w.category is UserWarning]
+    return result, texts
 
 
 def _run_in_one_process(calls: Sequence[Any]) -> Iterator[Any]:
