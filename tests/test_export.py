@@ -1,5 +1,6 @@
 """Exported simulators and aids give the outputs of the modules."""
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,27 @@ def test_onnx_gives_the_simulators_outputs(tmp_path: Path) -> None:
     wave = 0.03 * torch.randn(2, 8000)
     results = open_onnx(path)[0]({"waveform": wave, "thresholds": EARS})
     assert_close(results["perceived"], simulator(wave, EARS), 1e-4)
+
+
+@pytest.mark.slow
+def test_onnx_differs_by_rounding_only_for_a_tone(tmp_path: Path) -> None:
+    """The phase of frequencies without sound is that of rounding, in torch as in onnxruntime."""
+    pytest.importorskip("onnxscript")
+    simulator, path = load_pretrained("neuro-msbg-cnn-narrow"), tmp_path / "simulator.onnx"
+    export_onnx(simulator, path, seconds=0.5)
+    call, ears = open_onnx(path)[0], EARS[:1]
+    tone = 0.05 * (torch.arange(8000) * torch.pi / 8.0).sin().unsqueeze(0)
+    precise_simulator = copy.deepcopy(simulator).double()
+    precise = precise_simulator(tone.double(), ears.double())
+    rounding = 1e-7 * tone.abs().max() * torch.randn_like(tone)
+    moved = precise_simulator((tone + rounding).double(), ears.double())
+    onnx = call({"waveform": tone, "thresholds": ears})["perceived"]
+    assert (moved - precise).abs().max() > 1e-4 * precise.abs().max()
+    assert_close(onnx, precise.float(), 0.1)
+    noise = 10.0 ** (-50.0 / 20.0) * tone.square().mean().sqrt() * torch.randn_like(tone)
+    noisy = tone + noise
+    results = call({"waveform": noisy, "thresholds": ears})
+    assert_close(results["perceived"], simulator(noisy, ears), 1e-3)
 
 
 @pytest.mark.slow
