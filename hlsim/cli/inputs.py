@@ -260,11 +260,12 @@ def read_sliders(options: argparse.Namespace) -> dict[str, float]:
     """
     values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}
     sliders = {name: value for name, value in values.items() if value is not None}
-    has_aid = getattr(options, "compensator", None) and not getattr(options, "simulate", False)
-    settings = [*sliders, *(getattr(options, name, None) for name in ("loudness", "limit_to_ear"))]
-    if any(settings) and not has_aid:
-        raise ValueError(
-            "--noise-reduction, --amplification, --loudness and --limit-to-ear have no effect "
-            "without an aid; name one by --compensator (without --simulate), or leave them out"
-        )
+    simulates = getattr(options, "simulate", False)
+    settings = [name for name in ("loudness", "limit_to_ear") if getattr(options, name, None)]
+    if settings := [*sliders, *settings]:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in settings)
+        if simulates:
+            raise ValueError(f"{flags}: no effect with --simulate; leave one of them out")
+        if not getattr(options, "compensator", None):
+            raise ValueError(f"{flags}: no effect without an aid; name one by --compensator")
     return sliders

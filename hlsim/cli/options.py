@@ -410,7 +410,7 @@ def _limited(
     read: Callable[[str], Any], noun: str, lowest: float, highest: float
 ) -> Callable[[str], Any]:
     """Make a function that converts the text of an option to a number in a closed range."""
-    expected = f"{noun} from {lowest:,g} to {highest:,g}"
+    expected = f"{noun} from {lowest:,.10g} to {highest:,.10g}"
     return _checked_type(read, lambda value: lowest <= value <= highest, expected)
 
 

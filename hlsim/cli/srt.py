@@ -1,6 +1,7 @@
 """The command ``srt``, which measures the speech reception threshold in noise of simulated ears."""
 
 import argparse
+import math
 from typing import Any
 
 from hlsim.cli.inputs import build_single_microphone_aid, parse_ears, read_sliders
@@ -61,17 +62,24 @@ def _srt(options: argparse.Namespace) -> None:
     }
     for number, name in enumerate(ears):
         texts = [
-            f"{test} {_format_estimate(value, number)}" for test, value in tests.items() if value
+            f"{test} {_format_estimate(test, value, number)}"
+            for test, value in tests.items()
+            if value
         ]
         print(f"{name}, {result.pta[number]:.0f} dB HL: {', '.join(texts)}")
 
 
-def _format_estimate(estimate: Any, number: int) -> str:
+def _format_estimate(test: str, estimate: Any, number: int) -> str:
     """Return a text with the estimate for one of several ears, in dB, and its 95 % interval.
 
     Args:
+        test: What is estimated: ``"benefit"``, the difference of two thresholds, or a threshold.
         estimate: ``Estimate`` with one value per ear.
         number: Index of the ear.
     """
+    from hlsim.evaluation.digits.psychometric import HIGHEST_SNR
+
     value, low, high = (values[number] for values in estimate)
+    if not math.isfinite(value):
+        return "unknown" if test == "benefit" else f"above {HIGHEST_SNR:g} dB"
     return f"{value:.1f} dB [{low:.1f}, {high:.1f}]"

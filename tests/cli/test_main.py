@@ -140,7 +140,9 @@ compensate {speech} {out} --audiogram N3 --limit-to-ear --ucl 500:900 | got 900 
 compensate {speech} {out} --audiogram N3 --compensator nalr --loudness -5 | leave out loudness
 compensate {speech} {out} --audiogram N3 --loudness 5 | expected a number from -40 to 0
 listen {speech} --audiogram N3 --loudness -5 --out {out} | no effect without an aid
-srt --audiogram N3 --loudness -5 | no effect without an aid
+srt --audiogram N3 --loudness -5 | --loudness: no effect without an aid
+srt --audiogram N3 --seed -1 | a whole number from 0 to 4,294,967,295
+live --audiogram N3 --simulate --amplification 1 | --amplification: no effect with --simulate
 simulate {speech} {out} --audiogram 500:30,1000 | expected a name such as N3
 compensate {speech} {out} --listener N3 | N3: cannot read audiograms
 evaluate-simulator m --speech {folder} --audiograms standard --out o --compensator nalr | no effect

@@ -3,6 +3,7 @@
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hlsim.calibration import set_level
 from hlsim.checkpoint import checkpoints_folder
 from hlsim.cli.main import main
 from hlsim.data.bundled import DIGITS
-from hlsim.evaluation.digits import DigitTest
+from hlsim.evaluation.digits import DigitTest, ReceptionThreshold
 from hlsim.evaluation.digits.material import (
     Triplets,
     draw_triplets,
@@ -249,6 +250,24 @@ def test_command_prints_a_line_per_ear(capsys: pytest.CaptureFixture[str], tmp_p
     assert [line[:5] for line in capsys.readouterr().out.splitlines()] == ["left,", "right"]
     assert main(["srt", "--audiogram", "N2", "--noise-reduction", "1", *quick]) == 2
     assert "no effect without an aid" in capsys.readouterr().err
+
+
+def test_command_says_that_a_threshold_is_above_the_range(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deaf = Estimate(*np.full((3, 1), np.inf))
+    measured = Estimate(*np.array([[20.0], [19.0], [21.0]]))
+    for aided in (deaf, measured):
+        result = ReceptionThreshold(
+            deaf, aided, subtract(deaf, aided), np.array([90.0]), people_threshold(np.array([90.0]))
+        )
+        monkeypatch.setattr(
+            "hlsim.evaluation.digits.reception_threshold", Mock(return_value=result)
+        )
+        assert main("srt --audiogram N6 --compensator nalr".split()) == 0
+        line = capsys.readouterr().out
+        assert "unaided above 32 dB, aided" in line and "benefit unknown, people" in line
+    assert "aided 20.0 dB [19.0, 21.0]" in line
 
 
 @torch.no_grad()
