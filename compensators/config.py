@@ -102,14 +102,16 @@ class BeamformerConfig(ModelConfig):
 
     Attributes:
         bands: Number of bands, 4 to 40, as in ``HearingAidConfig``.
-        hidden: Width of the two layers of the network.
-        seconds: Time constant of the averages in seconds.
-        loading: Loading of the fixed beams, see ``BinauralMVDR``.
-        spacing: Distance between the two microphones of a side in m.
-        aid: Settings of the hearing aid, by the names of ``HearingAidConfig``.
+        hidden: Width of the two hidden layers of the network, 1 to 512.
+        seconds: Time constant in seconds, 0.01 to 2, of the averages over the recent past from
+            which the weights of the microphones are computed.
+        loading: Loading of the fixed beams, 1e-6 to 1, see ``BinauralMVDR``.
+        spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
+        aid: Settings of the hearing aid, by the names of ``HearingAidConfig``. ``BeamformingAid``
+            validates them.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: Another value is out of range.
 
     >>> BeamformerConfig(bands=12).hidden
     64

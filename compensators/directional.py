@@ -442,7 +442,8 @@ class DirectionalAid(nn.Module):
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Measure the insertion gains of the aid behind the front end, see ``Aid.gains``.
 
-        They hold for sound from the front, which passes the front end nearly unchanged.
+        They do not include the front end, which passes sound from the front nearly unchanged; a
+        differential microphone attenuates it below its ``lowest`` frequency.
         """
         gains: Tensor = self.aid.gains(audiogram, level)
         return gains
@@ -574,16 +575,17 @@ def beam_and_blocking_taps(loading: float, spacing: float, before: int) -> NDArr
 
     The beams are those of ``mvdr_taps``. The two other signals are, at each side, a cardioid to the
     rear, and the difference of the beam and a cardioid to the front. Of sound in front of a sphere,
-    about -40 dB remain in both, and up to -28 dB near 8 kHz.
+    they have -40 dB or less up to 4 kHz, relative to the front microphone, and -24 dB at 8 kHz.
 
     Args:
         loading: Power of each microphone's own noise, see ``mvdr_taps``.
         spacing: Distance between the microphones of a side in m.
-        before: Number of samples of the beams, and again of the other filters, before time 0.
+        before: Number of samples before time 0 in each impulse response.
 
     Returns:
-        Impulse responses, (3, ears of the output, microphones, ears, length), the beams first. They
-        are twice as long as those of ``mvdr_taps``.
+        Impulse responses, (3, ears of the output, microphones, ears of the microphones, length):
+        the beams, the cardioids, and the differences. They are twice as long as those of
+        ``mvdr_taps``.
 
     >>> beam_and_blocking_taps(loading=1e-4, spacing=0.01, before=8).shape
     (3, 2, 2, 2, 288)

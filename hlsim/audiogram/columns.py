@@ -178,7 +178,8 @@ def _read_hz(number: str, kilo: str) -> float:
     """Convert the text of a frequency to Hz.
 
     Args:
-        number: Digits, perhaps with a decimal comma or with separated thousands.
+        number: Digits, perhaps with a decimal point or comma, or with separated thousands. Three
+            digits after a point or comma are thousands, unless the number is in kHz.
         kilo: ``"k"`` if the number is in kHz, otherwise an empty text.
     """
     if kilo:

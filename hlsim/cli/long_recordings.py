@@ -123,12 +123,16 @@ def _process_all(model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, f
 def _process_microphones(
     model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]
 ) -> Tensor:
-    """Return the output of a model whose microphones are the channels, left and right in turn.
+    """Return the output of a model whose microphones are the channels of a recording.
+
+    For an aid of two ears, the channels are left and right in turn, from front to rear; for an aid
+    of one ear, they are the microphones of this ear, from front to rear.
 
     Shape: (channels, time) -> (ears, time).
 
     Raises:
-        ValueError: There is another number of channels, or a listener for an aid of one ear.
+        ValueError: The number of channels is not that of the aid's microphones, or an aid of one
+            ear gets a listener.
     """
     aid: Any = model
     if aid.ears == 1 and isinstance(ears, Listener):

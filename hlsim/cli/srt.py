@@ -73,7 +73,7 @@ def _format_estimate(test: str, estimate: Any, number: int) -> str:
     """Return a text with the estimate for one of several ears, in dB, and its 95 % interval.
 
     Args:
-        test: What is estimated: ``"benefit"``, the difference of two thresholds, or a threshold.
+        test: Name of the estimate: ``"benefit"``, a difference of thresholds, or a threshold.
         estimate: ``Estimate`` with one value per ear.
         number: Index of the ear.
     """

@@ -121,7 +121,10 @@ def compare(
 def _adjust(
     comparisons: Sequence[ConditionComparison], planned: Collection[PlannedComparison]
 ) -> list[ConditionComparison]:
-    """Mark the planned comparisons of a measure, and adjust the p values of all others.
+    """Mark the planned comparisons of a measure, and adjust the p values of all others by Holm.
+
+    The number of the others becomes their ``family``. A single comparison is not marked, because
+    its p value needs no adjustment.
 
     Args:
         comparisons: All comparisons by one measure, with p values that are not adjusted.

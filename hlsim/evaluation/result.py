@@ -152,7 +152,7 @@ class Evaluation:
 
     @property
     def scores(self) -> list[str]:
-        """Columns of the table with scores, in the order of the measures."""
+        """Names of the table's columns with scores, in the order of the measures."""
         columns = [column for measure in self.measures for column in measure.scores or ()]
         return [column for column in columns if column in self.table]
 

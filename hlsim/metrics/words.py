@@ -227,10 +227,12 @@ def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> l
 
     Args:
         curve: Parameters of the model, from ``load_curve``.
-        aids: One pair per aid: the HASPI of its sentences, (items,), and the aid's mean HASPI.
+        aids: One pair per aid: the HASPI of each sentence, (items,), and its mean over these
+            sentences.
 
     Returns:
-        Proportion of words for each simulated listener, with each aid. Shape: (4000,) each.
+        One array per aid, with the proportion of words for each simulated listener. Shape: (4000,)
+        each.
 
     >>> scores = np.full(20, 0.6)
     >>> [proportion] = simulate_proportions(load_curve(), [(scores, 0.6)])

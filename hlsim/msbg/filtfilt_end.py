@@ -89,8 +89,11 @@ def _oscillations(
 def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
     """Compute the free oscillations of a low-pass, and the weights of the last samples in them.
 
+    The weighted sums of the last samples multiply the oscillations. The result is the difference
+    between the envelope by ``filtfilt`` and that of a signal which continues in silence.
+
     The low-pass has a state z of two numbers. With the input u, its output is z[0] + b0 u, and its
-    next state is transition z + input_vector u.
+    next state is A z + (b1 - a1 b0, b2 - a2 b0) u with A = [[-a1, 1], [-a2, 0]].
 
     Args:
         numerator: Three coefficients b0, b1, b2.

@@ -28,12 +28,15 @@ _FIR_TAIL = 2 * EAR_DELAY + 132
 def to_cochlea(signals: Tensor, rate: int, length: int, rate_divisor: int) -> Tensor:
     """Filter input with the outer and middle ear, and resample it to the rate of the cochlea.
 
+    The result has the delay of the ear's filter (``EAR_DELAY`` samples at 44.1 kHz).
+
     Shape: (items, time) -> (items, length).
 
     Args:
         signals: Input signals.
         rate: Sample rate of the input in Hz.
-        length: Number of samples of the result.
+        length: Number of samples of the result, which is cut, or ends in the filter's tail and
+            silence.
         rate_divisor: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
 
     >>> to_cochlea(torch.randn(2, 16000), rate=16000, length=44100, rate_divisor=1).shape

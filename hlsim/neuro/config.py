@@ -205,10 +205,15 @@ class NetworkConfig(ModelConfig):
 class NeuroConfig(NetworkConfig):
     """Sizes and choices of a Neuro-MSBG, by default those of ``neuro-msbg``.
 
+    The other sizes, such as ``fft`` and ``channels``, are described in ``NetworkConfig``, which has
+    other defaults.
+
     Attributes:
         structure: ``bands``, ``dual-path`` or ``monolithic``. ``bands`` is a network along time
             that corrects the gains in MSBG's frequency channels (``hlsim.neuro.bands``), at a lower
-            cost than the paper's ``dual-path`` networks. The ``monolithic`` baselines of the paper
+            cost than the paper's ``dual-path`` networks. It needs ``block="cnn"``,
+            ``phase="predicted"``, ``prior``, ``level_aware``, and the default ``fft``, ``window``
+            and ``hop``. The ``monolithic`` baselines of the paper
             have a linear encoder and no frequency axis: each frame is a vector of ``channels``
             values, and the blocks run along time only.
         audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation

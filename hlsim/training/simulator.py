@@ -92,7 +92,10 @@ class SimulatorTraining(TrainingModule):
         self.measured_values.append(-noise_to_signal_db(perceived, target))
 
     def _simulate(self, signal: Tensor, ears: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the outputs of the teacher and of the network in pascals, (items, time) each."""
+        """Return the outputs of the teacher, without a gradient, and of the network.
+
+        Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time) in pascals each.
+        """
         (teacher,) = self._teacher
         with torch.no_grad():
             target = teacher.to(signal.device)(signal, ears)

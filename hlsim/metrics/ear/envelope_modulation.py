@@ -391,8 +391,8 @@ def _energies_filtered_twice(covariance: _Covariance, extent: Extent) -> list[Te
         extent: Number of audible frames of each item.
 
     Returns:
-        Energies xx, yy and xy of the coefficients, (items, 10, 5) each, and energy of noise of
-        variance 1, (items, 10, 1).
+        Energies xx (of clean speech), yy (of the output) and xy of the coefficients, (items, 10
+        modulation rates, 5 coefficients) each, and energy of noise of variance 1, (items, 10, 1).
     """
     items = []
     for item, frames in enumerate(extent.ends):

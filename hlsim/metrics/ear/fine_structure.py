@@ -184,7 +184,16 @@ _FIRST, _INNER, _LAST = 0, 1, 2
 
 
 def _segment_kinds(counts: Extent, device: torch.device) -> Tensor:
-    """Return the kind of each segment: first, inner or last. Shape: -> int64 (items, segments)."""
+    """Return the kind of each segment, ``_FIRST``, ``_INNER`` or ``_LAST``.
+
+    The only segment of an item is the last one, and padding counts as inner segments.
+
+    Args:
+        counts: Number of segments of each item.
+        device: Device of the result.
+
+    Returns: Kinds, int64, (items, segments).
+    """
     indices = torch.arange(counts.longest, device=device)
     is_last = indices == integers(counts.ends, device)[:, None] - 1
     return torch.where(is_last, _LAST, (indices > 0).long())

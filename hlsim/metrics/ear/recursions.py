@@ -328,7 +328,9 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
 
 
 def _as_real(real: Tensor, imaginary: Tensor) -> Tensor:
-    """Convert a complex matrix to a real one, for vectors of real parts and then imaginary parts.
+    """Convert a complex matrix R + iI to the real one [[R, I], [-I, R]].
+
+    A row vector of real parts and then imaginary parts is multiplied with it from the left.
 
     Shape: (..., rows, columns) twice -> (..., 2 rows, 2 columns).
     """

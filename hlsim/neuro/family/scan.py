@@ -141,7 +141,7 @@ class _ScanGradient(torch.autograd.Function):
     """Gradients of the selective scan, which raise an error if they are differentiated.
 
     With ``once_differentiable`` instead, ``torch.autograd.grad`` for a subset of the inputs would
-    ignore the second derivative without an error.
+    ignore the second derivative without an error. Shapes are those of ``_SelectiveScan``.
     """
 
     @staticmethod
