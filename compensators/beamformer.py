@@ -30,10 +30,10 @@ from hlsim.dsp.resample import resample
 from hlsim.torchtools import built_in_float32, constant
 
 LOOK_AHEAD_SAMPLES = 8
-"""Look-ahead of the fixed filters and again of the adaptive ones in samples, 0.5 ms each."""
+"""Look-ahead of the fixed filters, and again of the adaptive ones: 0.5 ms each, at 16 kHz."""
 
 FILTER_SAMPLES = 128
-"""Length of the adaptive filters in samples."""
+"""Length of the adaptive filters in samples at 16 kHz."""
 
 EARS = 2
 """Number of ears."""
@@ -58,18 +58,20 @@ term, speech in quiet would be cancelled.
 class AdaptiveBeamformer(FilterAndSum):
     """A trained adaptive beamformer to the front, with 1 ms of look-ahead at 16 kHz.
 
-    For each ear, fixed filters compute a beam to the front, that of ``BinauralMVDR`` with half of
-    its look-ahead, and two signals from which most of the sound from the front is removed. Every
-    4 ms and in each band of the hearing aid, weights are computed with which the two signals,
-    subtracted from the beam, leave the least power (generalised sidelobe canceller, Griffiths and
-    Jim 1982). They come from averages over the recent past. A small network decides in each band
-    how much a frame counts in the averages, and how large a power is added to those of the two
-    signals (loading), which makes the weights smaller. Before training, all frames count alike.
+    The four microphones are a front and a rear one at each side of the head. For each ear, fixed
+    filters compute a beam to the front, that of ``BinauralMVDR`` with half of its look-ahead, and
+    two signals from which most of the sound from the front is removed. Every 4 ms and in each band
+    of the hearing aid, weights are computed with which the two signals, subtracted from the beam,
+    leave the least power (generalised sidelobe canceller, Griffiths and Jim 1982). The weights come
+    from averages over the recent past. For each ear and band, a small network decides how much a
+    frame counts in the averages, and how large a power is added to those of the two signals
+    (loading), which makes the weights smaller. Before training, all frames count alike.
 
     Args:
         config: Sizes and choices, by default ``BeamformerConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Whole signals at other
-            rates than 16000 are resampled, which adds 8.5 ms of look-ahead; streams need 16000.
+            rates than 16000 are resampled, which adds up to 8.5 ms of look-ahead; streams need
+            16000.
             Outputs contain the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
@@ -157,6 +159,11 @@ class AdaptiveBeamformer(FilterAndSum):
     def _adapt(self, frames: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the weights at the end of each frame, and the memory of their averages.
 
+        Args:
+            frames: Beams and blocked signals in Pa.
+            state: Memory of earlier frames, of which ``levels``, ``covariance`` and, if there is no
+                frame, ``weights`` are used.
+
         Shape: (..., hops, signals, ears, FRAME) -> (..., hops, blocked signals, ears, bands).
         """
         bands, past = self.config.bands, weight_of_past(self.config.seconds)
@@ -186,6 +193,8 @@ class AdaptiveBeamformer(FilterAndSum):
 
 class BeamformingAid(DirectionalAid, HubModel):
     """A hearing aid with four microphones: an ``AdaptiveBeamformer``, then a ``HearingAid``.
+
+    The input has the shape (..., microphones, ears, time) of ``compensators.directional``.
 
     Args:
         audiogram: Ears of the listener, which are used by all calls that pass none.
@@ -255,7 +264,7 @@ def _subtract(frames: Tensor, weights: Tensor) -> Tensor:
 
 @constant
 def _filters(bands: int) -> NDArray[np.float64]:
-    """Return the frequency responses of the bands' filters.
+    """Return the frequency responses of the bands' filters, which begin 0.5 ms before time 0.
 
     Returns: Real and imaginary parts, (2, bands, FRAME / 2 + 1).
     """

@@ -20,8 +20,8 @@ class MappingConfig(NetworkConfig):
             overlapping frames, which cancels steady sounds.
         bands: Number of bands, 4 to 40, in each of which the correction is computed. The centres
             are evenly spaced on the ERB-number scale, on which the ear's bandwidth is constant.
-        reach_db: Largest correction up or down in dB.
-        limit_spl: Peak of the output in dB SPL that no sample exceeds.
+        reach_db: Largest correction up or down in dB, 0.1 to 60.
+        limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds.
         microphones: Number of microphones per ear, 1 to 16. With more than 1, the network filters
             and adds their signals before it amplifies them.
         ears: Number of ears with several microphones each, 1 or 2. With one microphone it is 1, and
@@ -58,20 +58,23 @@ class HearingAidConfig(ModelConfig):
         bands: Number of bands, 4 to 40. Their centres are an equal number of ERBs (bandwidths of
             the normal ear), but at least 125 Hz, apart.
         bins: Number of single frequencies (62.5, 125, 187.5, ... Hz) whose levels are inputs of
-            noise reduction, in addition to the levels of the bands.
-        width: Width of the layer before the recurrent one of noise reduction.
+            noise reduction, in addition to the levels of the bands, 0 to 128.
+        width: Width of the layer before the recurrent one of noise reduction, 1 to 4096, as for
+            both other widths.
         hidden: Width of the recurrent layer.
         inner: Width of the three layers of the network that computes the correction.
-        reach_db: Largest correction of the restoring gain up or down in dB.
-        reduction_db: Largest attenuation of a band by noise reduction in dB.
-        attack: Time constant in seconds with which the level that sets the amplification rises.
-        release: Time constant in seconds with which this level falls.
-        opening: Time constant in seconds with which the attenuation of noise decreases.
-        closing: Time constant in seconds with which the attenuation of noise increases.
-        cap_db: Largest amplification of a band in dB.
-        quiet_spl: Level of a frame in dB SPL below which the amplification fades. Frames that are
-            15 dB softer than this level are not amplified.
-        limit_spl: Peak of the output in dB SPL that no sample exceeds.
+        reach_db: Largest correction of the restoring gain up or down in dB, 0 to 80. A band with a
+            loss of 10 dB HL has half of it, one with a severe loss nearly all.
+        reduction_db: Largest attenuation of a band by noise reduction in dB, 0 to 80.
+        attack: Time constant in seconds, 0 to 1, with which the level that sets the amplification
+            rises.
+        release: Time constant in seconds, 0.01 to 2, with which this level falls.
+        opening: Time constant in seconds, 0 to 1, with which the attenuation of noise decreases.
+        closing: Time constant in seconds, 0.01 to 2, with which the attenuation of noise increases.
+        cap_db: Largest amplification of a band in dB, 0 to 80.
+        quiet_spl: Level of the whole frame in dB SPL, 0 to 80, below which the amplification fades.
+            Frames that are 15 dB softer than this level are not amplified.
+        limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds.
 
     Raises:
         ValueError: A value is out of range.
@@ -111,7 +114,7 @@ class BeamformerConfig(ModelConfig):
             validates them.
 
     Raises:
-        ValueError: Another value is out of range.
+        ValueError: A value other than those in ``aid`` is out of range.
 
     >>> BeamformerConfig(bands=12).hidden
     64

@@ -3,7 +3,7 @@
 Inputs have the shape (..., microphones, ears, time): at each side of the head, a front and a rear
 microphone, left side first. Outputs have the shape (..., ears, time), which any aid of two ears
 takes. Sounds from the front come out nearly as the front microphone receives them; sounds from
-other directions are attenuated.
+other directions are attenuated. The look-ahead is 1 ms.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ class FilterAndSum(nn.Module):
         Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The samples are not floating-point numbers with time last, there are none,
-                or there is another number of microphones or ears.
+            ValueError: The samples are not floating-point numbers with time last, there are no
+                samples, or there is another number of microphones or ears.
         """
         signals = as_samples(waveform)
         return as_type_of(waveform, self.delayed_output(signals)[..., -signals.shape[-1] :])
@@ -150,7 +150,8 @@ class FilterAndSum(nn.Module):
         Args:
             waveform: Signals with the shape, type and device of those to process.
 
-        Returns: Zeros in place of the earlier samples that the filters need, under "past".
+        Returns: Zeros in place of the earlier samples that the filters need, under "past", (...,
+            microphones, ears, length of the filters - 1).
         """
         return {"past": waveform.new_zeros(*waveform.shape[:-1], self.taps.shape[-1] - 1)}
 
@@ -226,9 +227,9 @@ class MicrophoneStream:
         """Return the next output. Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The chunk has another number of microphones or ears, other leading
-                dimensions than the first one, or a sample that is NaN or infinite; or the aid
-                rejects an ear or a slider.
+            ValueError: The chunk is not a floating-point waveform, or has no samples, another
+                number of microphones or ears, other leading dimensions than the first one, or a
+                sample that is NaN or infinite; or the aid rejects an ear or a slider.
         """
         signals = as_samples(chunk)
         self._front_end.check_microphones(signals)
@@ -307,8 +308,9 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
     """An adaptive directional microphone at each side, whose null follows the loudest noise behind.
 
     A share, 0 to 1, of a cardioid to the rear is subtracted from a cardioid to the front. A larger
-    share moves the null from 180 towards 90 degrees. The share minimises the power of the output:
-    it is computed from average powers of the recent past. Source: Elko and Nguyen Pong 1995, IEEE
+    share moves the null from 180 towards 90 degrees. Each side has one share for all frequencies,
+    which minimises the power of its output: it is computed from average powers of the recent past.
+    Source: Elko and Nguyen Pong 1995, IEEE
     ASSP Workshop on Applications of Signal Processing to Audio and Acoustics, who use an LMS
     algorithm instead of averages.
 
@@ -450,7 +452,10 @@ class DirectionalAid(nn.Module):
 
     @property
     def latency(self) -> int:
-        """Delay of streams in samples, that of the front end and that of the aid."""
+        """Delay of streams in samples, that of the front end and that of the aid.
+
+        An aid without streams, such as ``NALR``, has none: reading it raises AttributeError.
+        """
         return self.front_end.latency + int(self.aid.latency)
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> MicrophoneStream:

@@ -46,7 +46,7 @@ MIN_SPACING = 125.0
 """Smallest distance of two centres in Hz, about what filters of this length can separate."""
 
 POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
-"""Power at 0 dB SPL, the lowest level of a band."""
+"""Power in Pa^2 at 0 dB SPL, the lowest level of a band."""
 
 GRID_POINTS = 4096
 """Length of the Fourier transform with which filters and the spectrum of speech are computed."""
@@ -170,7 +170,7 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
         gains: Gain just before the first sample, then that at the last sample of each hop at 16
             kHz.
         rate: Sample rate of the signal in Hz.
-        time: Number of samples of the signal.
+        time: Number of samples of the signal. The last one comes before the last one of the hops.
 
     Shape: (items, hops + 1) -> (items, time).
 

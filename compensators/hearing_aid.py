@@ -172,7 +172,7 @@ class HearingAid(Wearable, HubModel):
             waveform: Input of the aid.
             audiogram: Ears of the signals, by default those of the constructor.
             noise_reduction: Share of the attenuation of noise that is applied, 0 to 1: one number,
-                or one value per item.
+                or values that broadcast to the leading dimensions of the output.
             amplification: Share of the amplification that is applied, in the same form.
 
         Shape: (..., time) -> (..., time).

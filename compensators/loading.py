@@ -28,7 +28,7 @@ UNTRAINED: dict[str, type[NALR | WDRC]] = {
     "wdrc": WDRC,
     "camfit": CAMFIT,
 }
-"""Compensators without a checkpoint."""
+"""Class of each compensator without a checkpoint, by its name."""
 
 
 def load_compensator(
@@ -56,8 +56,8 @@ def load_compensator(
             ``HearingAid`` support this, also behind a front end.
         limit_to_ear: Limit the level of the output in each band below the uncomfortable level of
             the ear, see ``HearingAid``, in the same aids.
-        loudness: Loudness of the output of a ``HearingAid`` for the ear, in dB relative to a normal
-            ear, -40 to 0.
+        loudness: Loudness of the output for the impaired ear, in dB relative to a normal ear, -40
+            to 0. Only ``HearingAid`` supports it, also behind a front end.
 
     Raises:
         ValueError: There is no such checkpoint, it is of another kind or has changed since it was

@@ -96,10 +96,10 @@ class NALRP(NALR):
     """The prescription NAL-RP, NAL-R for severe and profound losses, as a filter.
 
     Where the threshold at 2 kHz is above 90 dB HL, NAL-RP gives low frequencies more gain and high
-    ones less than ``NALR``. For other ears, the two differ only between 2 and 4 kHz, where NAL-RP
-    uses the threshold at 3 kHz, and above 6 kHz, where its gain falls. See
-    ``hlsim.audiogram.prescription.nalrp_gains_db`` for the formula and its sources. The filter and
-    its errors are those of ``NALR``.
+    ones less than ``NALR``. For other ears, the two differ only between 1 and 4 kHz, because NAL-RP
+    also prescribes gains at 1.5 and 3 kHz, and above 6 kHz, where its gain falls to 0 at 10 kHz.
+    See ``hlsim.audiogram.prescription.nalrp_gains_db`` for the formula and its sources. The filter
+    and its errors are those of ``NALR``.
 
     The prescribed gains are openMHA's within 0.01 dB.
 

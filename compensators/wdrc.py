@@ -29,7 +29,7 @@ from hlsim.checks import check_choice, check_number, check_settings
 from hlsim.dsp.interpolation import interpolate
 
 KNEE_DB = 20.0
-"""Range in dB below the level of average speech in a band, below which the gain stays the same.
+"""Distance in dB below average speech in a band from which on softer sounds get no more gain.
 
 With CAMFIT it is ``SPEECH_RANGE_DB``.
 """
@@ -55,7 +55,7 @@ class WDRC(Wearable):
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
         release: Time constant in seconds with which this level falls, 0.01 to 2.
         limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds. A band is not
-            amplified beyond this level.
+            amplified beyond this level, and with CAMFIT not beyond 100 dB SPL.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal.
         prescription: ``"nalr"``, ``"nalrp"`` or ``"camfit"``.

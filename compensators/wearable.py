@@ -57,7 +57,10 @@ from hlsim.torchtools import (
 )
 
 Slider = float | Tensor
-"""Value of a slider, 0 to 1: one number, or one value per item."""
+"""Value of a slider, 0 to 1: one number, or a tensor with one value per item.
+
+The tensor broadcasts to the leading dimensions of the output.
+"""
 
 State = Mapping[str, Tensor]
 """Tensors that an aid remembers from one hop to the next, by name, (items, ...) each."""
@@ -85,7 +88,7 @@ class Wearable(Aid):
         audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
             kHz; components above get the gain of the highest band. A ``Stream`` accepts only 16000
-            Hz. Whole signals at other rates are resampled, which adds 8.5 ms of look-ahead.
+            Hz. Whole signals at other rates are resampled, which adds up to 8.5 ms of look-ahead.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal. The output of each ear is
