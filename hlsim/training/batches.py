@@ -38,13 +38,14 @@ Batch = dict[str, Tensor]
 """Tensors of a batch by name.
 
 - ``signal``: input of the network in pascals with shape (items, time)
-- ``thresholds``: thresholds of the ears in dB HL with shape (items, 8)
+- ``thresholds``: thresholds of the ears in dB HL at ``FREQUENCIES`` with shape (items, 8)
 - ``clean``: clean speech in pascals with shape (items, time)
-- ``noise_reduction`` (hearing aids): strength of noise reduction, 0 or 1, with shape (items,)
+- ``noise_reduction`` (hearing aids): strength of noise reduction, 0 (none) or 1, with shape
+  (items,)
 
 For several microphones, ``signal`` has the shape (items, microphones, time). For two ears with
-several microphones, the shapes are (items, microphones, 2, time), (items, 2, 8) and (items, 2,
-time).
+several microphones, the shapes are (items, microphones, ears, time), (items, ears, 8) and (items,
+ears, time), the left ear first.
 """
 
 MAX_DEVICES = 64
@@ -81,7 +82,8 @@ class TrainingData:
 
     Attributes:
         speech: Folder or files of clean speech, see ``AudioFiles``.
-        noise: Folder or files of noise that is mixed in, or pairs of clean and noisy speech.
+        noise: Folder or files of noise that is mixed in, or pairs of files of clean and noisy
+            speech, whose difference is the noise.
         audiograms: CSV file of measured ears, which are used in addition to random ones.
         valid_speech: Clean speech for validation, like ``speech``.
         valid_noise: Noise for validation, like ``noise``.
@@ -214,8 +216,8 @@ class _RandomBatches(Dataset[Batch]):
             generator: Source of the random numbers.
 
         Returns:
-            ``signal`` in pascals with shape (count, time), ``thresholds`` in dB HL with shape
-            (count, 8), and others of ``Batch``.
+            The tensors that ``Batch`` describes, of ``count`` items. An aid with one microphone
+            gets both ears of recorded scenes for two ears as items: twice as many.
         """
         raise NotImplementedError
 
@@ -345,7 +347,7 @@ class _CompensatorBatches(_RandomBatches):
 
         Returns:
             Clean speech and input of the aid, (count, time) each; for several microphones, (count,
-            2, time) and (count, microphones, 2, time).
+            ears, time) and (count, microphones, ears, time), with two ears.
         """
         recipe = self.recipe
         voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)

@@ -134,7 +134,12 @@ def _freeze(part: nn.Module) -> Iterator[None]:
 
 
 def _load_beamforming_aid(config: BeamformerConfig, name: str) -> nn.Module:
-    """Load an aid with several microphones, or place a new front end before a hearing aid."""
+    """Load the aid of a checkpoint, or place a new front end before it if it is a hearing aid.
+
+    Args:
+        config: Settings of the front end, which joins several microphones.
+        name: Name or folder of the checkpoint.
+    """
     start: Any = load_compensator(name)
     if not isinstance(start, HearingAid):
         return start
@@ -158,7 +163,8 @@ def train_compensator(
         data: Speech, noise and ears for training and validation.
         recipe: Network, criteria and number of steps.
         out: Folder for the results. A training that was interrupted resumes from it.
-        audiogram: Ear of a personal compensator; None trains a general one on random ears.
+        audiogram: Ear of a personal compensator; None trains a general one on random ears and
+            those of ``data``.
         simulator: Name, folder or module, see ``load_simulator``.
         options: ``max_minutes`` and options of Lightning's ``Trainer``, see ``train_network``.
 

@@ -63,7 +63,7 @@ class TrainingModule(L.LightningModule):
         """Summarise the measured values of all validation batches.
 
         Args:
-            values: All ``measured_values`` in one tensor.
+            values: All ``measured_values`` in one tensor, (values,).
 
         Returns:
             Dict with means or quantiles, and with ``score``, which is higher for a better network.
@@ -149,14 +149,14 @@ def initial_network(
         recipe: Recipe with the name of the checkpoint (``start``), the settings of the network
             (``model``) and the seed of random weights.
         build: Function that builds a network with the settings of the recipe.
-        load: Function that loads the network of a checkpoint by its name.
+        load: Function that loads the network of a checkpoint by its name or folder.
 
     Returns:
         The network, in training mode, all of whose weights are trained.
 
     Raises:
-        ValueError: There is no such checkpoint, it is of another kind, or its settings differ from
-            those of the recipe.
+        ValueError: There is no such checkpoint, it is of another kind, or the recipe has other
+            settings of the network.
 
     >>> from hlsim.neuro import NeuroMSBG, load_pretrained
     >>> from hlsim.training.recipes import SimulatorRecipe

@@ -29,16 +29,16 @@ class TrainingRecipe:
         start: Name or folder of a checkpoint to start from, instead of random weights. The network
             has the settings of the checkpoint. It is saved as the best network until training finds
             a better one.
-        steps: Number of training steps. The learning rate falls over them.
-        batch: Number of clips per step.
-        seconds: Duration of each clip in seconds.
-        learning_rate: Highest learning rate of the optimiser, AdamW.
-        weights: Weight under the name of each criterion.
+        steps: Number of training steps, 1 or more. The learning rate falls over them.
+        batch: Number of clips per step, 1 or more.
+        seconds: Duration of each clip in seconds, above 0 and at most 600.
+        learning_rate: Highest learning rate of the optimiser, AdamW, above 0.
+        weights: Weight under the name of each criterion, 0 or more, of which one is above 0.
         levels: Lowest and highest level of the speech in dB SPL.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1.
-        validate_every: Number of steps between validations.
-        validation_items: Number of validation items, rounded up to batches of 4.
-        seed: Seed of every random draw.
+        validate_every: Number of steps between validations, 1 or more.
+        validation_items: Number of validation items, 1 or more, rounded up to batches of 4.
+        seed: Seed of every random draw, a whole number below 2**32 in magnitude.
 
     Raises:
         ValueError: A setting is out of range, or the settings contradict each other.
@@ -100,7 +100,7 @@ class SimulatorRecipe(TrainingRecipe):
             audible), all in dB / 10; of ``gradient``, 1 minus the cosine of the gradients through
             the network and through the teacher; and of the paper's ``magnitude``, ``phase``,
             ``complex`` and ``time``. Gradients are compared in every third step, and such a step
-            takes three times as long.
+            takes three to four times as long.
         unit_power: Signal that is scaled to unit power, ``truth`` or ``input``. Estimate and target
             are multiplied by the same factor before all criteria but ``levels`` and ``gradient``.
             ``truth`` is the target, with which soft items count as much as loud ones. ``input`` is
@@ -114,8 +114,8 @@ class SimulatorRecipe(TrainingRecipe):
             is several times faster on hardware that supports it, and several times slower on other
             hardware. Transforms, prior, scans and criteria remain in float32, and so does a network
             of the structure ``bands``.
-        average: Weight of the past in the moving average of the weights; 0 for none. The average is
-            validated and saved.
+        average: Weight of the past in the moving average of the weights, from 0 (none) to below 1.
+            The average is validated and saved.
 
     >>> SimulatorRecipe(steps=1000).learning_rate
     0.003
@@ -164,17 +164,19 @@ class CompensatorRecipe(TrainingRecipe):
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
             them, a network learns that steady sounds are noise.
         equalised: Share of clips of speech, and of noise, that are equalised at random by up to 15
-            dB. A few voices have few spectra, and the gains for other voices would be up to 20 dB
-            wrong.
-        noisy: Share of noisy clips among those of speech, if there is noise.
+            dB, from 0 to 1. A few voices have few spectra, and the gains for other voices would be
+            up to 20 dB wrong.
+        noisy: Share of noisy clips among those of speech, if there is noise, from 0 to 1. In random
+            scenes it is that of all clips, and the others have an SNR of 60 dB.
         babble: Share of noisy clips whose noise consists of other voices of the batch, at most
-            four; 0 for random scenes of several microphones, which have other voices in any case.
+            four, from 0 to 1; 0 for random scenes of several microphones, which have other voices
+            in any case.
         snr: Lowest and highest signal-to-noise ratio in dB. The level of the speech is its active
             level, without pauses.
         mismatch: Standard deviation in dB of the gains of the microphones in random scenes.
         reverberation_time: Longest reverberation time in s of the rooms of half of the random
             scenes, 0.2 to 1.5; 0 for scenes without rooms. It needs the extra ``scenes``.
-        unreduced: Share of items for which a hearing aid's noise reduction is off.
+        unreduced: Share of items for which a hearing aid's noise reduction is off, from 0 to 1.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.
         limit_to_ear: Whether the output of a hearing aid is limited to the uncomfortable levels of

@@ -38,7 +38,8 @@ class SimulatorTraining(TrainingModule):
         teacher: Simulator at 16 kHz, which is moved to the device of the training.
 
     Raises:
-        ValueError: The network with which the recipe starts does not exist or has other settings.
+        ValueError: The settings of the network are not valid, or the network with which the recipe
+            starts does not exist or has other settings.
 
     >>> recipe = SimulatorRecipe(model={"channels": 4, "blocks": 1})
     >>> signal, ears = 0.02 * torch.randn(1, 4000), torch.full((1, 8), 40.0)
