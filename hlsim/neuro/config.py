@@ -104,11 +104,12 @@ class NetworkConfig(ModelConfig):
     """Sizes of the networks on spectrograms: Neuro-MSBG and ``MappingCompensator``.
 
     Such a network encodes the spectrogram of its input on a coarser grid, processes it in
-    *dual-path blocks* (layers along time, then layers along frequency), and decodes it again.
+    *dual-path blocks* (layers along time, then layers along frequency), and decodes it again. All
+    numbers are from 1 to 1024; ``dense_depth`` may also be 0.
 
     Attributes:
-        fft: Length of the Fourier transform in samples at 16 kHz.
-        window: Length of the Hann window in samples at 16 kHz.
+        fft: Length of the Fourier transform in samples at 16 kHz, an even number.
+        window: Length of the Hann window in samples at 16 kHz, at most ``fft``.
         hop: Samples at 16 kHz from one frame to the next, at most a quarter of ``window``.
         channels: Number of feature maps of the network.
         dense_depth: Number of dilated convolutions of the encoder and of each decoder.
@@ -177,7 +178,7 @@ class NetworkConfig(ModelConfig):
 
     @property
     def hz(self) -> tuple[float, ...]:
-        """Frequencies of the spectrogram in Hz."""
+        """Frequencies of a spectrogram at 16 kHz in Hz."""
         return tuple(NEURO_RATE * k / self.fft for k in range(self.fft // 2 + 1))
 
     @property
@@ -213,9 +214,10 @@ class NeuroConfig(NetworkConfig):
             that corrects the gains in MSBG's frequency channels (``hlsim.neuro.bands``), at a lower
             cost than the paper's ``dual-path`` networks. It needs ``block="cnn"``,
             ``phase="predicted"``, ``prior``, ``level_aware``, and the default ``fft``, ``window``
-            and ``hop``. The ``monolithic`` baselines of the paper
-            have a linear encoder and no frequency axis: each frame is a vector of ``channels``
-            values, and the blocks run along time only.
+            and ``hop``, here in samples at 16537.5 Hz. It ignores ``audiogram``, ``dense_depth``
+            and the second numbers of ``stride`` and ``kernel``. The ``monolithic`` baselines of the
+            paper have a linear encoder and no frequency axis: each frame is a vector of
+            ``channels`` values, and the blocks run along time only.
         audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation
             1), or ``concatenated`` for eight thresholds next to magnitude and phase along frequency
             (its Table IV).

@@ -83,7 +83,10 @@ _IMAGE_BINS = (_UNIT_AT_FRAME_RATE - _UNIT) // 2
 def to_frame_rate(waveform: Tensor) -> Tensor:
     """Filter signals with outer and middle ear, without delay, and convert them to the frame rate.
 
-    Shape: (items, time) -> (items, time * 1323 / 1280).
+    The first sample of the result lies 0.13 ms after the first one of the signal, so that frames
+    lie where those of MSBG do. ``from_frame_rate`` undoes this shift.
+
+    Shape: (items, time) -> (items, time * 1323 / 1280), rounded up.
 
     Args:
         waveform: Signals at 16 kHz, whose first sample is at a multiple of ``FRAME_PERIOD``.
@@ -105,8 +108,8 @@ def to_frame_rate(waveform: Tensor) -> Tensor:
 def from_frame_rate(waveform: Tensor, severity: Tensor, length: int) -> Tensor:
     """Convert signals to 16 kHz, and apply the other fixed filters of MSBG.
 
-    They are the filter bank without a loss, the inverse of the outer and middle ear, and a
-    low-pass.
+    They are the sum of the filter bank's channels without gains, the inverse of the outer and
+    middle ear, and a low-pass.
 
     Shape: (items, time), (items,) -> (items, length).
 
@@ -135,7 +138,10 @@ def from_frame_rate(waveform: Tensor, severity: Tensor, length: int) -> Tensor:
 def analyse_frames(waveform: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the spectra of MSBG's frames of signals, with the time origin in their middle.
 
-    Shape: (items, time) -> (items, frames, 97) twice, the real and the imaginary parts.
+    The first frame begins 72 samples (three hops) before the signal.
+
+    Shape: (items, time) -> (items, ceil(time / 24) + 3, 97) twice, the real and the imaginary
+        parts.
 
     >>> real, imaginary = analyse_frames(torch.randn(1, 240))
     >>> real.shape

@@ -73,8 +73,9 @@ class NeuroMSBG(EarNetwork, HubModel):
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
             the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
-        compute_prior: Compute the constants of MSBG's formulae, which takes up to half a second for
-            the first network. With False, they are NaN until a state dict is loaded.
+        compute_prior: Compute the constants of MSBG's formulae, which takes 0.2 s for the first
+            default network, and up to 2 s with a longer transform. With False, they are NaN until a
+            state dict is loaded.
 
     Attributes:
         emulates_msbg: True, because the simulator emulates MSBG.

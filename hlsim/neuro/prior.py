@@ -85,8 +85,8 @@ class BandGains(nn.Module):
         compute: Compute the constants. With False, they are NaN until a state dict is loaded.
 
     Attributes:
-        receptive_field: Number of input samples before and after an output sample that influence
-            it, in addition to those of the transform.
+        receptive_field: Number of input samples at ``rate`` before and after an output sample that
+            influence it, in addition to those of the transform.
 
     >>> gains = BandGains(STFT(192, 96, 24), rate=16537.5)
     >>> gains.channel_levels(torch.ones(1, 50, 97), torch.tensor([2])).shape
