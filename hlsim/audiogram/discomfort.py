@@ -29,10 +29,10 @@ def predict_uncomfortable_levels(thresholds: Levels) -> Levels:
 
     The two numbers were fitted to 138 people of the Oldenburg Hearing Health Record (Jafri et al.
     2025, doi 10.5281/zenodo.16919812, CC BY 4.0) at 500, 1000, 2000 and 4000 Hz. A level of 115 dB
-    HL or more counted as not reached. For 138 other people, the error of the 942 levels that they
-    reached has a root mean square of 8.7 dB and a mean of 2.6 dB; 137 levels were not reached.
-    People with equal thresholds differ much, so measure the levels where you can. The line is
-    assumed to hold at other frequencies, too.
+    HL or more counted as not reached. For 138 other people, the prediction minus the level, over
+    the 942 levels that they reached, has a root mean square of 8.7 dB and a mean of 2.6 dB; 137
+    levels were not reached. People with equal thresholds differ much, so measure the levels where
+    you can. The line is assumed to hold at other frequencies, too.
 
     Args:
         thresholds: Thresholds in dB HL: a number, an array or a tensor of any shape.

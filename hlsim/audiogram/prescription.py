@@ -256,7 +256,7 @@ def _table(name: str) -> list[Any]:
 def _free_field_threshold(points: Frequencies) -> NDArray[np.float64]:
     """Return the free-field level in dB SPL of 0 dB HL at frequencies in Hz.
 
-    It is interpolated linearly, and constant outside 125 Hz to 12.5 kHz. Shape: (points,).
+    It is interpolated linearly in Hz, and constant outside 125 Hz to 12.5 kHz. Shape: (points,).
     """
     grid, levels = zip(*FREE_FIELD_THRESHOLD_SPL.items(), strict=True)
     return np.interp(points, grid, levels)

@@ -38,8 +38,7 @@ LOWEST_UCL, HIGHEST_UCL = 20.0, 140.0
 """Range of the uncomfortable levels of an audiogram in dB HL."""
 
 UCL_NOT_REACHED = 115.0
-"""Uncomfortable level in dB HL from which on it was not reached: the real one is at least as high.
-"""
+"""Level in dB HL from which on a measured uncomfortable level means that none was reached."""
 
 HIGHEST_SIMULATED = 100.0
 """Highest threshold in dB HL that a simulator accepts. MSBG divides by 0 at 105 dB HL."""

@@ -23,10 +23,11 @@ def read_audiograms(
     """Read the audiograms of a table with one row per ear, per listener or per threshold.
 
     A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``.25k``, or ``L250`` and
-    ``R250`` if each row has both ears. A long table has the columns ``frequency`` and
-    ``threshold``, and ``listener`` and ``ear`` if it has several ears. Other columns may have any
-    name, in a long table only if it has ``listener`` and ``ear``. A file may have commas,
-    semicolons or tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
+    ``R250`` if each row has both ears; one of uncomfortable levels ``ucl_250``, or ``ucl_L250`` and
+    ``ucl_R250``. A long table has the columns ``frequency`` in Hz and ``threshold``, perhaps
+    ``ucl``, and ``listener`` and ``ear`` if it has several ears. Other columns may have any name,
+    in a long table only if it has ``listener`` and ``ear``. A file may have commas, semicolons or
+    tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
         path: A CSV file, a pandas ``DataFrame``, or ``"standard"`` for Bisgaard's audiograms N1 to
@@ -78,7 +79,7 @@ def read_listeners(
         names: Names of the listeners to read, by default all. Other listeners are not validated.
 
     Returns:
-        Listeners, each under its name.
+        Listeners, each under its name. An ear without thresholds in a table is None.
 
     Raises:
         ValueError: The file cannot be read, has no listener of a name, the names of two listeners
@@ -126,7 +127,7 @@ def _group_rows(path: str | Path | Any) -> dict[str, list[_Row]]:
     """Read the rows of a table, and group them by the name of the listener.
 
     Raises:
-        ValueError: The table cannot be read, or a row has no name of a listener.
+        ValueError: The table cannot be read, has no column ``listener``, or no name in a row of it.
     """
     rows: dict[str, list[_Row]] = {}
     for place, row in _read_rows(path):
@@ -257,8 +258,9 @@ def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[s
         the ear and, per frequency, one column of thresholds and perhaps of uncomfortable levels.
 
     Raises:
-        ValueError: A column is missing, a frequency is not understood, an ear has two thresholds at
-            one frequency, or a row lacks the listener or the ear that other rows have.
+        ValueError: There are further columns without those of the listener and the ear, a frequency
+            is not understood, an ear has two thresholds at one frequency, or a row lacks the
+            listener or the ear that other rows have.
     """
     names = [column for column in rows[0][1] if column not in (frequency, threshold, *ucl)]
     key_names: list[str] = [name for name in ("listener", "ear") if name in names]

@@ -47,7 +47,8 @@ def as_thresholds(
 
     Returns:
         Thresholds in dB HL: (8,) for one ear, (2, 8) for a ``Listener``, (batch, 8) and
-        (batch, 2, 8) for sequences of them. A floating-point tensor is returned as it is.
+        (batch, 2, 8) for sequences of them, in float32. A floating-point tensor is returned as it
+        is, (..., 8).
 
     Raises:
         ValueError: The value does not describe ears, an ear is missing, a tensor does not have
@@ -113,8 +114,11 @@ def find_limits(audiogram: AudiogramLike | None) -> Tensor | None:
     ``predict_limits`` returns.
 
     Args:
-        audiogram: One or more ears. For None and a tensor of thresholds, which have no measured
-            levels, the result is None.
+        audiogram: One or more ears. The result is None for None, for a tensor of thresholds, and
+            for an array of several ears, which have no measured levels.
+
+    Raises:
+        ValueError: An ear is not valid, or a listener lacks one.
 
     >>> find_limits(["N3", "N4"]).shape
     torch.Size([2, 8])
@@ -145,8 +149,8 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
         listener follow one another.
 
     Raises:
-        ValueError: An ear is not valid, a level of one that is returned is above 100 dB HL, or a
-            listener lacks an ear.
+        ValueError: An ear is not valid, a listener lacks one, or an ear that was measured at other
+            frequencies has a level above 100 dB HL.
 
     >>> ears_on_other_grids(["N3", {500: 20}])
     [None, Audiogram({500: 20})]

@@ -281,8 +281,8 @@ class Audiogram:
     def who_grade(self) -> str:
         """Grade of hearing loss: ``"normal"``, ``"mild"`` to ``"profound"``, or ``"complete"``.
 
-        The pure-tone average (``pta``) decides. The grade differs from ``severity``, which is
-        MSBG's.
+        The pure-tone average (``pta``) decides: the grades end below 20, 35, 50, 65, 80 and 95 dB
+        HL (``hlsim.audiogram.scale.WHO_GRADES``). They differ from ``severity``, which is MSBG's.
 
         Source: World Health Organization 2021, World report on hearing, Table 1.3.
         """
@@ -318,14 +318,15 @@ class Audiogram:
         """Convert a row of a table with the thresholds of one ear into an audiogram.
 
         Args:
-            row: Texts by column. Columns of thresholds have the names that ``threshold_columns``
-                describes; other columns are ignored. A text that is empty, ``NA``, ``null``,
-                ``None`` or ``nan`` means that the frequency was not measured.
+            row: Texts by column. ``hlsim.audiogram.columns.threshold_columns`` describes the names
+                of columns of thresholds and of uncomfortable levels; other columns are ignored. A
+                text that is empty, ``NA``, ``null``, ``None`` or ``nan`` means that the frequency
+                was not measured.
 
         Raises:
-            ValueError: The row has no measured threshold, those of both ears, two of one frequency,
-                one that is not a number from -10 to 120, or a column whose name looks like
-                thresholds but is not understood.
+            ValueError: The row has the thresholds of both ears, none that was measured, two of one
+                frequency, one that is not a number from -10 to 120, an uncomfortable level that is
+                not valid, or a column whose name looks like thresholds but is not understood.
 
         >>> Audiogram.from_row({"hl_500": "20", "1k": "30"})
         Audiogram({500: 20, 1000: 30})
@@ -472,8 +473,9 @@ def ears_in_row(
 ) -> dict[EarName | None, Audiogram]:
     """Convert the thresholds in a row of a table into audiograms, one per ear that columns name.
 
-    A frequency was not measured if its value is empty, ``NA``, ``null``, ``None`` or ``nan``. An
-    ear without a measured threshold is left out.
+    Uncomfortable levels in the row become the ``ucl`` of the audiograms. A frequency was not
+    measured if its value is empty, ``NA``, ``null``, ``None`` or ``nan``. An ear without a measured
+    threshold is left out.
 
     Args:
         row: Texts by column.
@@ -483,8 +485,9 @@ def ears_in_row(
         The left and the right ear, or one ear under None if columns do not name the ear.
 
     Raises:
-        ValueError: There is no measured threshold, a column is not understood, a text is not a
-            level from -10 to ``highest``, some columns name an ear and others do not, an ear has
+        ValueError: There is no measured threshold, a column is not understood, a threshold is not a
+            number from -10 to ``highest``, an uncomfortable level is not one from 20 to 140 or is
+            below the threshold, some columns name an ear and others do not, an ear has
             uncomfortable levels but no thresholds, or a remark is a number.
 
     >>> ears_in_row({"L500": "20", "R500": "30"})
