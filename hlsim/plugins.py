@@ -13,13 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-import scipy
 import torch
 from torch import Tensor, nn
-
-MAX_DELAY_SECONDS = 2e-3
-"""Largest delay in seconds of a plug-in that must be time-aligned."""
 
 _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 """Names of plug-ins: a module or a file, and one of its attributes."""
@@ -153,37 +148,6 @@ class WaveformPlugin:
         if not output.requires_grad and not bool(output.isfinite().all()):
             raise ValueError(f"{self.kind} {self.name} returned samples that are NaN or infinite")
         return output.to(waveform)
-
-    def check_aligned(self, waveform: Tensor, sample_rate: int, *arguments: Any) -> None:
-        """Call the plug-in, and reject an output that is delayed or advanced by more than 2 ms.
-
-        The delay is that at which the first channels of input and output correlate most.
-
-        Args:
-            waveform: First argument of the plug-in. Shape: (..., time).
-            sample_rate: Sample rate in Hz.
-            arguments: Further arguments of the plug-in.
-
-        Raises:
-            ValueError: The call fails, or the output is silent or not time-aligned.
-        """
-        output = self(waveform, *arguments)
-        channels = [
-            signal.reshape(-1, signal.shape[-1])[0].resolve_neg().numpy()
-            for signal in (output, waveform)
-        ]
-        if not channels[0].any():
-            raise ValueError(
-                f"{self.kind} {self.name} returned silence for sound, expected an output that is "
-                "time-aligned with the input"
-            )
-        correlation = np.abs(scipy.signal.correlate(*channels, method="fft"))
-        delay = int(correlation.argmax()) - (waveform.shape[-1] - 1)
-        if abs(delay) > MAX_DELAY_SECONDS * sample_rate:
-            raise ValueError(
-                f"{self.kind} {self.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
-                "an output that is time-aligned with the input; shift the output in your code"
-            )
 
 
 _load_numbers = itertools.count()

@@ -24,6 +24,7 @@ from hlsim.calibration import (
     set_level,
 )
 from hlsim.checks import check_attributes, check_rate, check_waveform
+from hlsim.dsp.fft import correlate
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.interpolation import interpolate
 from hlsim.dsp.resample import HIGHEST_RATE, resample
@@ -43,6 +44,9 @@ UNSMEARED = "msbg-unsmeared"
 
 _HALF_LENGTH_SECONDS = 0.064
 """Time in seconds that the filter of ``Attenuation`` covers before time 0, and after it."""
+
+_MAX_DELAY_SECONDS = 2e-3
+"""Largest delay in seconds of a plug-in that must be time-aligned."""
 
 _LOWEST_PLUGIN_RATE = 1000
 """Lowest sample rate of a plug-in in Hz."""
@@ -180,7 +184,7 @@ class PluginSimulator(nn.Module):
         generator = torch.Generator().manual_seed(0)
         noise = torch.randn(1, self.plugin_rate // 2, generator=generator, **settings)
         no_loss = torch.zeros(1, len(FREQUENCIES), **settings)
-        self.plugin.check_aligned(set_level(noise, 65.0), self.plugin_rate, no_loss)
+        check_aligned(self.plugin, set_level(noise, 65.0), self.plugin_rate, no_loss)
 
     def __str__(self) -> str:
         return str(self.plugin)
@@ -208,6 +212,39 @@ class PluginSimulator(nn.Module):
         perceived = self.plugin.call(inputs, ears)
         output = resample(perceived, self.plugin_rate, self.sample_rate)
         return output[..., : waveform.shape[-1]].reshape(*batch, -1) / gain
+
+
+def check_aligned(
+    plugin: WaveformPlugin, waveform: Tensor, sample_rate: int, *arguments: Any
+) -> None:
+    """Call a plug-in, and reject an output that is delayed or advanced by more than 2 ms.
+
+    The delay is that at which the first channels of input and output correlate most.
+
+    Args:
+        plugin: Simulator or enhancer.
+        waveform: First argument of the plug-in. Shape: (..., time).
+        sample_rate: Sample rate in Hz.
+        arguments: Further arguments of the plug-in.
+
+    Raises:
+        ValueError: The call fails, or the output is silent or not time-aligned.
+
+    >>> check_aligned(WaveformPlugin("torch:sin", "enhancer"), torch.randn(2, 16000), 16000)
+    """
+    output = plugin(waveform, *arguments)
+    channels = [signal.reshape(-1, signal.shape[-1])[0] for signal in (output, waveform)]
+    delay, coefficient = correlate(*channels)
+    if coefficient == 0.0:
+        raise ValueError(
+            f"{plugin.kind} {plugin.name} returned silence for sound, expected an output that is "
+            "time-aligned with the input"
+        )
+    if abs(delay) > _MAX_DELAY_SECONDS * sample_rate:
+        raise ValueError(
+            f"{plugin.kind} {plugin.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
+            "an output that is time-aligned with the input; shift the output in your code"
+        )
 
 
 def load_simulator(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hlsim.calibration import set_level
 from hlsim.plugins import WaveformPlugin, load_plugin
+from hlsim.simulators import check_aligned
 
 CODE = """
 import torch
@@ -34,6 +35,12 @@ def complex_numbers(waveform):
 
 def integers(waveform):
     return (32767 * waveform).to(torch.int16)
+
+def offset(waveform):
+    return waveform + 10.0
+
+def silent(waveform):
+    return 0.0 * waveform
 
 def array(waveform):
     return waveform.numpy()
@@ -117,13 +124,16 @@ def test_a_scalar_is_no_output_of_an_aid(module: str, waveform: Tensor) -> None:
 def test_outputs_with_the_negative_bit_are_accepted(module: str) -> None:
     plugin = WaveformPlugin(f"{module}:negative", "teacher")
     assert plugin(noise()).is_neg()
-    plugin.check_aligned(noise(), 16000)
+    check_aligned(plugin, noise(), 16000)
 
 
 def test_outputs_that_are_not_aligned_are_rejected(module: str) -> None:
-    WaveformPlugin(f"{module}:half", "teacher").check_aligned(noise(), 16000)
-    with pytest.raises(ValueError, match=r"delays by 5\.0 ms"):
-        WaveformPlugin(f"{module}:late", "teacher").check_aligned(noise(), 16000)
+    for attribute in ("half", "offset"):
+        check_aligned(WaveformPlugin(f"{module}:{attribute}", "teacher"), noise(), 16000)
+    for attribute, words in (("late", r"delays by 5\.0 ms"), ("silent", "returned silence")):
+        plugin = WaveformPlugin(f"{module}:{attribute}", "teacher")
+        with pytest.raises(ValueError, match=words):
+            check_aligned(plugin, noise(), 16000)
 
 
 def test_names_that_cannot_be_loaded_are_rejected(module: str) -> None:

@@ -95,24 +95,33 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
     return min(length for length in lengths if length >= minimum)
 
 
-def cross_correlation(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    """Compute the correlation of two real signals at all lags, as ``scipy.signal.correlate`` does.
+def correlate(output: Tensor, reference: Tensor) -> tuple[int, float]:
+    """Find the lag at which the cross-correlation of two signals has the largest magnitude.
+
+    The mean of each signal is subtracted first.
 
     Args:
-        first: Signal, (time,).
-        second: Signal, (other time,).
+        output: The output. Shape: (time,).
+        reference: Signal with which it is compared. Shape: (other time,).
 
     Returns:
-        Correlations, (time + other time - 1,). The one at which both signals begin together has the
-        index ``len(second) - 1``. Earlier ones belong to lags at which the first signal is earlier.
+        The number of samples by which the output is later, negative if it is earlier; and the
+        magnitude of the correlation coefficient at this lag, 0 to 1, or 0 if a signal is constant.
 
-    >>> cross_correlation(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0])).round(6) + 0.0
-    array([0., 0., 0., 1.])
+    >>> speech = torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    >>> lag, coefficient = correlate(torch.nn.functional.pad(-speech, (32, 0)), speech)
+    >>> lag, round(coefficient, 3)
+    (32, 1.0)
     """
-    points = fft_length(len(first) + len(second) - 1)
-    spectrum = np.fft.rfft(first, points) * np.fft.rfft(second, points).conj()
-    correlation = np.fft.irfft(spectrum, points)
-    return np.concatenate((correlation[points - len(second) + 1 :], correlation[: len(first)]))
+    signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, reference)]
+    points = fft_length(len(output) + len(reference) - 1)
+    spectra = [np.fft.rfft(signal, points) for signal in signals]
+    magnitudes = np.abs(np.fft.irfft(spectra[0] * spectra[1].conj(), points))
+    peak = int(magnitudes.argmax())
+    # The correlations at negative lags are at the end.
+    lag = peak if peak < len(output) else peak - points
+    scale = np.prod([np.linalg.norm(signal) for signal in signals])
+    return lag, float(magnitudes[peak] / scale) if scale else 0.0
 
 
 def power(spectrum: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from hlsim.dsp.fir import filter_without_delay
 from hlsim.evaluation.aid_properties import measure_gain_curve
 from hlsim.metrics.band_levels import band_centres
 from hlsim.plugins import WaveformPlugin
+from hlsim.simulators import check_aligned
 
 UNAIDED = "unaided"
 """Name of the condition without an aid."""
@@ -391,7 +392,7 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
     enhancers: dict[str, WaveformPlugin] = {}
     for name in names:
         enhancer = WaveformPlugin(name, "enhancer")
-        enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
+        check_aligned(enhancer, speech, NEURO_RATE, NEURO_RATE)
         label = name.rpartition(":")[2]
         enhancers[name if label in enhancers else label] = enhancer
     return enhancers

@@ -9,14 +9,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.checks import check_names, loud_outputs
-from hlsim.dsp.fft import cross_correlation
+from hlsim.dsp.fft import correlate
 from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
@@ -263,29 +262,6 @@ def find_lag(output: Tensor, clean: Tensor) -> int | None:
     """
     lag, coefficient = correlate(output, clean)
     return lag if coefficient > CORRELATION_FLOOR else None
-
-
-def correlate(output: Tensor, clean: Tensor) -> tuple[int, float]:
-    """Find the lag at which the cross-correlation of two signals has the largest magnitude.
-
-    Args:
-        output: The output. Shape: (time,).
-        clean: Clean speech. Shape: (time,).
-
-    Returns:
-        The number of samples by which the output is later, negative if it is earlier; and the
-        magnitude of the correlation coefficient at this lag, 0 to 1, or 0 if a signal is constant.
-
-    >>> speech = torch.randn(1000, generator=torch.Generator().manual_seed(0))
-    >>> lag, coefficient = correlate(torch.nn.functional.pad(-speech, (32, 0)), speech)
-    >>> lag, round(coefficient, 3)
-    (32, 1.0)
-    """
-    signals = [(signal.double() - signal.double().mean()).numpy() for signal in (output, clean)]
-    correlation = np.abs(cross_correlation(*signals))
-    peak = int(correlation.argmax())
-    scale = np.prod([np.linalg.norm(signal) for signal in signals])
-    return peak - (len(clean) - 1), float(correlation[peak] / scale) if scale else 0.0
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:

@@ -19,7 +19,8 @@ from hlsim.audiogram.prescription import FREE_FIELD_THRESHOLD_SPL
 from hlsim.audiogram.scale import interpolate_over_log
 from hlsim.calibration import PASCAL_SPL, POWER_FLOOR, gain_to_pascals
 from hlsim.checks import check_finite, check_rate, check_waveform
-from hlsim.evaluation.measures import CORRELATION_FLOOR, correlate
+from hlsim.dsp.fft import correlate
+from hlsim.evaluation.measures import CORRELATION_FLOOR
 from hlsim.metrics.sii import SII_BANDS, sii
 
 Array = NDArray[np.float64]
