@@ -147,7 +147,7 @@ def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
 
 
 def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
-    """Filter signals block by block, four times as fast as by one transform of the whole signal.
+    """Filter signals block by block, which is faster than one transform of the whole signal.
 
     Shape: (..., time), (2049,) -> (..., length).
 

@@ -44,8 +44,8 @@ HIGHEST_RATE = 1_000_000
 MAX_KERNEL_VALUES = 100_000_000
 """Largest number of values of a kernel without its margins, 0.4 GB in float32.
 
-To 16000 Hz, the kernel has 0.13 million values from 44100 Hz and 12 million from 44056 Hz. From
-44101 Hz it would have 710 million.
+To 16000 Hz, there are 0.07 million from 44100 Hz and 11 million from 44056 Hz. From 44101 Hz there
+would be 706 million.
 """
 
 

@@ -93,7 +93,8 @@ def sphere_response(cosines: ArrayLike, frequencies: ArrayLike) -> NDArray[np.co
 def microphone_positions(spacing: float = 0.01) -> NDArray[np.float64]:
     """Return the positions of a front and a rear microphone at each side of a spherical head.
 
-    They lie on the sphere in the horizontal plane, the same way in front of and behind each ear.
+    They lie on the sphere in the horizontal plane, at the same distance in front of each ear and
+    behind it.
 
     Args:
         spacing: Distance between the two microphones of a side along the sphere in m.

@@ -127,7 +127,8 @@ def simulate_cochlea(
     Shape: (items, time), (items, channels) -> complex (items, points // (2 * rate_divisor) + 1).
 
     Args:
-        signals: Signals in Pa, which are zero-padded to ``points`` and then treated as periodic.
+        signals: Signals in Pa, which are zero-padded to ``points // rate_divisor`` samples and then
+            treated as periodic.
         ratios: dB by which each channel changes per dB of input, from ``expansion_ratios`` in
             ``hlsim.msbg.recruitment``.
         bank: Filter bank for the severity of the ears.

@@ -6,16 +6,16 @@ channels form a *rate band* with a common sample rate and a common *detector*, t
 their envelopes are computed:
 
 - ``"modulus"``: Narrow channels are analytic signals (complex signals without negative frequencies)
-  at about 5.5 kHz, or at about 11 kHz (9 kHz where the highest frequency of interest allows it).
-  The modulus of an analytic signal is its envelope. Rectifying the channel would add harmonics, but
-  the low-pass of the envelope removes them.
+  at about 5.5 kHz, or at 9 to 13 kHz, depending on the highest frequency of interest. The modulus
+  of an analytic signal is its envelope. Rectifying the channel would add harmonics, but the
+  low-pass of the envelope removes them.
 - ``"harmonics"``: With severe losses, channels are so wide for their centre frequency that
   harmonics reach down to 0 Hz. Two harmonics complete the modulus of these channels.
 - ``"itself"``: The lowest channels, and the widest ones at 44.1 kHz, are rectified as in pyclarity.
 
 Channels whose centre frequency is far above the highest frequency of interest respond only with the
-lower edges of their bands, and all of them have the expansion ratio of the threshold at 8 kHz. They
-are computed as one channel, their sum.
+lower edges of their bands, and all of them have the expansion ratio of the threshold at 8 kHz,
+unless higher thresholds were measured. They are computed as one channel, their sum.
 """
 
 import itertools
@@ -75,7 +75,7 @@ class RateBand:
             ``"modulus"``, the modulus of its analytic signal; or ``"harmonics"``, this modulus with
             two harmonics.
         response: Frequency responses of the channels, (channels, points // 2 + 1), or of their
-            analytic signals, (channels, points).
+            analytic signals, (channels, points), without frequencies that the signals do not have.
         mean_weights: Weights for ``hlsim.msbg.envelope.partial_means``, (3, samples per step).
         interpolation: Weights for ``hlsim.msbg.recruitment.interpolate``. For the detector
             ``"modulus"`` each is repeated, for the real and the imaginary part; of the analytic
