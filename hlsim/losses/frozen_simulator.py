@@ -64,7 +64,7 @@ class FrozenSimulator:
             ``"normal-hearing"``, what the normal ear perceives of it. By default, each criterion
             has its own.
         checkpoint: Whether activations of the simulator are computed again in the backward pass
-            instead of stored. It has no effect on exact models.
+            instead of stored.
 
     Raises:
         ValueError: There is no such simulator, it is not valid, was built for another rate or
@@ -200,7 +200,7 @@ def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
         shape: Expected shape.
 
     Raises:
-        ValueError: It is anything else.
+        ValueError: The value is no such tensor.
 
     >>> check_shape(torch.zeros(2), "criterion", (2,))
     tensor([0., 0.])

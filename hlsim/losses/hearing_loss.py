@@ -104,15 +104,16 @@ class HearingLossLoss(nn.Module):
             ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
             exact model; ``"attenuation"``, a linear ear; ``package.module:name``, a simulator of
-            your own; or a module, which is called with a waveform and thresholds. The module itself
-            is frozen, so pass a copy of one that is still trained. It may have the attributes
+            your own; or a module, which is called with a waveform, (..., time), and thresholds in
+            dB HL, (..., 8), whose leading dimensions broadcast. The module itself is frozen, so
+            pass a copy of one that is still trained. It may have the attributes
             ``sample_rate``, ``full_scale_spl`` and ``aligned`` (false if its output is delayed),
             which are validated; ``emulates_msbg``, true if its normal ear and its phases are those
             of MSBG; ``highest_frequency`` of its output in Hz; and ``needs_exact_lengths``, true if
             silence after the end of an item changes the output before.
         sample_rate: Sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
             below 8 kHz. The criterion ``"paper"`` resamples what it compares to 16000.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
+        full_scale_spl: Level in dB SPL of RMS 1.0, 0 to 200.
         reference: Signal with which ``"paper"`` and a function compare: ``"clean"``, the clean
             speech (the default for ``"paper"``), or ``"normal-hearing"``, what a normal ear
             perceives of it (the default otherwise). ``heard`` returns the same choice, and by
@@ -139,11 +140,12 @@ class HearingLossLoss(nn.Module):
             storing them, which takes less memory and more time. Value and gradient are the same. A
             module of your own gets the attribute ``checkpoint = True``; what it then stores is up
             to its code.
-        loudness: Target of the perceived loudness, in dB relative to a normal ear: one number, or a
-            dict of numbers by the level of the clean speech in dB SPL, such as
-            ``{50: 0, 65: -5, 80: -9}``, which is interpolated. The reference gets this gain. Each
-            of two ears has this target; both together are louder than one, so that two ears need a
-            lower number. Most people prefer less than normal loudness, see the guide about levels.
+        loudness: Target of the perceived loudness, -40 to 20 dB relative to a normal ear: one
+            number, or a dict of numbers by the level of the clean speech in dB SPL, 0 to 120, such
+            as ``{50: 0, 65: -5, 80: -9}``, which is interpolated. The reference gets this gain.
+            Each of two ears has this target; both together are louder than one, so that two ears
+            need a lower number. Most people prefer less than normal loudness, see the guide about
+            levels.
 
     Raises:
         ValueError: A name is unknown, a value has another type or is out of range, ``loudness`` is
@@ -462,12 +464,12 @@ class HASPILoss(HearingLossLoss):
     It is called as ``loss(output, clean, audiogram=None, lengths=None)``, with waveforms of
     shape (..., time) in pascals, and returns a scalar; ``HearingLossLoss`` describes the details.
     Items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. On one core, a step costs
-    9 to 18 times that of the default loss, with HASQI 20 to 41 times, the more items the more.
+    8 to 18 times that of the default loss, with HASQI 20 to 41 times, the more items the more.
 
     Args:
         audiogram: Ear or ears, as in ``HearingLossLoss``.
-        quality: Weight of 1 minus HASQI, beside 1 for 1 minus HASPI.
-        level: Weight of level and peaks. With 0 a model learns to be as loud as it can.
+        quality: Weight of 1 minus HASQI, 0 or more, beside 1 for 1 minus HASPI.
+        level: Weight of level and peaks, 0 or more. With 0 a model learns to be as loud as it can.
         options: ``simulator``, ``sample_rate``, ``full_scale_spl``, ``reduction``, ``normal``,
             ``ears``, ``checkpoint`` and ``loudness`` of ``HearingLossLoss``.
 

@@ -25,9 +25,9 @@ def score_loss(
     """Compute 1 minus the score of each item, for training.
 
     The ear's internal noise has no random effect (``noise="expected"``), so the loss is smooth. An
-    item has no meaningful score if its clean signal is silent, below 20 dB SPL, only as long as a
-    click, or for HASPI below the threshold of hearing: the loss of this item is 0 and has no
-    gradient. An item with NaN or infinity in ``output`` has the loss NaN.
+    item has no meaningful score if its clean signal is silent, below 20 dB SPL, shorter than 16 ms
+    without the silence at its ends, or for HASPI below the threshold of hearing: the loss of this
+    item is 0 and has no gradient. An item with NaN or infinity in ``output`` has the loss NaN.
 
     Args:
         name: Name of the score, ``"haspi"`` or ``"hasqi"``.
