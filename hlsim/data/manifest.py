@@ -120,8 +120,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
         raise ValueError(f"{path}: the manifest is not valid: {error}") from error
     if not (folder / utterances[0].path).is_file():
         raise ValueError(
-            f"{path}: its first file, {utterances[0].path}, is not in {folder}; set the root "
-            "(--root) to the folder to which the paths are relative"
+            f"{path}: its first file, {utterances[0].path}, is not in {folder}; move the manifest "
+            "to the folder to which the paths are relative, or pass this folder as root (--root)"
         )
     return utterances
 

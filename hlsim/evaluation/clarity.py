@@ -244,8 +244,8 @@ def _read_pairs(
 
     Raises:
         ValueError: There is no scene, or two files are one scene; a scene lacks its reference; a
-            file is broken, or names an unknown scene or listener; or a listener who is used lacks
-            an ear or has a name that cannot be that of a file.
+            file is broken, or names an unknown scene or listener; a listener who is used lacks an
+            ear or has a name that cannot be that of a file; or two pairs have one output file.
     """
     mixes: dict[str, Path] = {}
     for ending in _MIX_ENDINGS:
@@ -274,6 +274,15 @@ def _read_pairs(
             expected = " or ".join(path.name for path in candidates)
             raise ValueError(f"{mixes[scene]} has no reference; put {expected} beside it")
         pairs.append(_Pair(mixes[scene], reference, scene, name, people[name]))
+    by_output = {pair.output_name: pair for pair in pairs}
+    for pair in pairs:
+        other = by_output[pair.output_name]
+        if pair is not other:
+            raise ValueError(
+                f"the output of scene {pair.scene} for {pair.name} and that of scene "
+                f"{other.scene} for {other.name} would be the same file, {pair.output_name}; "
+                "rename a scene or a listener"
+            )
     if not pairs:
         raise ValueError(
             f"{folder}, {scenes_listeners or listeners}: no scene has a listener; expected files "

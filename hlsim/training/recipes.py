@@ -179,9 +179,9 @@ class CompensatorRecipe(TrainingRecipe):
         unreduced: Share of items for which a hearing aid's noise reduction is off, from 0 to 1.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
             or numbers by level, see ``HearingLossLoss``.
-        limit_to_ear: Whether the output of a hearing aid is limited to the uncomfortable levels of
-            the ear in training, see ``HearingAid``. The saved aid is limited only if it is loaded
-            with ``limit_to_ear``.
+        limit_to_ear: Whether the output of a hearing aid is limited in training to the
+            uncomfortable levels that are predicted for the ear, see ``HearingAid``. The saved aid
+            is limited only if it is loaded with ``limit_to_ear``.
 
     >>> CompensatorRecipe(kind="hearing-aid", weights={"denoising": 1.0}).steps
     3000

@@ -65,6 +65,9 @@ def make_scenes(folder: Path, rate: int) -> Path:
             write(folder / "scenes" / f"{name}_{kind}_CH1.wav", signal, rate)
     (folder / "no reference").mkdir()
     (folder / "no reference" / "S1_mix_CH1.wav").touch()
+    (folder / "one output").mkdir()
+    for name in ("S_mix_CH1", "S_reference", "S_L_mix_CH1", "S_L_reference"):
+        (folder / "one output" / f"{name}.wav").touch()
     (folder / "listeners.json").write_text(json.dumps(LISTENERS))
     (folder / "pairs.json").write_text(json.dumps(PAIRS))
     return folder
@@ -351,7 +354,8 @@ def test_existing_outputs_that_an_aid_would_replace_are_rejected(
     assert output.read_bytes() == contents
 
 
-LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
+EAR = LISTENERS["L0001"]
+LEFT_EAR_ONLY = {"L0001": {**EAR, "audiogram_levels_r": None}}
 
 
 @pytest.mark.parametrize(
@@ -368,6 +372,7 @@ LEFT_EAR_ONLY = {"L0001": {**LISTENERS["L0001"], "audiogram_levels_r": None}}
         ({"scenes_listeners": {}}, "no scene has a listener"),
         ({"listeners": LEFT_EAR_ONLY}, "L0001"),
         ({"listeners": {"../L1": LISTENERS["L0001"]}}, "cannot name a file"),
+        ({"scenes": "one output", "listeners": {"1": EAR, "L_1": EAR}}, "be the same file, S_L_1_"),
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
