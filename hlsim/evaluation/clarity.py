@@ -429,7 +429,10 @@ def _check_existing_outputs(condition: Condition, folders: Mapping[str, Path], o
 
 
 def _folder_name(condition: Condition) -> str:
-    """Return the name of the folder for a condition's signals, without unusual characters."""
+    """Return the name of the folder for a condition's signals: its name with hyphens.
+
+    They replace all characters but letters, digits and ``_.+-``.
+    """
     return re.sub(r"[^\w.+-]+", "-", condition.name).strip(".-")
 
 

@@ -125,7 +125,7 @@ def evaluate_compensators(
         measures: Names of measures in addition to HASPI and HASQI.
         precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         items: Number of items. With noise, 400 items are 200 of clean and 200 of noisy speech.
-        seconds: Length of an item in seconds. HASPI is not reliable much below 3.
+        seconds: Length of an item in seconds, 0.7 or more. HASPI is not reliable much below 3.
         levels: Levels of the clean speech in dB SPL, through which the items cycle.
         gain_ears: Names of the standard ears for the measurements in ``details``. If ``audiogram``
             is passed, they use this ear instead.

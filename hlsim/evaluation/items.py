@@ -31,7 +31,10 @@ INPUT_LEVELS = (50.0, 65.0, 80.0)
 """Levels of the clean speech in dB SPL through which items for hearing aids cycle."""
 
 MAX_SILENT_END = 0.1
-"""Largest share of an item that may be silent at its end without a warning; it costs 0.5 dB."""
+"""Largest share of an item that may be silent at its end without a warning.
+
+The level of an item includes its silence, so its speech is then 0.5 dB louder than stated.
+"""
 
 _SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB through which noisy items cycle, as in the paper."""
@@ -176,7 +179,7 @@ def draw_scene_items(
             clips.
 
     Returns: Items, see ``Item`` for the shape of their signals. Their facts are those of
-        ``draw_aid_items``, with an unknown SNR (NaN).
+        ``draw_aid_items``, with ``speech`` always noisy and an unknown SNR (NaN).
 
     Raises:
         ValueError: A number is out of range, or a file cannot be used.
@@ -291,8 +294,8 @@ def apply_treatments(
         second one. Each has the fact ``treatment``, the name of its treatment.
 
     Raises:
-        ValueError: A treatment is unknown, ``"compensated"`` lacks a compensator, or this was built
-            for another rate or level.
+        ValueError: A treatment is unknown, ``"compensated"`` lacks a compensator, or that was built
+            for another sample rate or full scale.
 
     >>> clean = torch.ones(1600)
     >>> item = Item("item 1", clean, clean, Audiogram.standard("N3"))

@@ -74,7 +74,15 @@ REFERENCES: dict[str, Callable[..., Any]] = {
 def _prepare(
     score: str, clean: _CleanSignal, sample_rate: int, full_scale_spl: float, *ear: Audiogram
 ) -> Any:
-    """Prepare a clean signal once for all conditions, and for HASPI also for all ears."""
+    """Prepare a clean signal once for all conditions, and for HASPI also for all ears.
+
+    Args:
+        score: Name of the score, one of ``REFERENCES``.
+        clean: Clean signal.
+        sample_rate: Sample rate in Hz.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+        ear: The ear of the item for HASQI and HAAQI; nothing for HASPI.
+    """
     settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "whole_khz": True}
     return REFERENCES[score](clean.samples, *ear, **settings)
 

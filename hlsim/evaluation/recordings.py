@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 LATE_MS = 4.0
-"""Lag of an output in ms above which a report warns."""
+"""Lag of an output in ms, late or early, above which a report has a note."""
 
 _INTERAURAL_SECONDS = 0.002
 """Largest lag in seconds between the clean files of both ears if they contain the same sound."""
@@ -109,7 +109,7 @@ def haspi_report(
             the manifest is not valid, ``better_ear`` is set and an utterance lacks an ear or has
             other speech at it, there is no such measure, precision or baseline, or nothing could
             be scored.
-        MissingExtraError: The package of a measure is not installed.
+        MissingExtraError: pandas, joblib or the package of a measure is not installed.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder = EXAMPLE_FILE.parent
@@ -204,7 +204,7 @@ def score_recordings(
         ValueError: There is no such measure or precision, nothing could be scored, or
             ``better_ear`` is set and an utterance lacks an ear or has different speech for both
             ears.
-        MissingExtraError: The package of a measure is not installed.
+        MissingExtraError: pandas, joblib or the package of a measure is not installed.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.data.bundled import EXAMPLE_FILE

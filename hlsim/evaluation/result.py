@@ -120,7 +120,7 @@ class Evaluation:
         return evaluation
 
     def check_values(self, columns: Sequence[str], predicate: str = "could be scored") -> None:
-        """Raise ValueError if the table has no value in any of some columns.
+        """Raise ValueError if the table has not a single value in the listed columns.
 
         Args:
             columns: Names of the columns. A column that the table lacks has no values.
@@ -194,7 +194,11 @@ class Evaluation:
             before, after: Names of the conditions, which may be the same.
 
         Returns:
-            Both shares of words, 0 to 1, and their difference with its interval.
+            Mean shares of words, 0 to 1, and their difference, with the interval in which it lies
+            for 90 % of new listeners.
+
+        Raises:
+            ValueError: No item has both scores.
         """
         scores = self.wide("haspi").dropna(subset=[before, after]).clip(0.0, 1.0)
         return words_change(scores[before].to_numpy(), scores[after].to_numpy())

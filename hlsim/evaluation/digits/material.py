@@ -63,10 +63,10 @@ class Triplets(NamedTuple):
 
 @cache
 def load_digits() -> Tensor:
-    """Load the bundled digits, each scaled to RMS 1.
+    """Load the bundled digits, each scaled to RMS 1 without the silence around it.
 
     Returns:
-        Samples at 16 kHz, (voices, 10, SLOT_SAMPLES).
+        Samples at 16 kHz, (voices, 10, SLOT_SAMPLES), where the second index is the digit, 0 to 9.
 
     >>> load_digits().shape
     torch.Size([8, 10, 12000])
@@ -147,7 +147,8 @@ def _draw_noise(count: int, amplitudes: Tensor, generator: torch.Generator) -> T
 
     Args:
         count: Number of signals.
-        amplitudes: Factors at the frequencies of the Fourier transform of a triplet.
+        amplitudes: Factors at the frequencies of a triplet's real Fourier transform,
+            (TRIPLET_SAMPLES / 2 + 1,).
         generator: Source of the random numbers.
 
     Returns: Samples, (count, TRIPLET_SAMPLES).

@@ -59,7 +59,7 @@ _AROUND_DB = 4.0
 """Largest distance in dB from the latest estimate of the threshold, in the last two rounds."""
 
 _AIDED_AT_ONCE = 8
-"""Number of triplets that an aid gets at once. Networks round differently in other batches."""
+"""Number of triplets that an aid gets at once, fixed because networks round by the batch size."""
 
 _PERCEIVED_AT_ONCE = 4
 """Number of triplets that a core simulates and recognises at once.
@@ -70,7 +70,8 @@ More of them fill the cache and take about an eighth more time.
 AidFunction = Callable[..., Tensor]
 """Function of signals in pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL.
 
-With ``DigitTest``, the signals may be those of several microphones, (items, ..., time).
+It returns the outputs of the aid, (items, time). With ``DigitTest``, the signals may be those of
+several microphones, (items, ..., time).
 """
 
 

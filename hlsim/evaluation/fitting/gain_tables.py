@@ -109,7 +109,8 @@ def _equaliser_points(gains: Array) -> Array:
     The gains of an aid are those for noise in a third of an octave around each of the eight
     ``FREQUENCIES``, see ``Aid.gains``. An equaliser's gain in dB is a straight line over log
     frequency between its points at these frequencies. Over a third of an octave, it amplifies the
-    noise by up to 2 dB more or less than at the centre, so its points are fitted in a few steps.
+    noise more or less than at the centre, by up to 2 dB (by up to 6 dB at 8 kHz for NAL-RP), so its
+    points are fitted in a few steps.
 
     Args:
         gains: Gains of the aid in dB, (8,).

@@ -116,9 +116,8 @@ def value_hash(value: Any) -> str:
     """Compute the SHA-256 of a value in hexadecimal, the same in every process.
 
     Args:
-        value: Text, number, list or dict, whose order does not matter, nested as you like, with
-            tensors, arrays, dataclasses, functions (of which only the name counts), and modules
-            with a fingerprint.
+        value: Text, number, list, or dict (in any order), nested as you like, with tensors, arrays,
+            dataclasses, functions (of which only the name counts), and modules with a fingerprint.
 
     Raises:
         TypeError: The value contains something else, such as a lambda.
