@@ -380,7 +380,8 @@ def loudness(text: str) -> float | dict[float, float]:
     """Convert the text of ``--loudness`` to a number, or to numbers by level.
 
     Args:
-        text: A number in dB, or levels in dB SPL with numbers in dB.
+        text: Loudness in dB relative to a normal ear, a number, or levels of the input in dB SPL
+            with such numbers. Their range is not checked here.
 
     Raises:
         argparse.ArgumentTypeError: The text is neither, or a level occurs twice.
@@ -409,7 +410,14 @@ def _read_points(text: str) -> dict[float, float]:
 def _limited(
     read: Callable[[str], Any], noun: str, lowest: float, highest: float
 ) -> Callable[[str], Any]:
-    """Make a function that converts the text of an option to a number in a closed range."""
+    """Make a function that converts the text of an option to a number in a range with both ends.
+
+    Args:
+        read: Function that converts the text; it raises ValueError for text that it cannot convert.
+        noun: Noun with its article for the number, for the error message.
+        lowest: Smallest accepted number.
+        highest: Largest accepted number.
+    """
     expected = f"{noun} from {lowest:,.10g} to {highest:,.10g}"
     return _checked_type(read, lambda value: lowest <= value <= highest, expected)
 

@@ -137,7 +137,8 @@ def evaluate_compensators(
             ``"for-ear"``, which is NAL-RP for ears with a profound loss at 2 kHz, and otherwise
             NAL-R. One that is not NAL-R is a further condition, which takes time.
         loudness: Loudness at which an output has no loudness error, in dB relative to a normal ear:
-            a number, or numbers by the level of the input, as in ``HearingLossLoss``.
+            a number from -40 to 20, or numbers by the level of the input in dB SPL, as in
+            ``HearingLossLoss``.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.

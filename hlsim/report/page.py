@@ -104,7 +104,7 @@ class Sound:
         label: Name on the button.
         level: Level in dB SPL, which is shown beside the name.
         audio: Contents of a WAV file.
-        loudness: RMS level of the WAV file in dB relative to full scale.
+        loudness: RMS level of the WAV file in dB relative to full scale, an RMS of 1.0.
         spectrogram: Contents of a PNG file with the spectrogram, without axes or margins.
         note: Text on the spectrogram, which says why it is black; empty if it is not.
 

@@ -76,7 +76,7 @@ def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) ->
 
     All sounds of a group have one gain, so that their loudness can be compared. Groups have
     different gains, because the output of an aid is much louder than what the ear perceives of it.
-    The heading of a group says by how many dB it is played softer than the first one.
+    If a group is played softer than the first one, its heading says by how many dB.
 
     Args:
         groups: Signals in pascals, as a dict from the heading of a group, which may be empty, to a
@@ -187,7 +187,7 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     """Compute the spectrogram of a signal up to 8 kHz, in windows of 20 ms every 10 ms.
 
     If there are several channels, their powers are averaged. Signals shorter than a window are
-    padded with silence.
+    padded with silence. The first window is centred at the first sample.
 
     Args:
         signal: Signal in pascals. Shape: (time,) or (channels, time).

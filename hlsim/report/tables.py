@@ -120,7 +120,8 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     Args:
         table: Table of the study.
         fact: Column with a property of the items, such as ``"snr"`` or ``"severity"``, by whose
-            values the rows are split, too, in ascending order. Empty for conditions alone.
+            values the rows are split, too, in ascending order; rows without a value, None or NaN,
+            are left out. Empty for conditions alone.
 
     Returns:
         Rows of the table by the name of the condition, such as "aid", or with ``fact`` by value

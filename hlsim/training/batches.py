@@ -51,7 +51,7 @@ ears, time), the left ear first.
 MAX_DEVICES = 64
 """Largest number of training devices.
 
-Each step has this many numbers of batches, and each device draws the batch of its own number.
+The batches of a step have this many consecutive numbers, of which each device draws one.
 """
 
 _VALIDATION_SECONDS = 2.0
@@ -64,7 +64,7 @@ _HIGHEST_CLEAN_LEVEL = 80.0
 """Highest level in dB SPL of the clean speech that belongs to the input of a simulator."""
 
 _MEASURED_SHARE = 0.5
-"""Share of measured ears, if there are any. The others are random."""
+"""Probability with which an ear of a batch is a measured one, if there are any, else random."""
 
 _QUIET_SNR = 60.0
 """Signal-to-noise ratio in dB of scenes that are not noisy."""

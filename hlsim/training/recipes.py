@@ -178,7 +178,7 @@ class CompensatorRecipe(TrainingRecipe):
             scenes, 0.2 to 1.5; 0 for scenes without rooms. It needs the extra ``scenes``.
         unreduced: Share of items for which a hearing aid's noise reduction is off, from 0 to 1.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
-            or numbers by level, see ``HearingLossLoss``.
+            from -40 to 20 or numbers by level of the speech in dB SPL, see ``HearingLossLoss``.
         limit_to_ear: Whether the output of a hearing aid is limited in training to the
             uncomfortable levels that are predicted for the ear, see ``HearingAid``. The saved aid
             is limited only if it is loaded with ``limit_to_ear``.
