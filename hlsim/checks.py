@@ -303,6 +303,32 @@ def check_finite(signals: Tensor, name: str = "waveform") -> None:
         )
 
 
+def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
+    """Return what a module returned, if it is a floating-point tensor of the expected shape.
+
+    Args:
+        output: Value to validate.
+        source: Name of the module or function that returned it, for the message.
+        shape: Expected shape.
+
+    Raises:
+        ValueError: The value is no such tensor.
+
+    >>> check_shape(torch.zeros(2), "criterion", (2,))
+    tensor([0., 0.])
+    """
+    is_real = isinstance(output, Tensor) and output.is_floating_point()
+    if not is_real or output.shape != shape:
+        result = type(output).__name__
+        if isinstance(output, Tensor):
+            result = f"{output.dtype} of shape {tuple(output.shape)}"
+        raise ValueError(
+            f"expected the {source} to return a floating-point tensor of shape {tuple(shape)}, "
+            f"got {result}"
+        )
+    return output
+
+
 def check_device(module: nn.Module, device: torch.device | None = None) -> None:
     """Raise ValueError if a module lacks its weights, or has them on another device than its input.
 

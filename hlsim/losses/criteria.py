@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import NEURO_RATE
-from hlsim.checks import check_weights
+from hlsim.checks import check_shape, check_weights
 from hlsim.dsp.resample import resample
 from hlsim.losses import coherent_bands, paper
-from hlsim.losses.frozen_simulator import ReferenceKind, check_shape
+from hlsim.losses.frozen_simulator import ReferenceKind
 from hlsim.losses.interaural import interaural_loss
 from hlsim.losses.score_loss import SCORES, score_loss
 from hlsim.metrics.band_levels import band_level_loss

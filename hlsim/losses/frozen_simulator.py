@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.checks import check_shape
 from hlsim.dsp.resample import resample
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
 from hlsim.simulators import load_simulator
@@ -189,29 +190,3 @@ class FrozenSimulator:
 def _normal_ear() -> Tensor:
     """Return the thresholds of a normal ear, 0 dB HL at all ``FREQUENCIES``, (8,), on the CPU."""
     return torch.zeros(len(FREQUENCIES), device="cpu")
-
-
-def check_shape(output: Any, source: str, shape: tuple[int, ...]) -> Tensor:
-    """Return what a module returned, if it is a floating-point tensor of the expected shape.
-
-    Args:
-        output: Value to validate.
-        source: Name of the module or function that returned it, for the message.
-        shape: Expected shape.
-
-    Raises:
-        ValueError: The value is no such tensor.
-
-    >>> check_shape(torch.zeros(2), "criterion", (2,))
-    tensor([0., 0.])
-    """
-    is_real = isinstance(output, Tensor) and output.is_floating_point()
-    if not is_real or output.shape != shape:
-        result = type(output).__name__
-        if isinstance(output, Tensor):
-            result = f"{output.dtype} of shape {tuple(output.shape)}"
-        raise ValueError(
-            f"expected the {source} to return a floating-point tensor of shape {tuple(shape)}, "
-            f"got {result}"
-        )
-    return output

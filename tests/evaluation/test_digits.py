@@ -215,10 +215,10 @@ def test_sliders_reach_the_aid() -> None:
         ({"aid": "hearing-aid-directional"}, "an aid with one microphone"),
         ({"aid": NALR(sample_rate=44100)}, "an aid with sample_rate=16000, got 44100"),
         ({"aid": NALR(full_scale_spl=100.0)}, "an aid with full_scale_spl=94"),
-        ({"aid": lambda x, _: x[..., :-1]}, "return as many samples"),
-        ({"aid": lambda x, _: x * float("nan")}, "without NaN"),
-        ({"aid": lambda x, _: (32767 * x).short()}, "floating-point samples .* got torch.int16"),
-        ({"aid": lambda x, _: x.numpy()}, "expected the aid to return a tensor, got a ndarray"),
+        ({"aid": lambda x, _: x[..., :-1]}, "expected the aid to return .* of shape"),
+        ({"aid": lambda x, _: x * float("nan")}, "the output of the aid .* NaN or infinite"),
+        ({"aid": lambda x, _: (32767 * x).short()}, "floating-point tensor .* got torch.int16"),
+        ({"aid": lambda x, _: x.numpy()}, "expected the aid to return .* got ndarray"),
     ],
 )
 def test_invalid_arguments_are_rejected(settings: dict[str, Any], words: str) -> None:

@@ -28,7 +28,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import DIGIT_LISTENER
-from hlsim.checks import check_attributes, check_number, loud_outputs
+from hlsim.checks import check_attributes, check_finite, check_number, check_shape, loud_outputs
 from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import (
@@ -223,19 +223,10 @@ def _call_aid(aid: AidFunction, ear: Tensor, inputs: Tensor) -> Tensor:
         -> (triplets, time).
 
     Raises:
-        ValueError: The outputs are no tensor, have another shape, or samples that are not finite.
+        ValueError: The outputs are no floating-point tensor of this shape, or are not finite.
     """
-    outputs = aid(inputs, ear)
-    if not isinstance(outputs, Tensor):
-        raise ValueError(f"expected the aid to return a tensor, got a {type(outputs).__name__}")
-    expected = len(inputs), inputs.shape[-1]
-    is_finite = outputs.is_floating_point() and bool(outputs.isfinite().all())
-    if outputs.shape != expected or not is_finite:
-        raise ValueError(
-            f"expected the aid to return finite floating-point samples of shape {expected}, "
-            f"got {outputs.dtype} of shape {tuple(outputs.shape)}; return as many samples as the "
-            "input has, without NaN or infinity"
-        )
+    outputs = check_shape(aid(inputs, ear), "aid", (len(inputs), inputs.shape[-1]))
+    check_finite(outputs, "the output of the aid")
     return outputs
 
 
