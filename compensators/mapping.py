@@ -30,7 +30,7 @@ from hlsim.torchtools import built_in_float32, constant
 NEPER_DB = 20.0 / math.log(10.0)
 """One neper in dB."""
 
-POWER_FLOOR = 1e-9
+PHASE_POWER_FLOOR = 1e-9
 """Power of a point of a spectrogram below which the phase between microphones fades."""
 
 LOWEST_CENTRE = 100.0
@@ -238,7 +238,7 @@ def _relative_features(reference: Tensor, signals: Tensor) -> Tensor:
     """
     first, squared = power(reference).unsqueeze(1), power(signals)
     cross = signals * reference.unsqueeze(1).conj()
-    phase = cross * (first * squared + POWER_FLOOR**2).rsqrt()
+    phase = cross * (first * squared + PHASE_POWER_FLOOR**2).rsqrt()
     ratio = log_magnitude(squared) - log_magnitude(first)
     return torch.cat((ratio, phase.real, phase.imag), 1)
 

@@ -48,7 +48,7 @@ _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)
 Of tones of 2 s, they are the middle second, which has whole periods of each tone.
 """
 
-_POWER_FLOOR = 1e-30
+_TONE_POWER_FLOOR = 1e-30
 """Lowest power of a tone, which keeps ratios finite for JSON."""
 
 _RATIO_FLOOR = 1e-20
@@ -183,7 +183,7 @@ def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     bins = torch.fft.fftfreq(middle.shape[-1], 1.0 / NEURO_RATE).abs()
     near = (bins - hertz.unsqueeze(-1)).abs() <= _SIDEBAND_DISTANCE_HZ
     tone, sidebands = (power * near).sum(-1), (power * ~near).sum(-1)
-    ratio = (sidebands / tone.clamp_min(_POWER_FLOOR)).clamp_min(_RATIO_FLOOR)
+    ratio = (sidebands / tone.clamp_min(_TONE_POWER_FLOOR)).clamp_min(_RATIO_FLOOR)
     return 10.0 * ratio.log10()
 
 

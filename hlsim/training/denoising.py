@@ -4,13 +4,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from compensators.filter_bank import HISTORY, HOP, filter_powers, frame_power
+from compensators.filter_bank import HISTORY, HOP, POWER_FLOOR, filter_powers, frame_power
 from compensators.hearing_aid import HearingAid
-from hlsim.calibration import NEURO_RATE, PASCAL_SPL, level_spl, set_level
+from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.losses.score_loss import score_loss
-
-_POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
-"""Power in Pa^2 (0 dB SPL) that is added to that of speech, so that silence is not attenuated."""
 
 _WIENER_EXPONENT = 0.6
 """Ratio of the target gain in dB to Wiener's gain in dB."""
@@ -50,7 +47,8 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
         parts = torch.stack((clean, signal - clean))
         frames = frame_power(functional.pad(parts, (HISTORY, 0)).flatten(0, 1))
         speech, noise = filter_powers(frames, aid.bands).chunk(2)
-        wiener = ((speech + _POWER_FLOOR) / (speech + noise + _POWER_FLOOR)).sqrt()
+        # The floor of the levels of the aid is added to speech, so that silence is not attenuated.
+        wiener = ((speech + POWER_FLOOR) / (speech + noise + POWER_FLOOR)).sqrt()
         lowest_gain = 10.0 ** (-aid.config.reduction_db / 20.0)
         target = (wiener**_WIENER_EXPONENT).clamp_min(lowest_gain)[:, _GAIN_DELAY:]
     return (gains[:, :-_GAIN_DELAY].sqrt() - target.sqrt()).square().mean((-2, -1))
