@@ -72,7 +72,7 @@ def mix(
     level = dbfs(signal)
     if sample_rate is not None:
         rate = check_rate(sample_rate)
-        waveforms = signal.detach().cpu().reshape(-1, signal.shape[-1])
+        waveforms = signal.detach().cpu().double().reshape(-1, signal.shape[-1])
         for number, waveform in enumerate(waveforms):
             if bool(waveform.any()):  # A channel may be silent.
                 level.view(-1)[number] = active_level_db(waveform, rate)

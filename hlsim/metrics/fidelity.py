@@ -233,7 +233,9 @@ def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.
             finite, or the reference is silent.
     """
     x, y = (
-        np.asarray(signal.detach().cpu() if isinstance(signal, Tensor) else signal, np.float64)
+        np.asarray(
+            signal.detach().cpu().double() if isinstance(signal, Tensor) else signal, np.float64
+        )
         for signal in (reference, estimate)
     )
     if x.ndim != 1 or x.shape != y.shape or not len(x):

@@ -28,6 +28,15 @@ def test_the_ratio_is_that_of_the_active_or_of_the_rms_level() -> None:
     assert float(level_spl(active[0]) - level_spl(added[0])) > 3.0
 
 
+def test_bfloat16_is_mixed_like_its_values_in_float32() -> None:
+    """NumPy, which computes the active level, has no bfloat16."""
+    speech, noise = 0.03 * torch.randn(2, 16000, dtype=torch.bfloat16)
+    mixed = mix(speech, noise, 5.0)
+    assert mixed.dtype == torch.bfloat16
+    expected = mix(speech.float(), noise.float(), 5.0)
+    torch.testing.assert_close(mixed.float(), expected, atol=1e-3, rtol=0.02)
+
+
 @pytest.mark.parametrize("rate", [16000, None])
 def test_channels_of_a_recording_have_one_gain(rate: int | None) -> None:
     speech = torch.stack((hlsim.example_speech(), 0.1 * hlsim.example_speech()))

@@ -38,6 +38,8 @@ def test_snr_and_raw_mse_equal_those_of_a_known_error(pair: tuple[Tensor, Tensor
     assert snr_db(clean, clean) == 200.0
     assert raw_mse(clean, clean) == 0.0
     assert raw_mse(clean, clean * 0) == pytest.approx(1.0)
+    halves = pair[0].bfloat16(), pair[1].bfloat16()
+    assert snr_db(*halves) == snr_db(*(signal.float() for signal in halves))
 
 
 @pytest.mark.parametrize("rate", [16000, 44100])
