@@ -58,8 +58,7 @@ class STFT:
         """Compute the spectrum of each frame of waveforms.
 
         The result equals that of ``torch.stft`` with a Hann window and ``pad_mode="constant"``,
-        with its last two dimensions swapped. The gradient of ``torch.stft`` takes 1.5 times as
-        long.
+        with its last two dimensions swapped.
 
         Shape: (items, time) -> complex (items, time // hop + 1, frequencies).
         """
@@ -74,8 +73,8 @@ class STFT:
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
         """Compute waveforms from the spectra of their frames, the inverse of ``analyse``.
 
-        The result equals that of ``torch.istft``, which takes longer and exports to an ONNX graph
-        with an index that onnxruntime rejects.
+        The result equals that of ``torch.istft``, which exports to an ONNX graph with an index that
+        onnxruntime rejects.
 
         Shape: complex (items, frames, frequencies) -> (items, length).
 

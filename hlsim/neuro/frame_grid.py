@@ -268,7 +268,7 @@ def _inward_response(units: int) -> NDArray[np.complex128]:
         units: Length of the Fourier transform in units of 160 ms.
 
     Returns:
-        Response at the frequencies of the transform up to half of the frame rate.
+        Response at the frequencies of the transform up to half of the frame rate, (frequencies,).
     """
     response = _fourier_transform(_ear_taps(), units) * _conversion(units, _EAR_HALF_LENGTH)
     return response * (_UNIT_AT_FRAME_RATE / _UNIT)
@@ -283,16 +283,26 @@ def _outward_responses(units: int) -> NDArray[np.complex128]:
 
 
 def _fourier_transform(taps: NDArray[np.float64], units: int) -> NDArray[np.complex128]:
-    """Compute the spectra of taps at 44.1 kHz up to half of the frame rate."""
+    """Compute the spectra of taps at 44.1 kHz up to half of the frame rate.
+
+    Shape: (..., taps) -> complex (..., units * 1323 + 1), where a unit is 160 ms.
+    """
     bins = units * _UNIT_AT_FRAME_RATE // 2 + 1
     return np.asarray(np.fft.rfft(taps, units * _UNIT_AT_MSBG_RATE)[..., :bins])
 
 
 def _conversion(units: int, advance: int) -> NDArray[np.complex128]:
-    """Compute the response of a low-pass to convert rates, advanced by samples at 44.1 kHz.
+    """Compute the response of a low-pass to convert rates, without its delay.
 
     It ends between 8 kHz and half of the frame rate, where it is so near 0 that the Fourier
     transforms do not make it ring: an output depends on the declared field only.
+
+    Args:
+        units: Length of the Fourier transform in units of 160 ms.
+        advance: Number of samples at 44.1 kHz by which the response is advanced in addition.
+
+    Returns:
+        Response at the frequencies up to half of the frame rate, (units * 1323 + 1,).
     """
     nyquist = FRAME_RATE / 2.0
     length = 2 * _LOWPASS_HALF_LENGTH + 1

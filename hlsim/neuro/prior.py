@@ -307,7 +307,7 @@ class Prior(BandGains):
 
 
 def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
-    """Compute the square root of the ratio of two powers, smeared to original.
+    """Compute the square root of the ratio of two powers in Pa^2, smeared to original.
 
     The root of a negative ratio is imaginary. The ratio is at most 1e16.
 

@@ -41,6 +41,8 @@ products to complex numbers.
 def power(real: Tensor, imaginary: Tensor) -> Tensor:
     """Compute squared magnitudes of complex numbers from their real and imaginary parts.
 
+    Shape: (...) twice -> (...).
+
     >>> power(torch.tensor([3.0]), torch.tensor([4.0]))
     tensor([25.])
     """
@@ -205,7 +207,13 @@ class _Block:
         return [values[self.items, self.frames] for values in maps]
 
     def factors(self, gains: Tensor, matrices: Sequence[Tensor], out: Sequence[Tensor]) -> Planes:
-        """Compute the factors of gains over the square root of 8, see ``smear_and_amplify``."""
+        """Compute the factors of gains over the square root of 8, see ``smear_and_amplify``.
+
+        Args:
+            gains: Gains of all items and steps.
+            matrices: Matrices for real and imaginary parts, over the square root of 8.
+            out: Two tensors for the results.
+        """
         for matrix, result in zip(matrices, out, strict=True):
             rows = gains[self.items, self.steps] @ matrix[self.items]
             for frame in range(self.step):
@@ -283,6 +291,8 @@ def _smearing_factor(
         smeared_power: Power of the smeared spectrum in Pa^2, which may be negative.
         out: Six tensors for the results and an intermediate one.
 
+    Shape: (items, frames, frequencies) for all tensors.
+
     Returns:
         Factor times the square root of 8, magnitude of r + i e, divisor of the ratio, and ratio.
     """
@@ -343,7 +353,10 @@ def _scale(values: Tensor) -> Tensor:
 def _multiply(
     first: Sequence[Tensor], second: Sequence[Tensor], out: Sequence[Tensor], sign: float = 1.0
 ) -> Planes:
-    """Multiply complex numbers, or with the sign -1 the conjugates of the first ones, by others."""
+    """Multiply ``first``, or with the sign -1 its conjugate, by ``second``, and fill ``out``.
+
+    Each is a pair of real and imaginary parts, any shape.
+    """
     (a, b), (c, d) = first, second
     real = torch.mul(a, c, out=out[0]).addcmul_(b, d, value=-sign)
     return real, torch.mul(a, d, out=out[1]).addcmul_(b, c, value=sign)
