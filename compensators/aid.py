@@ -4,7 +4,7 @@ The insertion gain is the level of an aid's output minus that of its input in dB
 octave around a frequency. It is measured with noise that has the spectrum of average speech.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from compensators.filter_bank import RATE, SPEECH_SPL, speech_density
-from hlsim.audiogram import FREQUENCIES, HIGHEST_SIMULATED
-from hlsim.audiogram.thresholds import (
-    AudiogramLike,
-    as_thresholds,
-    has_listeners,
-    resolve_thresholds,
-    store_thresholds,
-)
+from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, StoredEars, as_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_device, check_number, check_rate, check_settings
 from hlsim.dsp.fft import power
 from hlsim.torchtools import constant
 
 
-class Aid(nn.Module):
+class Aid(StoredEars, nn.Module):
     """Base class of all aids: it stores ears, and measures the gains of an aid.
 
     Subclasses implement ``forward`` and ``_amplify``.
@@ -49,10 +43,6 @@ class Aid(nn.Module):
     True
     """
 
-    highest_level: ClassVar[float] = HIGHEST_SIMULATED
-
-    thresholds: Tensor | None
-
     @check_settings
     def __init__(
         self,
@@ -65,18 +55,6 @@ class Aid(nn.Module):
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.store_ears(audiogram)
-
-    def store_ears(self, audiogram: AudiogramLike | None) -> None:
-        """Store the ears that calls without an audiogram use.
-
-        Args:
-            audiogram: One or more ears, or None.
-
-        Raises:
-            ValueError: An ear is not valid.
-        """
-        self.thresholds = store_thresholds(audiogram, highest=self.highest_level)
-        self._two_ears = has_listeners(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Return the output for whole signals, time-aligned with the input.
@@ -148,21 +126,6 @@ class Aid(nn.Module):
         """
         ears = self.thresholds if audiogram is None else audiogram
         return as_thresholds(ears, highest=self.highest_level)
-
-    def resolve_thresholds(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
-        """Return the thresholds of the passed or else of the stored ears, checked for a waveform.
-
-        See ``hlsim.audiogram.thresholds.resolve_thresholds`` for shapes and errors.
-
-        Returns: Thresholds in dB HL on the waveform's device, (..., 8).
-        """
-        return resolve_thresholds(
-            self.thresholds,
-            audiogram,
-            waveform,
-            two_ears=self._two_ears,
-            highest=self.highest_level,
-        )
 
     def _amplify(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Return the output in pascals for signals in pascals at 16 kHz.

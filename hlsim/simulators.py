@@ -10,12 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import (
-    AudiogramLike,
-    has_listeners,
-    resolve_thresholds,
-    store_thresholds,
-)
+from hlsim.audiogram.thresholds import AudiogramLike, StoredEars, resolve_thresholds
 from hlsim.calibration import (
     NEURO_RATE,
     PASCAL_SPL,
@@ -52,7 +47,7 @@ _LOWEST_PLUGIN_RATE = 1000
 """Lowest sample rate of a plug-in in Hz."""
 
 
-class Attenuation(nn.Module):
+class Attenuation(StoredEars, nn.Module):
     """Linear ear: each frequency is attenuated by the hearing loss, and nothing else happens.
 
     The gain in dB at a frequency is the threshold in dB HL times -1. Thresholds are interpolated
@@ -91,8 +86,7 @@ class Attenuation(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         # samples before and after a sample of the output on which it depends
         self.reach = round(_HALF_LENGTH_SECONDS * self.sample_rate)
-        self.thresholds = store_thresholds(audiogram)
-        self._two_ears = has_listeners(audiogram)
+        self.store_ears(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Attenuate signals.
@@ -110,7 +104,7 @@ class Attenuation(nn.Module):
                 not broadcast, or the waveform is not a floating-point signal with time last.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
-        ears = resolve_thresholds(self.thresholds, audiogram, waveform, two_ears=self._two_ears)
+        ears = self.resolve_thresholds(waveform, audiogram)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = torch.promote_types(waveform.dtype, torch.float32)
             half = self.reach

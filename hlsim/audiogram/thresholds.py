@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -234,6 +234,51 @@ def resolve_thresholds(
             f"{(*waveform.shape[:-1], len(FREQUENCIES))}"
         ) from None
     return on_device(thresholds, waveform.device)
+
+
+class StoredEars:
+    """Base class of modules that store the ears for calls without an audiogram.
+
+    Attributes:
+        highest_level: Highest hearing threshold that the module accepts, in dB HL.
+        thresholds: Thresholds in dB HL of the stored ears, (..., 8); None if there are none.
+
+    >>> ears = StoredEars()
+    >>> ears.store_ears("N3")
+    >>> ears.resolve_thresholds(torch.zeros(16000), None).shape
+    torch.Size([8])
+    """
+
+    highest_level: ClassVar[float] = HIGHEST_SIMULATED
+
+    thresholds: Tensor | None
+
+    def store_ears(self, audiogram: AudiogramLike | None) -> None:
+        """Store the ears that calls without an audiogram use.
+
+        Args:
+            audiogram: One or more ears, or None.
+
+        Raises:
+            ValueError: An ear is not valid.
+        """
+        self.thresholds = store_thresholds(audiogram, highest=self.highest_level)
+        self._two_ears = has_listeners(audiogram)
+
+    def resolve_thresholds(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
+        """Return the thresholds of the passed or else of the stored ears, checked for a waveform.
+
+        See the function ``resolve_thresholds`` for shapes and errors.
+
+        Returns: Thresholds in dB HL on the waveform's device, (..., 8).
+        """
+        return resolve_thresholds(
+            self.thresholds,
+            audiogram,
+            waveform,
+            two_ears=self._two_ears,
+            highest=self.highest_level,
+        )
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:

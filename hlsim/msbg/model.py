@@ -17,13 +17,7 @@ from hlsim.audiogram import (
     Audiogram,
     severity_index,
 )
-from hlsim.audiogram.thresholds import (
-    AudiogramLike,
-    ears_on_other_grids,
-    has_listeners,
-    resolve_thresholds,
-    store_thresholds,
-)
+from hlsim.audiogram.thresholds import AudiogramLike, StoredEars, ears_on_other_grids
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_flag, check_rate, check_waveform
 from hlsim.dsp.fft import rfft
@@ -54,7 +48,7 @@ that back, less at high frequencies and with more loss: without a loss 186 at 20
 _POWER_FLOOR = 1e-30
 """Smallest power in Pa^2 by which powers are divided."""
 
-_HALF_RATE_HZ = 20000
+HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which aligned signals run at 22.05 kHz inside the model."""
 
 _CPU_SAMPLES = 384_000
@@ -78,7 +72,7 @@ class _Group(NamedTuple):
     frequencies: tuple[float, ...] = FREQUENCIES
 
 
-class MSBG(nn.Module):
+class MSBG(StoredEars, nn.Module):
     """The Moore, Stone, Baer and Glasberg model of what an impaired ear perceives.
 
     The model computes the same as ``Ear.process`` of pyclarity 0.9.0: outer and middle ear,
@@ -132,8 +126,6 @@ class MSBG(nn.Module):
 
     emulates_msbg = True
 
-    thresholds: Tensor | None
-
     def __init__(
         self,
         audiogram: AudiogramLike | None = None,
@@ -154,8 +146,7 @@ class MSBG(nn.Module):
         self.rescale_active = rescale_active
         self.smearing = smearing
         self.checkpoint = False
-        self.thresholds = store_thresholds(audiogram)
-        self._two_ears = has_listeners(audiogram)
+        self.store_ears(audiogram)
         self._other_grids = ears_on_other_grids(audiogram)
 
     @not_compiled  # it depends on the values of the ears, and numpy designs its filters
@@ -176,9 +167,7 @@ class MSBG(nn.Module):
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)
-        thresholds = resolve_thresholds(
-            self.thresholds, audiogram, waveform, two_ears=self._two_ears
-        )
+        thresholds = self.resolve_thresholds(waveform, audiogram)
         with torch.autocast(waveform.device.type, enabled=False):
             return self._simulate(waveform, thresholds, grids)
 
@@ -290,7 +279,7 @@ class MSBG(nn.Module):
         samples = signals.shape[-1]
         bank = BANKS[group.severity]
         smears = self._smears(group.severity)
-        rate_divisor = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
+        rate_divisor = 2 if self.aligned and rate <= HALF_RATE_HZ else 1
         delay = self.delay(group.severity) if self.aligned else 0
         highest = rate / 2 if rate_divisor == 2 else MSBG_RATE / 2
         # A frame that smearing leaves nearly empty depends on the last bits, so unaligned output,
