@@ -18,12 +18,10 @@ from hlsim.calibration import NEURO_RATE
 from hlsim.dsp.overlap import Block, split_into_blocks
 from hlsim.dsp.resample import ROLLOFF, ZERO_CROSSINGS
 from hlsim.msbg import MSBG
+from hlsim.msbg.model import HALF_RATE_HZ
 from hlsim.msbg.overlapping_blocks import block_bounds
 from hlsim.neuro.network import EarNetwork
 from hlsim.simulators import Attenuation
-
-_HALF_RATE_HZ = 20000
-"""Highest sample rate in Hz at which MSBG works at 22.05 kHz."""
 
 _BLOCK_SECONDS = 8.0
 """Duration in seconds of the output of a block, and of the parts that ``read_all`` yields."""
@@ -186,7 +184,7 @@ def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
     """
     if isinstance(model, MSBG):
         # At high rates, MSBG works at 44.1 instead of 22.05 kHz, and takes twice the memory.
-        return block_bounds(samples, rate, None if rate <= _HALF_RATE_HZ else _BLOCK_SECONDS / 2)
+        return block_bounds(samples, rate, None if rate <= HALF_RATE_HZ else _BLOCK_SECONDS / 2)
     hop = round(_BLOCK_SECONDS * rate)
     if isinstance(model, NALR):
         return split_into_blocks(samples, hop, ORDER, ORDER)

@@ -176,7 +176,7 @@ def _process_file(
         outputs = process_recording(model, recording, gain, ear, **sliders)
         write_parts(target, meter.measure(outputs, recording.samples, show), *size)
     text = f"input {level + gain_db:.1f} dB SPL"
-    output_level = 10.0 * math.log10(max(meter.power, POWER_FLOOR)) + options.full_scale_spl
+    output_level, _ = level_and_gain(max(meter.power, POWER_FLOOR), options)
     text += f", output {output_level + gain_db:.1f} dB SPL"
     if meter.peak > 1.0 and options.no_clipping:
         factor = PLAYED_PEAK / meter.peak

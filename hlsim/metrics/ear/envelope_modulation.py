@@ -42,7 +42,10 @@ WINDOW_LEAD = WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES // 2 - 1
 """Number of zeros before a signal, so that the window of its first frame is complete."""
 
 SILENCE_DB = 2.5
-"""Level in dB over threshold that a frame of clean speech must exceed to count."""
+"""Level in dB over threshold that a frame of clean speech must exceed to count.
+
+For fine structure, it holds for segments, and for each channel in them.
+"""
 
 COSINES = 5
 """Number of cepstral coefficients."""

@@ -23,7 +23,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.metrics.ear.envelope_modulation import ENERGY_FLOOR, cosines, normalised_covariance
+from hlsim.metrics.ear.envelope_modulation import (
+    ENERGY_FLOOR,
+    SILENCE_DB,
+    cosines,
+    normalised_covariance,
+)
 from hlsim.metrics.ear.extent import Extent, integers
 from hlsim.metrics.ear.model import CHANNELS, centre_frequencies
 from hlsim.metrics.ear.recursions import RATE
@@ -40,9 +45,6 @@ MAX_LAG = RATE // 1000
 
 FFT_POINTS = 432
 """Points of the Fourier transform of a segment, enough for correlations at delays of up to 1 ms."""
-
-SILENCE_DB = 2.5
-"""Level in dB over threshold that a segment, and a channel in it, must exceed to count."""
 
 SYNCHRONY_HZ = 3500.0
 """Frequency above which hair cells lose synchrony (Johnson 1980)."""
