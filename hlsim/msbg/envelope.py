@@ -86,7 +86,7 @@ def _modulus_with_harmonics(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class _ModulusWithHarmonics(torch.autograd.Function):
-    """``_modulus_with_harmonics`` with a hand-written backward pass: half of autograd's operations.
+    """``_modulus_with_harmonics`` with a hand-written backward pass, in half of autograd's time.
 
     Let r be the modulus of the signal x + i y, c = x^2 / r^2 the squared cosine of its phase, and
     r P(c) the result with P(c) = 1/5 + 12/5 c - 16/15 c^2. Then dr/dx = x / r, dr/dy = y / r,

@@ -15,7 +15,7 @@ their envelopes are computed:
 
 Channels whose centre frequency is far above the highest frequency of interest respond only with the
 lower edges of their bands, and all of them have the expansion ratio of the threshold at 8 kHz,
-unless higher thresholds were measured. They are computed as one channel, their sum.
+unless thresholds at higher frequencies were measured. They are computed as one channel, their sum.
 """
 
 import itertools

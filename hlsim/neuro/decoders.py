@@ -84,10 +84,10 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
 class _PhaseFactor(torch.autograd.Function):
     """The function exp(a) z / |z| of z = 1 + x + j y, with a hand-written backward pass.
 
-    The backward pass needs a third of autograd's operations. Let f be the result, g the gradient
-    with respect to f, and q = g conj(f). The gradient is Re q with respect to a, -y Im q / |z|^2
-    with respect to x, and (1 + x) Im q / |z|^2 with respect to y. Shape of a, x and y: (items,
-    time, frequency).
+    The backward pass takes half of autograd's time. Let f be the result, g the gradient with
+    respect to f, and q = g conj(f). The gradient is Re q with respect to a, -y Im q / |z|^2 with
+    respect to x, and (1 + x) Im q / |z|^2 with respect to y. Shape of a, x and y: (items, time,
+    frequency).
     """
 
     @staticmethod

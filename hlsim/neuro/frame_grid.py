@@ -171,8 +171,9 @@ class _Analysis(torch.autograd.Function):
     """Spectra of frames by products with matrices, and their gradient by ``_Synthesis``.
 
     The samples of a frame lie symmetrically about its middle, so that its even part has a real
-    spectrum, and its odd part an imaginary one. Two products with matrices of half the size take
-    half the time of a Fourier transform, and real and imaginary parts are contiguous.
+    spectrum, and its odd part an imaginary one. With their gradients, two products with matrices of
+    half the size take half the time of a Fourier transform, and real and imaginary parts are
+    contiguous.
     """
 
     @staticmethod
