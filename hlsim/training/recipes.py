@@ -110,10 +110,10 @@ class SimulatorRecipe(TrainingRecipe):
         levels: Lowest and highest level of the speech in dB SPL, before amplification.
         treated: Whether clips are equalised, amplified and compressed at random, like the outputs
             of compensators.
-        precision: Number format of the network's layers, ``float32`` or ``bfloat16``. ``bfloat16``
-            is several times faster on hardware that supports it, and several times slower on other
-            hardware. Transforms, prior, scans and criteria remain in float32, and so does a network
-            of the structure ``bands``.
+        precision: Number format of the network's layers, ``float32`` or ``bfloat16``. With
+            ``bfloat16``, a step takes 0.4 to 0.95 of the time on a GPU that supports it
+            (docs/gpu.md); hardware that does not may be slower. Transforms, prior, scans and
+            criteria remain in float32, and so does a network of the structure ``bands``.
         average: Weight of the past in the moving average of the weights, from 0 (none) to below 1.
             The average is validated and saved.
 

@@ -62,10 +62,7 @@ _AIDED_AT_ONCE = 8
 """Number of triplets that an aid gets at once, fixed because networks round by the batch size."""
 
 _PERCEIVED_AT_ONCE = 4
-"""Number of triplets that a core simulates and recognises at once.
-
-More of them fill the cache and take about an eighth more time.
-"""
+"""Number of triplets that a core simulates and recognises at once, whatever the number of cores."""
 
 AidFunction = Callable[..., Tensor]
 """Function of signals in pascals at 16 kHz, (items, time), and one ear, (8,) in dB HL.

@@ -121,8 +121,10 @@ def verify(
     """Measure the gains of an aid from its input and output, beside the targets for an ear.
 
     Both recordings are cut to the sound that they share, so that results do not depend on a delay,
-    or on silence before or after the sound of one recording. The input should be at least 15 s of
-    speech without noise; in shorter ones, the levels of valleys and peaks are less certain.
+    or on silence before or after the sound of one recording. If the coefficient of their
+    cross-correlation is 0.2 or less, the delay is unknown, and 0 is assumed. The input should be at
+    least 15 s of speech without noise; in shorter ones, the levels of valleys and peaks are less
+    certain.
 
     Args:
         input_: Recorded input of the aid, (time,), 1 s or more.
