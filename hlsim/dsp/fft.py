@@ -14,7 +14,8 @@ FADE_HZ = 80.0
 MAX_POWER_OF_TWO = 256
 """Largest power of two in a fast transform length.
 
-MKL takes up to three times as long for 2^10 * 49 points as for 2^4 * 3125 points.
+On some processors, MKL takes longer for lengths with a larger one: for 2^10 * 49 points longer than
+for 2^4 * 3125.
 """
 
 

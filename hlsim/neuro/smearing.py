@@ -250,8 +250,8 @@ def _cut_blocks(spectrum: Tensor, step: int, buffers: int) -> Iterator[_Block]:
 
     On a CPU, a block is a part of one item that fits the cache. Smaller blocks take longer, because
     it takes several microseconds to begin an operation. The operations of a block write their
-    results to the same buffers again and again, whose memory is not returned to the system after
-    each operation. This takes a third of the time.
+    results to the same buffers again and again, because it takes time to return the memory to the
+    system after each operation.
 
     Args:
         spectrum: Real parts of the spectra.
