@@ -148,7 +148,12 @@ def _process_channels(
 ) -> Tensor:
     """Return the output of a model, channel by channel, as a model itself processes long signals.
 
+    A listener's left ear gets the first of two channels, and the right ear the second one.
+
     Shape: (channels, time) -> (channels, time).
+
+    Raises:
+        ValueError: There is a listener, and the number of channels is not 2.
     """
     ears_of_channels = [ears] * len(part)
     if isinstance(ears, Listener):

@@ -88,9 +88,10 @@ def _prepare(
 
 
 def _score_for_ear(name: str, precision: torch.dtype, item: Item, output: Tensor) -> Values:
-    """Compute HASPI, HASQI or HAAQI, as a dict with the one column ``name``.
+    """Compute HASPI, HASQI or HAAQI of an output, (time,), as a dict with the one column ``name``.
 
-    As in pyclarity, the ear's noise is drawn, and the sample rate is rounded to whole kHz.
+    As in pyclarity, the ear's internal noise is drawn, with the seed of the item, and the sample
+    rate is rounded to whole kHz. ``precision`` is the number type of the computation.
     """
     samples = item.clean.to(precision)
     clean = _CleanSignal(value_hash(samples), samples)
@@ -102,7 +103,10 @@ def _score_for_ear(name: str, precision: torch.dtype, item: Item, output: Tensor
 
 
 def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tensor) -> Values:
-    """Compute STOI or PESQ, which ignore the ear, as a dict with the one column ``name``."""
+    """Compute STOI or PESQ of an output, (time,), as a dict with the one column ``name``.
+
+    ``score`` is the function of output, clean speech and sample rate in Hz. It ignores the ear.
+    """
     return {name: score(output, item.clean, item.sample_rate)}
 
 

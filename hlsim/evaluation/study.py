@@ -538,6 +538,9 @@ def _check_values(measure: Measure, values: dict[str, Any]) -> Values:
 def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     """Process an item, and cut its signals and the output to the length of the shorter one.
 
+    Returns:
+        The item with its cut signals, and the output, (time,).
+
     Raises:
         ValueError: The output has another type or shape, differs in length by more than 0.1 s, or
             is not finite.
