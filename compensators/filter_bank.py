@@ -223,7 +223,7 @@ def speech_band_levels(bands: int) -> NDArray[np.float64]:
 
 
 def speech_density(points: int) -> NDArray[np.float64]:
-    """Return the power density of average speech at the frequencies of a transform, on any scale.
+    """Return the power density of average speech at the frequencies of a transform, up to a factor.
 
     Args:
         points: Length of the Fourier transform at 16 kHz.

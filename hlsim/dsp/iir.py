@@ -14,7 +14,7 @@ ComplexArray = NDArray[np.complex128]
 
 
 class ZerosPoles(NamedTuple):
-    """A filter as the zeros and poles of its transfer function, and a factor.
+    """A filter as the zeros and poles of its transfer function, and a factor, ``gain``.
 
     An analogue prototype is a low-pass with the cut-off frequency 1 radian per second.
 

@@ -188,10 +188,10 @@ class NetworkConfig(ModelConfig):
 
     @property
     def receptive_field(self) -> int | None:
-        """Number of input samples before and after an output sample that the layers combine for it.
+        """Number of input samples at 16 kHz on each side of an output sample that influence it.
 
-        The samples have 16 kHz. None if the output depends on the whole signal, as with layers
-        other than convolutions. ``EarNetwork.receptive_field`` includes the prior.
+        None if the output depends on the whole signal, as with layers other than convolutions.
+        ``EarNetwork.receptive_field`` includes the prior.
         """
         if self.block != "cnn":
             return None

@@ -230,7 +230,15 @@ class _Block:
         gains_slope: Tensor,
         matrix_slopes: Sequence[Tensor],
     ) -> None:
-        """Add the gradients with respect to gains and matrices, the inverse of ``factors``."""
+        """Add the gradients with respect to gains and matrices, the backward pass of ``factors``.
+
+        Args:
+            factor_slopes: Gradients with respect to the results of ``factors``.
+            gains: Gains of all items and steps.
+            matrices: Matrices of ``factors``.
+            gains_slope: Tensor to which the gradient with respect to the gains is added.
+            matrix_slopes: Two tensors for the gradients with respect to the matrices, or none.
+        """
         rows = gains[self.items, self.steps]
         for index, (slope, matrix) in enumerate(zip(factor_slopes, matrices, strict=True)):
             sums = slope.new_zeros(*rows.shape[:2], slope.shape[-1])

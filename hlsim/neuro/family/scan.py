@@ -193,6 +193,8 @@ def _parts(A: Tensor, *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
     Args:
         A: Rates, whose size is the number of states per time.
         tensors: Tensors of shape (items, time, ...).
+
+    Returns: For each part, the items of all tensors that belong to it.
     """
     at_once = _STATES_AT_ONCE_GPU if A.is_cuda else _STATES_AT_ONCE_CPU
     states_per_item = tensors[0].shape[1] * A.numel()

@@ -108,6 +108,8 @@ class EncoderLayer(nn.TransformerEncoderLayer):
     """Transformer layer whose memory grows in proportion to the length of the sequence.
 
     The layer consists of self-attention and a feed-forward layer, with normalisation before each.
+    In evaluation mode, its memory grows with the square of the length, so that ``SequencePath``
+    leaves it in training mode.
 
     Shape: (sequences, length, channels) -> (sequences, length, channels).
 
