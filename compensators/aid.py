@@ -69,7 +69,8 @@ class Aid(StoredEars, nn.Module):
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (120 for
                 NAL-R and NAL-RP), shapes do not fit, or the waveform is not a floating-point tensor
-                with time last or is on another device than the weights.
+                with time last, has no samples or one above 1e9 in magnitude, or is on another
+                device than the weights.
         """
         raise NotImplementedError
 

@@ -163,7 +163,8 @@ class MSBG(StoredEars, nn.Module):
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (as in the
                 standard audiogram ``"N7"``), the shapes do not fit, or the waveform is not a
-                floating-point tensor with time last.
+                floating-point tensor with time last, or has no samples or one above 1e9 in
+                magnitude.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)

@@ -80,8 +80,8 @@ class EarNetwork(nn.Module):
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
-                not broadcast, or the waveform is not a floating-point signal with time last or is
-                on another device than the weights.
+                not broadcast, or the waveform is not a floating-point tensor with time last, has no
+                samples or one above 1e9 in magnitude, or is on another device than the weights.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         weight = next(self.parameters())
