@@ -173,14 +173,33 @@ def find_audible_frames(amplitude: Tensor, extent: Extent) -> tuple[Tensor, Exte
     """
     frames_of = Extent(tuple(-(-end // STRIDE) for end in extent.ends))
     is_audible = frames_of.cut(amplitude) > 10.0 ** (SILENCE_DB / 20.0)
-    audible = Extent(tuple(is_audible.sum(-1).tolist()))
+    order, counts = move_to_front(is_audible)
+    audible = Extent(counts)
     if min(audible.ends) < 2:
         raise UnscorableError(
             "clean is below the threshold of hearing in all frames or all but one; raise its "
             "level, or leave the item out"
         )
-    indices = (~is_audible).byte().argsort(dim=-1, stable=True)
-    return indices[:, : audible.longest], audible
+    return order[:, : audible.longest], audible
+
+
+def move_to_front(is_audible: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+    """Find the order in which the audible frames of each item come first, in their order.
+
+    The function synchronises with a GPU once.
+
+    Args:
+        is_audible: True for audible frames. Shape: (items, frames).
+
+    Returns:
+        Indices of the frames in the new order, (items, frames), and the number of audible frames of
+        each item.
+
+    >>> move_to_front(torch.tensor([[False, True, True]]))
+    (tensor([[1, 2, 0]]), (2,))
+    """
+    order = (~is_audible).byte().argsort(dim=-1, stable=True)
+    return order, tuple(is_audible.sum(-1).tolist())
 
 
 @constant

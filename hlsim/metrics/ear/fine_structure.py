@@ -27,6 +27,7 @@ from hlsim.metrics.ear.envelope_modulation import (
     ENERGY_FLOOR,
     SILENCE_DB,
     cosines,
+    move_to_front,
     normalised_covariance,
 )
 from hlsim.metrics.ear.extent import Extent, integers
@@ -144,12 +145,11 @@ def envelope_correlation(
     >>> envelope_correlation(levels, 2.0 * levels, Extent((5,))).round(decimals=4)
     tensor([1.])
     """
-    is_audible = _audible_segments(clean, counts)
-    audible = tuple(is_audible.sum(-1).tolist())
+    # Silence between audible segments does not count; the rest of a shorter item is cut by
+    # ``extent``.
+    order, audible = move_to_front(_audible_segments(clean, counts))
     extent = Extent(tuple(max(1, count) for count in audible))
-    # Audible segments are moved to the front, in their order, because silence between them does not
-    # count; the rest of a shorter item is cut by ``extent``.
-    order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
+    order = order[:, None, : extent.longest]
     basis = cosines(like=clean)
     waves = []
     for levels in (clean, output):
