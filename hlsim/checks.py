@@ -158,6 +158,14 @@ def check_number(
     raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}{fix}")
 
 
+def check_seed(seed: Any) -> None:
+    """Raise ValueError unless a seed is a whole number from 0 to 2^32 - 1, as NumPy requires.
+
+    >>> check_seed(0)
+    """
+    check_number("seed", seed, 0, 2**32 - 1, whole=True)
+
+
 def check_flag(name: str, value: Any) -> None:
     """Raise ValueError unless a setting is True or False.
 

@@ -28,6 +28,9 @@ EAR_NAMES: dict[str, EarName] = {
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 """The eight audiometric frequencies in Hz at which networks, losses and aids take thresholds."""
 
+PTA_FREQUENCIES = (500.0, 1000.0, 2000.0, 4000.0)
+"""Frequencies in Hz whose mean threshold is the pure-tone average."""
+
 LOWEST_HZ, HIGHEST_HZ = 100.0, 20000.0
 """Range of the frequencies in Hz at which an audiogram may have thresholds."""
 

@@ -188,18 +188,30 @@ def _read_ears(
             no name of an ear, or both the columns of thresholds and the column ``ear`` name it.
     """
     ears = ears_in_row(row, highest)
-    text = row.get("ear", "")
-    name = EAR_NAMES.get(text.lower())
     if None in ears:
-        if text and name is None:
-            raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
-        return {name: ears[None]}
-    if name is not None:
+        return {named_ear(row): ears[None]}
+    if row.get("ear", "").lower() in EAR_NAMES:
         raise ValueError(
             f"columns of thresholds name the ear, and the column ear has {row['ear']!r}; "
             "remove the column ear"
         )
     return ears
+
+
+def named_ear(row: Mapping[str, str]) -> EarName | None:
+    """Return the ear that the column ``ear`` of a row names, or None if there is no text.
+
+    Raises:
+        ValueError: The text is no name of an ear.
+
+    >>> named_ear({"ear": "L"}), named_ear({})
+    ('left', None)
+    """
+    text = row.get("ear", "")
+    name = EAR_NAMES.get(text.lower())
+    if text and name is None:
+        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
+    return name
 
 
 def _read_rows(table: str | Path | Any) -> list[_Row]:

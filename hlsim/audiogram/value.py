@@ -31,6 +31,7 @@ from hlsim.audiogram.scale import (
     LOWEST_HZ,
     LOWEST_LEVEL,
     LOWEST_UCL,
+    PTA_FREQUENCIES,
     SEVERITIES,
     SEVERITY_LIMITS,
     UCL_NOT_REACHED,
@@ -248,7 +249,7 @@ class Audiogram:
     def pta(self) -> float:
         """Pure-tone average in dB HL: mean threshold at 500, 1000, 2000 and 4000 Hz."""
         levels = dict(zip(FREQUENCIES, self.thresholds, strict=True))
-        return sum(levels[hz] for hz in (500.0, 1000.0, 2000.0, 4000.0)) / 4.0
+        return sum(levels[hz] for hz in PTA_FREQUENCIES) / len(PTA_FREQUENCIES)
 
     def plot(self, axes: Any = None, *, ear: EarName | None = None) -> Any:
         """Draw the audiogram as audiologists do, with the hearing loss downwards.

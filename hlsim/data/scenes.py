@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.calibration import NEURO_RATE, set_level
-from hlsim.checks import check_number, check_rate, check_waveform
+from hlsim.checks import check_number, check_rate, check_seed, check_waveform
 from hlsim.data.mixing import mix
 from hlsim.data.rooms import REVERBERATION_TIMES, Room, draw_room, find_arrivals
 from hlsim.dsp.sphere import evenly_spread_directions, head_responses, unit_vectors
@@ -104,7 +104,7 @@ def make_scene(
     """
     rate = check_rate(sample_rate)
     check_number("snr", snr, -100.0, 100.0)
-    check_number("seed", seed, 0, 2**32 - 1, whole=True)
+    check_seed(seed)
     check_number("spacing", spacing, 0.002, 0.1)
     if isinstance(maskers, Tensor) or not isinstance(azimuths, Sequence):
         raise ValueError(

@@ -30,7 +30,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.audiogram.columns import threshold_columns
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.scale import EAR_NAMES, EARS
-from hlsim.audiogram.table import read_audiograms, read_listeners
+from hlsim.audiogram.table import named_ear, read_audiograms, read_listeners
 from hlsim.audiogram.value import ears_in_row
 from hlsim.calibration import full_scale_at
 from hlsim.evaluation.running.fingerprint import value_hash
@@ -436,10 +436,7 @@ def _read_row(
     for column in _REQUIRED_COLUMNS:
         if not row[column]:
             raise ValueError(f"expected a value in the column {column}, got none; fill it in")
-    listener, text = row.get("listener", ""), row.get("ear", "")
-    ear = EAR_NAMES.get(text.lower(), "")
-    if text and not ear:
-        raise ValueError(f"expected left or right in the column ear, got {text!r}; correct it")
+    listener, ear = row.get("listener", ""), named_ear(row) or ""
     has_thresholds = any(row[column] for column in threshold_columns(row))
     if has_thresholds and row.get("audiogram"):
         raise ValueError(
@@ -454,7 +451,7 @@ def _read_row(
         audiogram = getattr(listeners[listener], ear, None)
     if audiogram is None:
         raise ValueError(
-            f"there is no audiogram of listener {listener!r}, ear {text!r}; add columns hl_250, "
+            f"there is no audiogram of listener {listener!r}, ear {ear!r}; add columns hl_250, "
             "hl_500, ... or a column audiogram, or pass a file of audiograms with a row for this "
             "ear"
         )

@@ -22,6 +22,7 @@ from hlsim.checks import (
     check_lengths,
     check_number,
     check_rate,
+    check_seed,
     check_waveform,
 )
 from hlsim.dsp.fft import fft_length
@@ -229,7 +230,7 @@ class Reference(ABC):
                 inaudible to a normal ear.
         """
         check_choice("noise", noise, Noise)
-        check_number("seed", seed, 0, 2**32 - 1, whole=True)
+        check_seed(seed)
         outputs = as_samples(output)
         check_waveform(outputs, "output", full_scale_spl=self._full_scale_spl)
         check_pair(outputs, self._clean)

@@ -25,10 +25,18 @@ from torch import Tensor, nn
 
 from compensators import load_compensator
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.scale import PTA_FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
 from hlsim.checkpoint import DIGIT_LISTENER
-from hlsim.checks import check_attributes, check_finite, check_number, check_shape, loud_outputs
+from hlsim.checks import (
+    check_attributes,
+    check_finite,
+    check_number,
+    check_seed,
+    check_shape,
+    loud_outputs,
+)
 from hlsim.evaluation.digits.material import Triplets, draw_triplets, perceive, present
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import (
@@ -49,7 +57,7 @@ NOISE_SPL = 65.0
 TRIPLETS = 120
 """Number of triplets per ear and condition by default."""
 
-_PTA = [FREQUENCIES.index(hz) for hz in (500.0, 1000.0, 2000.0, 4000.0)]
+_PTA = [FREQUENCIES.index(hz) for hz in PTA_FREQUENCIES]
 """Indices of the frequencies of the pure-tone average."""
 
 _ROUND_ENDS = (0.2, 0.6)
@@ -139,7 +147,7 @@ class DigitTest:
         """
         check_number("noise_spl", noise_spl, 40.0, 90.0)
         check_number("triplets", triplets, 30, 3000, whole=True)
-        check_number("seed", seed, 0, 2**32 - 1, whole=True)
+        check_seed(seed)
         return cls(
             draw_triplets(triplets, torch.Generator().manual_seed(seed)),
             load_simulator(simulator),
