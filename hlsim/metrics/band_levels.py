@@ -2,7 +2,7 @@
 
 There are 24 bands from 80 Hz to 7.5 kHz. They are equally wide, 1.25 ERB (equivalent rectangular
 bandwidths), on the scale of Glasberg and Moore (1990), rectangular and without gaps, so that their
-powers add up to that of the signal.
+powers add up to that of the signal between 80 Hz and 7.5 kHz.
 """
 
 import numpy as np
@@ -49,7 +49,8 @@ _WEIGHT_FLOOR = 1e-3
 def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     """Compute the level in 24 bands from 80 Hz to 7.5 kHz in frames of 32 ms, every 16 ms.
 
-    The bands are about as wide as auditory filters, 1.25 ERB each.
+    The bands are about as wide as auditory filters, 1.25 ERB each. Frame k is centred on k * 16 ms;
+    zeros surround the signal.
 
     Shape: (..., time) -> (..., frames, 24).
 

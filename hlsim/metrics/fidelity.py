@@ -145,8 +145,9 @@ def stoi(output: Signal, clean: Signal, sample_rate: int) -> float:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The signals are not one-dimensional or differ in length, or STOI is not defined:
-            a signal is silent, has a sample that is not finite, or has less than 0.4 s of speech.
+        ValueError: The signals are empty, not one-dimensional or of different lengths, or STOI is
+            not defined: a signal is silent, has a sample that is not finite, or has less than 0.4 s
+            of speech.
         MissingExtraError: pystoi is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)
@@ -173,8 +174,9 @@ def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The signals are not one-dimensional or differ in length, or PESQ is not defined:
-            a signal is silent, has a sample that is not finite, or has no speech that pesq detects.
+        ValueError: The signals are empty, not one-dimensional or of different lengths, or PESQ is
+            not defined: a signal is silent, has a sample that is not finite, or has no speech that
+            pesq detects.
         MissingExtraError: pesq is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)

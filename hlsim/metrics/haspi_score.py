@@ -4,12 +4,13 @@ The score is that of pyclarity 0.9.0, with a gradient. Please note:
 
 - HASPI rewards gain: 20 dB took one utterance from 0.53 to 0.99. Report the level beside the score.
 - White noise in place of the output should score 0. It does to within 0.05 on utterances
-  of 3 s and more, but scores up to 0.3 on 1.2 s, 0.45 on 0.7 s and 0.99 on 0.2 s. Signals shorter
+  of 3 s and more, but scores up to 0.3 on 1.2 s, 0.5 on 0.7 s and 0.99 on 0.2 s. Signals shorter
   than 0.7 s are rejected.
 - Clean speech below 20 dB SPL, or that a normal ear does not hear, is rejected, because every
   output would have the same score. A constant offset does not count as level.
-- The ear spans 80 to 8000 Hz. Between 16 and 48 kHz, scores differ by up to 0.008. Compare scores
-  of one rate.
+- The ear spans 80 to 8000 Hz. From 24 to 48 kHz, scores of the same sounds differ by less than
+  0.001. At 16 kHz, they differ by up to 0.01 for clean speech and 0.05 for noisy speech. Compare
+  scores of one rate.
 - Signals and channels are aligned by whole samples. One sample in one channel changes a score by up
   to 0.006. Where two delays match equally well, single precision may choose another one than double
   precision.
@@ -74,16 +75,18 @@ def haspi(
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
         clean: Clean speech, not amplified. Shape: (..., time). Lengths of both that differ by 0.1 s
             at most are cut to the shorter one, with a warning.
-        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item. Shape of a
-            tensor: (..., 8). The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz count,
-            interpolated over log frequency where they were not measured.
+        audiogram: The impaired ear, -10 to 120 dB HL: one for all items or one for each, or a
+            ``Listener`` for (..., 2, time). Shape of a tensor: (..., 8). The thresholds at 250,
+            500, 1000, 2000, 4000 and 6000 Hz count, interpolated over log frequency where they were
+            not measured.
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200 (pyclarity's ``level1``).
         lengths: Number of samples of each item in a padded batch. Shape: (...).
-        noise: Internal noise of the ear. ``"expected"`` computes the mean score over all draws of
-            the noise, which is smooth and the same every time; ``"seeded"`` draws the noise that
-            pyclarity draws with ``seed`` (scores vary by up to 0.007); ``"none"`` leaves it out.
-        seed: Seed of the drawn noise of each item.
+        noise: Internal noise of the ear. ``"expected"`` computes the score from features that are
+            means over all draws of the noise, so that it is smooth and the same every time;
+            ``"seeded"`` draws the noise that pyclarity draws with ``seed`` (scores vary by up to
+            0.007); ``"none"`` leaves it out.
+        seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
         whole_khz: Round the rate to whole kHz, as pyclarity does. From 44.1 to 44 kHz, scores
             mostly change by less than 0.01.
 
@@ -122,7 +125,7 @@ class HaspiReference(Reference):
         clean: Clean speech, not amplified. The scores are on its device, and float64 if it is,
             otherwise float32. Its gradient is not computed. Shape: (..., time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         keep: Store the clean speech's features; otherwise they are computed, and the level is
@@ -218,7 +221,7 @@ class HaspiReference(Reference):
             audiogram: The impaired ear, or one for each item, as in ``haspi``.
             noise: Internal noise of the ear: ``"expected"``, its mean effect; ``"seeded"``, the
                 noise that pyclarity draws; or ``"none"``.
-            seed: Seed of the drawn noise of each item.
+            seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 
         Returns:
             Scores, 0 to 1, an array if ``output`` is one. Shape: (...).

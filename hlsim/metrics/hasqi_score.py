@@ -42,14 +42,15 @@ def hasqi(
         output: Output of an aid, at the impaired ear, at least 0.7 s long. Shape: (..., time).
         clean: Clean speech, not amplified unless ``equalisation`` is 2. Shape: (..., time). Lengths
             of both that differ by 0.1 s at most are cut to the shorter one, with a warning.
-        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        audiogram: The impaired ear, -10 to 120 dB HL: one for all items or one for each, or a
+            ``Listener`` for (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         noise: Noise at the threshold of hearing, which matters where nothing of the output is
             audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the noise
             that pyclarity draws with ``seed``; ``"none"`` leaves it out.
-        seed: Seed of the drawn noise of each item.
+        seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity: 1 amplifies clean speech by NAL-R here, 2 takes speech that
             NAL-R or another prescription has amplified.
@@ -88,9 +89,10 @@ class HasqiReference(QualityReference):
         clean: Clean speech, not amplified unless ``equalisation`` is 2. The scores are on its
             device, and float64 if it is, otherwise float32. Its gradient is not computed. Shape:
             (..., time).
-        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        audiogram: The impaired ear, -10 to 120 dB HL: one for all items or one for each, or a
+            ``Listener`` for (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity, 1 or 2, see ``hasqi``.

@@ -61,9 +61,10 @@ class QualityReference(Reference):
         clean: Clean signals, not amplified unless ``equalisation`` is 2. The scores are on their
             device, and float64 if they are, otherwise float32. Their gradient is not computed.
             Shape: (..., time).
-        audiogram: The impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        audiogram: The impaired ear, -10 to 120 dB HL: one for all items or one for each, or a
+            ``Listener`` for (..., 2, time).
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R here, 2 takes
@@ -96,7 +97,7 @@ class QualityReference(Reference):
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
-            seed: Seed of the drawn noise of each item.
+            seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 
         Returns:
             Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
@@ -115,7 +116,7 @@ class QualityReference(Reference):
                 time).
             noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
-            seed: Seed of the drawn noise of each item.
+            seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 
         Returns:
             Score and parts, tensors even if ``output`` is an array. Shape of each: (...).

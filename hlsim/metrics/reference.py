@@ -69,7 +69,7 @@ class Reference(ABC):
         audiogram: Ear that receives the clean signals, a normal one for HASPI and the impaired one
             for HASQI and HAAQI; one ear, or one for each item.
         sample_rate: Sample rate in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity: 1 amplifies the clean signals by NAL-R, 2 takes them as

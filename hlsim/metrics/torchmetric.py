@@ -169,8 +169,9 @@ class _MeanScore(_Metric):
                 for two ears, (batch, 2, time).
             clean: Clean speech of the same shape. The longer of both is cut with a warning if they
                 differ by up to 0.1 s.
-            audiogram: One ear, or one per item. For two channels a ``Listener``, a pair of left
-                and right ear, or one of these per item. None takes that of the constructor.
+            audiogram: One ear, or one per item; for a tensor (8,) or (batch, 8). For two channels a
+                ``Listener``, a pair of left and right ear, or one of these per item; for a tensor
+                (2, 8) or (batch, 2, 8). None takes that of the constructor.
             lengths: Number of samples of each item of a padded batch. Shape: (batch,).
 
         Raises:
@@ -267,9 +268,9 @@ class HASPI(_MeanScore):
         sample_rate: Sample rate in Hz, 16000 to 48000.
         audiogram: Ear for calls of ``update`` without an audiogram, such as those by torchmetrics'
             ``MultitaskWrapper``.
-        full_scale_spl: Level in dB SPL of a signal with RMS 1.0.
-        limit: Largest number of items that are scored from one reset to the next in each process;
-            the others are skipped. None scores all.
+        full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
+        limit: Largest number of items, 1 or more, that are scored from one reset to the next in
+            each process; the others are skipped. None scores all.
         options: Keyword arguments of ``torchmetrics.Metric``, except ``dist_sync_on_step``.
 
     Raises:

@@ -7,7 +7,7 @@ enhancement challenges.
 - HASPI was that of the better ear at pyclarity's default level. The sentences were in British
   English, in noise, and 7 to 10 words long. For other speech the predictions are an extrapolation.
 - At the same HASPI, people understood fewer words in the second challenge. A prediction for no
-  particular challenge lies between the two, and differs from each by up to 0.08.
+  particular challenge lies between the two, and differs from each by up to 0.09.
 - HASPI ranks aids, not people. Its correlation with the words understood in the first challenge is
   0.97 for the means of ten aids, and 0.33 for the means of the listeners. The intervals include the
   differences between listeners.
@@ -141,7 +141,7 @@ def words_change(before: ArrayLike, after: ArrayLike, challenge: int | None = No
         challenge: 1 or 2 if the sentences are as hard as those of Clarity's first or second
             enhancement challenge. (The first had one interfering sound; the second had two or
             three, and the listener's head moved.) At the same HASPI, fewer words were understood in
-            the second one. With None, the difference between two such tests is a part of the
+            the second one. With None, the difference between two such challenges is a part of the
             uncertainty.
 
     Returns:
@@ -222,8 +222,8 @@ def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> l
 
     The same 4000 listeners, whose random numbers are fixed, are simulated with every aid, so the
     arrays can be subtracted. Each listener has an intercept and a slope, and draws the uncertainty
-    of the curve and of the test. Each aid has an intercept for each listener, and the words that
-    are understood depend on chance.
+    of the curve and of the challenge. Each aid has an intercept for each listener, and the words
+    that are understood depend on chance.
 
     Args:
         curve: Parameters of the model, from ``load_curve``.

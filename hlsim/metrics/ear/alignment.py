@@ -75,7 +75,7 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     Near the maximum, single precision resolves these changes, but not the values themselves.
 
     Blocks of half a second are transformed, which fit into caches. Neighbouring blocks overlap by
-    all lags.
+    twice the largest lag.
 
     Args:
         reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).

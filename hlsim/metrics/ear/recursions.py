@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 StateSpace = tuple[Array, Array, Array, float, int]
 """A filter with the input u, the state x, the output y = c x + d u and the next state a x + b u.
 
-It is a, (states, states); b, (states, 1); c, (1, states); d; and the number of samples after which
-the influence of an input sample has vanished.
+The tuple has a, (states, states); b, (states, 1); c, (1, states); d; and the number of samples
+after which the influence of an input sample has vanished.
 """
 
 
