@@ -1,6 +1,8 @@
 """The program ``hlsim``. Every error ends with exit status 2 and a message of one line."""
 
 import argparse
+import atexit
+import gc
 import io
 import os
 import sys
@@ -82,6 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A character that the encoding lacks, in the name of a file, must not end the command.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    # Python ends by a search for unused objects, which takes half a second after torch is imported.
+    # The memory goes back to the system anyway.
+    atexit.register(gc.freeze)
     try:
         options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
         options.run(options)

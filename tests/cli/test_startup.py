@@ -106,3 +106,25 @@ def test_imports_are_few_and_a_command_runs_in_one_thread_unless_a_user_chooses(
     root = Path(hlsim.__file__).parents[1]
     ended = subprocess.run(call, capture_output=True, text=True, cwd=root)
     assert ended.returncode == 0, ended.stderr[-2000:]
+
+
+def test_evaluations_without_statistics_do_not_import_them() -> None:
+    script = "import sys, hlsim.evaluation.recordings; sys.exit('scipy.special' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+EXIT_SCRIPT = """
+import atexit, gc
+from hlsim.cli.main import main
+atexit.register(lambda: print("frozen", gc.get_freeze_count() > 0))
+try:
+    main(["--version"])
+finally:
+    print("ends")
+"""
+
+
+def test_a_command_ends_without_a_search_for_unused_objects() -> None:
+    call = [sys.executable, "-c", EXIT_SCRIPT]
+    ended = subprocess.run(call, capture_output=True, text=True, check=True)
+    assert ended.stdout.endswith("ends\nfrozen True\n")

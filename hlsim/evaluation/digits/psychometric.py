@@ -12,8 +12,8 @@ of Audiology 43, doi 10.1080/14992020400050004 (the test).
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import expit, logit
 
 from hlsim.evaluation.digits.material import DIGITS_PER_TRIPLET
 
@@ -74,7 +74,8 @@ def estimate_threshold(snr: Array, right: Array) -> Estimate:
     points = np.meshgrid(_THRESHOLDS, _SLOPES, _LAPSES, indexing="ij")
     threshold, slope, lapse = (values.reshape(-1, 1) for values in points)
     span = 1.0 - _GUESS - lapse
-    share = _GUESS + span * expit(slope * (snr - threshold) + logit((TARGET - _GUESS) / span))
+    log_odds = scipy.special.logit((TARGET - _GUESS) / span)
+    share = _GUESS + span * scipy.special.expit(slope * (snr - threshold) + log_odds)
     likelihoods = right * np.log(share) + (DIGITS_PER_TRIPLET - right) * np.log1p(-share)
     log_likelihood = likelihoods.sum(-1).reshape(len(_THRESHOLDS), -1)
     posterior = np.exp(log_likelihood - log_likelihood.max()).sum(-1)
