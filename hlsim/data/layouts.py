@@ -269,7 +269,9 @@ def _read_clarity_scenes(files: Sequence[str]) -> list[Utterance]:
     """Convert the paths of Clarity's scenes to utterances, one per scene.
 
     The clean speech is the anechoic target. The files of all microphones are the noisy recording,
-    whose reference is microphone 1 at both ears. Interferers and other files are not used.
+    whose reference is microphone 1 at both ears. Interferers and other files are not used. Scenes
+    in a folder ``train``, ``dev`` or ``eval`` are in the split train, valid or test, and others in
+    train.
 
     Raises:
         ValueError: A scene lacks its clean speech, or its first microphone.

@@ -21,7 +21,7 @@ def mix(
 
     The speech stays as it is, and the noise is scaled. The level of the speech is the active level
     of ITU-T P.56, which leaves pauses out; the level of the noise is its RMS level. Silent speech
-    gets inaudible noise, at -106 dB SPL.
+    gets inaudible noise, at -106 dB SPL for an SNR of 0 dB or more.
 
     Args:
         speech: Tensor or NumPy array of speech, ``(..., time)``.
@@ -38,9 +38,9 @@ def mix(
         Noisy speech, of the type and shape of ``speech``.
 
     Raises:
-        ValueError: The shapes, or that of the SNR, do not fit; the noise is silent or shorter than
-            the speech, samples are NaN or infinite, the SNR is NaN, or the sample rate is out of
-            range.
+        ValueError: The shapes, or that of the SNR, do not fit; a signal is not floating-point with
+            time last; the noise is silent or shorter than the speech, samples are NaN or infinite,
+            the SNR is NaN, or the sample rate is out of range.
 
     Example:
         >>> import hlsim

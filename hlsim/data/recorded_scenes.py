@@ -137,9 +137,9 @@ class SceneFiles(NamedTuple):
 def file_with_room(clean: Path, noisy: Path | None = None) -> Path | None:
     """Return the file of the target in its room that belongs to clean speech of Clarity's scenes.
 
-    It is beside the clean speech, whose level is not that in the room, and is that of the reference
-    microphone, or else of microphone 1. None if there is no such file, or if the clean speech has
-    the right level.
+    The clean speech has another level than in the room, and the file beside it has the target at
+    the reference microphone, or else at microphone 1. The result is None if there is no such file,
+    or if the clean speech has the right level.
 
     Args:
         clean: File of the clean speech.

@@ -15,7 +15,8 @@ from hlsim.extras import require
 REVERBERATION_TIMES = (0.2, 1.5)
 """Shortest and longest reverberation time of rooms in s.
 
-A large room does not reach shorter ones. The number of echoes grows with the third power.
+A large room does not reach shorter ones. The number of echoes grows with the third power of the
+time.
 """
 
 
@@ -33,12 +34,12 @@ class Room:
             1.5. The impulse responses end then. A source takes about a second to compute for
             0.5 s, and up to half a minute for 1.5 s.
         head: Position of the centre of the head in m, on the axes of ``size``: from the wall behind
-            the listener, from the wall on the right, and above the floor.
-        distance: Distance of all talkers and maskers from the centre of the head in m.
+            the listener, from the wall on the right, and above the floor; 0.0875 m, the radius of
+            the head, or more from each surface.
+        distance: Distance of all talkers and maskers from the centre of the head in m, 0.175 to 30.
 
     Raises:
-        ValueError: There are not three numbers for size or head, a number is out of range, or the
-            head is not inside the room.
+        ValueError: There are not three numbers for size or head, or a number is out of range.
 
     >>> Room(reverberation_time=0.5).size
     (6.0, 5.0, 2.7)

@@ -36,8 +36,9 @@ class Scene(NamedTuple):
     """Signals of the microphones of a scene.
 
     Attributes:
-        input: Target and maskers at the microphones, (..., microphones, ears, time).
-        target: Direct sound of the target alone, likewise.
+        input: Target and maskers at the microphones, (..., microphones, ears, time), the front
+            microphones and the left ear first.
+        target: Direct sound of the target alone, of the same shape.
 
     >>> Scene(torch.zeros(2, 2, 10), torch.zeros(2, 2, 10)).input.shape
     torch.Size([2, 2, 10])
@@ -74,13 +75,13 @@ def make_scene(
     Args:
         target: Speech at its level at the centre of the head without the head, (time,).
         maskers: Other talkers or noises at their relative levels, (time,) or longer.
-        azimuths: Azimuth of each masker in degrees, 0 in front, 90 on the left.
+        azimuths: Azimuth of each masker in degrees, -360 to 360, 0 in front, 90 on the left.
         diffuse: Recording of noise with the level of a masker that becomes diffuse, at least as
             long as the target.
-        snr: Signal-to-noise ratio at the microphones in dB: the active level of the target, with
-            its echoes, minus the level of all other sounds, with the powers of all microphones
-            averaged.
-        target_azimuth: Azimuth of the target in degrees.
+        snr: Signal-to-noise ratio at the microphones in dB, -100 to 100: the active level of the
+            target, with its echoes, minus the level of all other sounds, with the powers of all
+            microphones averaged.
+        target_azimuth: Azimuth of the target in degrees, -360 to 360.
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         sample_rate: Sample rate of all signals in Hz, 16000 to 48000.
         seed: Seed of the parts of the recording for diffuse noise, 0 or more.
@@ -88,7 +89,7 @@ def make_scene(
             default, as in the open. Echoes make sounds louder, by about 3 dB at 0.3 s.
 
     Returns:
-        The scene. Direct sound from the front arrives at the time it has in ``target``.
+        The scene. Direct sound passes the centre of the head at the time it has in ``target``.
 
     Raises:
         MissingExtraError: There is a room, and pyroomacoustics is not installed.

@@ -21,10 +21,10 @@ _RISE_SECONDS = 0.01
 def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
     """Draw sounds at 16 kHz that are not speech, without a calibrated level.
 
-    Items 0, 2, 4 and so on have one to four steady tones, which begin together at a random time, in
-    the first half of the item or before the item, and rise over 10 ms. (If no tone began before the
-    item, a network would learn that a tone always follows silence.) The other items have one to
-    eight clicks of one sample.
+    Items 0, 2, 4 and so on have one to four steady tones, 100 to 7500 Hz, which begin together at a
+    random time, in the first half of the item or before the item, and rise over 10 ms. (If no tone
+    began before the item, a network would learn that a tone always follows silence.) The other
+    items have one to eight clicks of one sample.
 
     The frequency of about half of the tones is a multiple of 250 Hz, as in audiometry. Such a tone
     has a whole number of periods in 4 or 8 ms, so that it has the same phase in every frame of a
