@@ -23,7 +23,7 @@ LOWEST_SPL, HIGHEST_SPL = -20.0, 140.0
 """Range of levels in dB SPL of recordings: from inaudible to a level that damages ears at once."""
 
 Loudness = float | Mapping[float, float]
-"""Loudness in dB relative to a normal ear, one number or numbers by the level of the input."""
+"""Loudness in dB relative to a normal ear, one number or numbers by the input's level in dB SPL."""
 
 POWER_FLOOR = 1e-20
 """Power of -106 dB SPL in Pa^2, to which lower powers are raised, so that all levels are finite."""
@@ -69,10 +69,11 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
 
     Args:
         waveform: Samples.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
-        ValueError: The waveform is not a floating-point tensor with time last.
+        ValueError: The waveform is not a floating-point tensor with time last, or
+            ``full_scale_spl`` is out of range.
 
     >>> level_spl(torch.tensor([1.0, -1.0]))
     tensor(94.)
@@ -119,8 +120,8 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: The waveform is not a floating-point tensor with time last, or ``spl`` is not a
-            level, out of range, or does not fit the items.
+        ValueError: The waveform is not a floating-point tensor with time last, ``spl`` is not a
+            level or does not fit the items, or a level is out of range.
 
     >>> level_spl(set_level(torch.randn(2, 16000), torch.tensor([65.0, 80.0]))).round()
     tensor([65., 80.])

@@ -45,7 +45,7 @@ SIMULATOR = "neuro-msbg"
 """Kind of the checkpoints of simulators."""
 
 DIGIT_LISTENER = "digit-listener"
-"""Kind of the checkpoints of listeners of the digit test.
+"""Kind of the checkpoints of networks that recognise the digits of the digit test.
 
 All kinds other than this one and ``SIMULATOR`` are compensators.
 """
@@ -82,7 +82,8 @@ def read_checkpoint(name: str | Path, classes: Sequence[Any], **options: Any) ->
     is on the CPU.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
+        name: Name of a checkpoint that ships with hlsim, the folder of a checkpoint, or the folder
+            of a training run, which contains it.
         classes: Classes of the accepted kinds of checkpoints, which extend ``HubModel``.
         options: Further arguments of the class of the checkpoint.
 

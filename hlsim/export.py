@@ -84,7 +84,7 @@ def export_program(
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
-        seconds: Duration of the waveforms.
+        seconds: Duration of the waveforms in seconds.
         items: Number of waveforms per call.
 
     Raises:
@@ -127,7 +127,7 @@ def export_onnx(
     Args:
         simulator: Neuro-MSBG at 16 kHz.
         path: File to write.
-        seconds: Duration of the waveforms.
+        seconds: Duration of the waveforms in seconds.
         items: Number of waveforms per call.
 
     Raises:

@@ -47,8 +47,9 @@ def load_audio(
 
     Args:
         path: A file that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
-        spl: RMS level over all channels in dB SPL to which the recording is scaled, with one gain
-            for all channels. With ``None`` nothing is scaled: the file's samples are pascals.
+        spl: RMS level over all channels in dB SPL, -20 to 140, to which the recording is scaled,
+            with one gain for all channels. With ``None`` nothing is scaled: the file's samples are
+            pascals.
         sample_rate: Rate in Hz to which the recording is resampled, 16000 to 48000; by default the
             file's rate.
 
@@ -189,7 +190,7 @@ def listen(
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
-        signals: Signals by the label to show, ``(time,)``, or ``(2, time)`` in stereo.
+        signals: Signals by the label to show, ``(time,)``, or ``(2, time)`` in stereo, left first.
 
     Returns:
         A player that a notebook displays; its ``save`` method writes a page for a browser.
