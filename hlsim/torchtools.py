@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import update_wrapper, wraps
+from functools import partial, update_wrapper, wraps
 from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, ParamSpec, TypeVar, overload
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 from torch.utils.weak import WeakTensorKeyDictionary
 
 P = ParamSpec("P")
@@ -90,6 +91,19 @@ def built_in_float32(construct: Callable[P, None]) -> Callable[P, None]:
             torch.set_default_dtype(default)
 
     return call
+
+
+def checkpointed(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Make a function compute its activations again in the backward pass instead of storing them.
+
+    Args:
+        function: Function that draws no random numbers, because their state is not stored.
+
+    >>> x = torch.tensor(3.0, requires_grad=True)
+    >>> torch.autograd.grad(checkpointed(torch.square)(x), x)
+    (tensor(6.),)
+    """
+    return partial(checkpoint, function, use_reentrant=False, preserve_rng_state=False)
 
 
 def without_modes(

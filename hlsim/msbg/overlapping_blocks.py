@@ -6,16 +6,15 @@ pass, and its activations are not stored.
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from hlsim.dsp.overlap import Block, split_into_blocks
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP
 from hlsim.msbg.smearing import HOP
+from hlsim.torchtools import checkpointed
 
 _BLOCK_SECONDS = 8.0
 """Duration of the output of a block."""
@@ -64,7 +63,7 @@ def in_blocks(
     blocks = block_bounds(samples, rate)
     is_differentiated = torch.is_grad_enabled() and (signals.requires_grad or ears.requires_grad)
     if is_differentiated and (checkpoints_short or len(blocks) > 1) and _hooks_are_allowed():
-        process = partial(checkpoint, process, use_reentrant=False, preserve_rng_state=False)
+        process = checkpointed(process)
     if len(blocks) == 1:
         return process(signals, ears, True)
     outputs = []

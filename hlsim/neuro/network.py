@@ -1,10 +1,7 @@
 """Base class of the networks that process a waveform for an ear: calibration, rates and memory."""
 
-from functools import partial
-
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import NEURO_RATE, check_full_scale, gain_to_pascals
@@ -12,7 +9,7 @@ from hlsim.checks import check_device, check_rate, check_waveform
 from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NetworkConfig
-from hlsim.torchtools import pair_items
+from hlsim.torchtools import checkpointed, pair_items
 
 # On a CPU, larger feature maps take time because the C library returns their memory to the system
 # after each operation.
@@ -111,8 +108,7 @@ class EarNetwork(nn.Module):
         inputs = resample(signals * gain, self.sample_rate, NEURO_RATE)
         process = self.process_items
         if self.checkpoint:
-            # The networks draw no random numbers, whose state need not be stored.
-            process = partial(checkpoint, process, use_reentrant=False, preserve_rng_state=False)
+            process = checkpointed(process)
         if self.receptive_field is None:
             output = process(inputs, ears)
         else:
