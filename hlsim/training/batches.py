@@ -51,8 +51,7 @@ ears, time), the left ear first.
 MAX_DEVICES = 64
 """Largest number of training devices.
 
-The batches of a step have this many consecutive numbers, of which each device draws one. With more
-devices, which is not checked, batches would occur twice.
+The batches of a step have this many consecutive numbers, of which each device draws one.
 """
 
 _VALIDATION_SECONDS = 2.0

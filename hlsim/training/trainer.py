@@ -24,7 +24,7 @@ from torch import Tensor
 from hlsim.checkpoint import CONFIG, read_record, read_weights
 from hlsim.files import lock_folder, write_atomically
 from hlsim.progress import ProgressLine, clear_line
-from hlsim.training.batches import BatchData
+from hlsim.training.batches import MAX_DEVICES, BatchData
 from hlsim.training.module import TrainingModule
 from hlsim.version import __version__
 
@@ -202,8 +202,8 @@ def train_network(
     Raises:
         ValueError: The folder contains another training, one with another number of devices, its
             network alone, or a broken state; another process is writing to it; there is no such
-            device; gradients would be accumulated; the loss is not finite; or a validation score is
-            NaN.
+            device, or there are more than 64; gradients would be accumulated; the loss is not
+            finite; or a validation score is NaN.
         KeyboardInterrupt: The training was interrupted. It resumes from its last validation.
     """
     recipe = module.recipe
@@ -244,6 +244,11 @@ def train_network(
             )
         except MisconfigurationException as error:
             raise ValueError(f"cannot train with {options}: {error}") from error
+        if trainer.world_size > MAX_DEVICES:
+            raise ValueError(
+                f"expected {MAX_DEVICES} devices at most, because others would draw the same "
+                f"batches, got {trainer.world_size}"
+            )
         if trainer.is_global_zero:
             locks.enter_context(lock_folder(folder))
         record["devices"] = trainer.world_size

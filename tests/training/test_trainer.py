@@ -231,6 +231,11 @@ def test_a_training_does_not_resume_with_another_number_of_devices(tmp_path: Pat
         run(VectorTraining(), tmp_path)
 
 
+def test_there_are_not_more_devices_than_batches_of_a_step(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"expected 64 devices at most.*, got 65"):
+        run(VectorTraining(), tmp_path, devices=MAX_DEVICES + 1)
+
+
 def test_gradients_are_not_accumulated(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="raise batch in the recipe"):
         run(VectorTraining(), tmp_path, accumulate_grad_batches=2)
