@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.torchtools import differentiable_once
+from hlsim.torchtools import differentiable_once, silence_after
 
 MAX_GRADIENT_RATIO = 6.0
 """Largest gradient of a block, as a multiple of the usual magnitude of the item's gradients.
@@ -28,7 +28,7 @@ LIMITER_SAMPLES = 4096
 def limit_gradient_spikes(
     output: Tensor, sample_rate: int, lengths: Tensor | None = None
 ) -> Tensor:
-    """Return a waveform unchanged, and limit its gradient in the backward pass.
+    """Return a waveform unchanged up to its end, and limit its gradient in the backward pass.
 
     In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
     times as large as that of all other samples, which then hardly affect the training step. The
@@ -55,7 +55,10 @@ def limit_gradient_spikes(
     >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
     True
     """
-    return _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
+    limited = _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
+    # Otherwise the gradient after the end of an item would limit that of its last block, because
+    # what an ear perceives depends on later samples.
+    return limited if lengths is None else silence_after(limited, lengths)
 
 
 class _GradientLimiter(torch.autograd.Function):

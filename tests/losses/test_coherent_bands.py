@@ -137,3 +137,15 @@ def test_spikes_of_the_gradient_are_limited_and_nan_stays() -> None:
     spiky[0, 8] = math.nan
     assert bool(limit_gradient(spiky, waveform)[0, 8].isnan())
     assert not bool(limit_gradient(torch.zeros(3, 1000), waveform).any())
+
+
+def test_a_gradient_after_the_end_of_an_item_does_not_limit_its_last_block() -> None:
+    """The gradient is not zero, because what an ear perceives depends on later samples."""
+    waveform, gradient = torch.randn(2, 1000), torch.ones(2, 1000)
+    waveform[:, 480:] = 0.0
+    gradient[:, 480:500] = 1e6
+    waveform.requires_grad_()
+    output = limit_gradient_spikes(waveform, RATE, torch.tensor([480, 470]))
+    limited = torch.autograd.grad(output, waveform, gradient)[0]
+    assert torch.equal(limited[0, :480], gradient[0, :480]) and not limited[0, 480:].any()
+    assert torch.equal(limited[1, :470], gradient[1, :470]) and not limited[1, 470:].any()
