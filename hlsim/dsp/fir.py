@@ -86,6 +86,29 @@ def lowpass_fir(taps: int, cutoff: float, kaiser_beta: float) -> NDArray[np.floa
     return np.asarray(coefficients / coefficients.sum())
 
 
+def bandpass_fir(taps: int, low: float, high: float) -> NDArray[np.float64]:
+    """Design a linear-phase band-pass in a Hann window, as ``firwin`` of scipy.
+
+    Args:
+        taps: Number of coefficients, an odd number. The filter delays by (taps - 1) / 2 samples.
+        low: Lower edge of the band, above 0, where 1 is the Nyquist frequency.
+        high: Upper edge of the band. With 1, the filter is a high-pass.
+
+    Returns:
+        Coefficients of the filter, (taps,). The gain is 1 at the centre of the band, or at the
+        Nyquist frequency for a high-pass.
+
+    >>> bandpass_fir(5, low=0.5, high=1.0).round(2)
+    array([-0.  , -0.19,  0.61, -0.19, -0.  ])
+    """
+    times = np.arange(taps) - 0.5 * (taps - 1)
+    band = high * np.sinc(high * times) - low * np.sinc(low * times)
+    coefficients = band * np.hanning(taps)
+    centre = 1.0 if high == 1.0 else 0.5 * (low + high)
+    gain = (coefficients * np.cos(np.pi * centre * times)).sum()
+    return np.asarray(coefficients / gain)
+
+
 def filters_with_gains(
     gains_db: Tensor, frequencies: tuple[float, ...], sample_rate: int, order: int
 ) -> Tensor:

@@ -21,7 +21,6 @@ on Audio, Speech, and Language Processing 24(2), 354-365, doi 10.1109/TASLP.2015
 """
 
 import numpy as np
-import scipy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -30,6 +29,7 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.dsp.fft import fft_length
+from hlsim.dsp.fir import bandpass_fir
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.recursions import RATE
@@ -43,10 +43,10 @@ ENVELOPE_SEGMENT = 192
 ENVELOPE_RATE = 2 * RATE // ENVELOPE_SEGMENT
 """Number of segments per second, 250, because segments overlap by half."""
 
-MODULATION_BANDS = (20.0, 32.0), (32.0, 50.0), (50.0, 80.0), (80.0,)
+MODULATION_BANDS = (20.0, 32.0), (32.0, 50.0), (50.0, 80.0), (80.0, 125.0)
 """Edges in Hz of four bands of modulation: rates at which envelopes fluctuate.
 
-The last band ends at half of ``ENVELOPE_RATE``, 125 Hz.
+The last band ends at half of ``ENVELOPE_RATE``.
 """
 
 MODULATION_ORDER = 128
@@ -137,11 +137,10 @@ def _split_by_rate(waves: Tensor) -> Tensor:
 @constant
 def _modulation_responses(points: int) -> NDArray[np.float64]:
     """Return the frequency responses of the bands of modulation. Shape: (4, points // 2 + 1)."""
+    nyquist = ENVELOPE_RATE / 2
     filters = [
-        scipy.signal.firwin(
-            MODULATION_ORDER + 1, edges, window="hann", pass_zero=False, fs=ENVELOPE_RATE
-        )
-        for edges in MODULATION_BANDS
+        bandpass_fir(MODULATION_ORDER + 1, low / nyquist, high / nyquist)
+        for low, high in MODULATION_BANDS
     ]
     return zero_phase_responses(filters, points)
 

@@ -91,6 +91,7 @@ MSBG(ear, sample_rate=16000)(speech)
 load_pretrained("neuro-msbg")(speech, ear)
 NALR(ear)(speech)
 hlsim.metrics.haspi(0.02 * torch.randn(16000), 0.02 * torch.randn(16000), ear)
+hlsim.metrics.haaqi(0.02 * torch.randn(16000), 0.02 * torch.randn(16000), ear)
 assert not {"scipy.signal", "scipy.stats"} & set(sys.modules)  # take a second
 assert not late_imports, late_imports
 assert callable(hlsim.evaluation.haspi_report) and callable(hlsim.export.export_aid)

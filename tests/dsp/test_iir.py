@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from hlsim.dsp.fir import lowpass_fir
+from hlsim.dsp.fir import bandpass_fir, lowpass_fir
 from hlsim.dsp.iir import (
     ELLIPTIC,
     ZerosPoles,
@@ -46,3 +46,10 @@ def test_recursive_filters_are_those_of_scipy(
 def test_the_low_pass_is_firwin(taps: int, cutoff: float, beta: float) -> None:
     expected = signal.firwin(taps, cutoff, window=("kaiser", beta))
     np.testing.assert_allclose(lowpass_fir(taps, cutoff, beta), expected, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.16, 0.256), (0.64, 1.0)])
+def test_the_band_pass_is_firwin(low: float, high: float) -> None:
+    edges = (low, high) if high < 1.0 else (low,)
+    expected = signal.firwin(129, edges, window="hann", pass_zero=False)
+    np.testing.assert_allclose(bandpass_fir(129, low, high), expected, rtol=1e-12, atol=1e-15)
