@@ -498,15 +498,16 @@ def ears_in_row(
     ucl: dict[EarName | None, dict[float, float]] = {}
     for column, meaning in threshold_columns(row).items():
         text = str(row[column]).strip()
+        if text.lower() in _UNMEASURED:
+            continue
         if meaning.is_remark:
             _check_remark(text, column)
-        elif text.lower() not in _UNMEASURED:
-            if meaning.is_ucl:
-                level = _parse_level(text, column, LOWEST_UCL, HIGHEST_UCL, _UCL_ADVICE)
-                ucl.setdefault(meaning.ear, {})[meaning.hz] = level
-            else:
-                level = _parse_level(text, column, LOWEST_LEVEL, highest, _THRESHOLD_ADVICE)
-                points.setdefault(meaning.ear, {})[meaning.hz] = level
+        elif meaning.is_ucl:
+            level = _parse_level(text, column, LOWEST_UCL, HIGHEST_UCL, _UCL_ADVICE)
+            ucl.setdefault(meaning.ear, {})[meaning.hz] = level
+        else:
+            level = _parse_level(text, column, LOWEST_LEVEL, highest, _THRESHOLD_ADVICE)
+            points.setdefault(meaning.ear, {})[meaning.hz] = level
     if not points:
         raise ValueError(
             "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got the "

@@ -36,6 +36,7 @@ def read_text(folder: Path, text: str) -> list[Audiogram]:
         "hl_250;hl_500;hl_1000\n10;22,5;30\n",
         "hl_250\thl_500\thl_1000\n10\t22,5\t30\n",
         "hl_250,hl_500,hl_1000,hl_1000_masked\n10,22.5,30,yes\n",
+        "hl_250,hl_500,hl_1000,hl_1000_masked\n10,22.5,30,NaN\n",
         '250 Hz,500 Hz,"1,000 Hz"\n10,22.5,30\n',
         "250 Hz;500 Hz;1.000 Hz\n10;22,5;30\n",
         "250 Hz,500 Hz,1 000 Hz\n10,22.5,30\n",
