@@ -12,6 +12,7 @@ SII_BANDS = tuple(SII_TABLE)
 """Centres of the 18 third octaves in Hz."""
 
 _IMPORTANCE, _NORMAL_SPEECH, INTERNAL_NOISE = zip(*SII_TABLE.values(), strict=True)
+"""Importance of each band, and levels of speech and of a normal ear's noise, see ``SII_TABLE``."""
 
 SILENCE = -50.0
 """Spectrum level in dB SPL per Hz that means no noise."""
