@@ -452,7 +452,7 @@ class DirectionalAid(nn.Module):
 
     @property
     def latency(self) -> int:
-        """Delay of streams in samples, that of the front end and that of the aid.
+        """Delay of streams in samples at 16 kHz, that of the front end and that of the aid.
 
         An aid without streams, such as ``NALR``, has none: reading it raises AttributeError.
         """

@@ -191,8 +191,8 @@ class constant(Generic[P, Values]):
 
     With the additional argument ``like``, a call returns the values as a tensor in the precision
     and on the device of the tensor ``like``. This tensor comes from a store, so it must not be
-    changed in place, and the other arguments must be hashable. Without ``like``, a call returns the
-    values as the function computes them.
+    changed in place. The other arguments must be positional and hashable. Without ``like``, a call
+    returns the values as the function computes them.
 
     Args:
         design: Function at the top level of a module, which returns an array or numbers.

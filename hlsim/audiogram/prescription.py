@@ -171,7 +171,8 @@ def compressed_gains_db(
         speech_levels: Level in dB SPL of each band in average speech at 65 dB SPL.
         range_db: Distance in dB below ``speech_levels`` from which on softer sounds get no more
             gain.
-        limit_spl: Level in dB SPL beyond which no band is amplified.
+        limit_spl: Highest level in dB SPL to which a band is amplified; a band above it gets no
+            gain.
 
     Returns:
         Gains in dB, 0 or more, in the common shape of the arguments.

@@ -41,8 +41,8 @@ def as_thresholds(
     NaN, and so do the outputs that are computed with it.
 
     Args:
-        audiogram: One or more ears: an ``Audiogram``, a name such as ``"N3"``, a ``Listener``, a
-            sequence of these, a tensor or an array.
+        audiogram: One or more ears: an ``Audiogram``, a name such as ``"N3"``, a dict such as
+            ``{500: 20}``, eight numbers, a ``Listener``, a sequence of these, a tensor or an array.
         highest: Highest level allowed, in dB HL.
 
     Returns:

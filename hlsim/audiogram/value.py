@@ -321,13 +321,14 @@ class Audiogram:
         Args:
             row: Texts by column. ``hlsim.audiogram.columns.threshold_columns`` describes the names
                 of columns of thresholds and of uncomfortable levels; other columns are ignored. A
-                text that is empty, ``NA``, ``null``, ``None`` or ``nan`` means that the frequency
-                was not measured.
+                text that is empty, ``NA``, ``n/a``, ``null``, ``None`` or ``nan`` means that the
+                frequency was not measured.
 
         Raises:
             ValueError: The row has the thresholds of both ears, none that was measured, two of one
-                frequency, one that is not a number from -10 to 120, an uncomfortable level that is
-                not valid, or a column whose name looks like thresholds but is not understood.
+                frequency, one that is not a number from -10 to 120 dB HL, an uncomfortable level
+                that is not valid, a column whose name looks like thresholds but is not understood,
+                or another error of ``ears_in_row``.
 
         >>> Audiogram.from_row({"hl_500": "20", "1k": "30"})
         Audiogram({500: 20, 1000: 30})
@@ -475,8 +476,8 @@ def ears_in_row(
     """Convert the thresholds in a row of a table into audiograms, one per ear that columns name.
 
     Uncomfortable levels in the row become the ``ucl`` of the audiograms. A frequency was not
-    measured if its value is empty, ``NA``, ``null``, ``None`` or ``nan``. An ear without a measured
-    threshold is left out.
+    measured if its value is empty, ``NA``, ``n/a``, ``null``, ``None`` or ``nan``. An ear without a
+    measured threshold is left out.
 
     Args:
         row: Texts by column.

@@ -260,7 +260,8 @@ class Parser(argparse.ArgumentParser):
         """Declare ``--linked``, with which one level sets the gains of both ears.
 
         Args:
-            condition: Beginning of the restriction in the help text, such as "stereo files; ".
+            condition: Text before "hearing aids, wdrc and camfit only" in the help, such as "stereo
+                files; ".
         """
         text = f"link the gains of both ears ({condition}hearing aids, wdrc and camfit only)"
         self.flag("--linked", text)

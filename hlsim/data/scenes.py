@@ -334,7 +334,11 @@ def _echo_impulse_responses(spacing: float, sample_rate: int) -> NDArray[np.floa
     The constant parts are removed: those of thousands of echoes would add up to 100 times that of
     the direct sound.
 
-    Shape: () -> (areas, microphones, ears, length), see ``head_impulse_responses``.
+    Args:
+        spacing: Distance between the two microphones of a side in m.
+        sample_rate: Sample rate in Hz.
+
+    Returns: Responses, (areas, microphones, ears, length), see ``head_impulse_responses``.
     """
     height = (2.0 * np.arange(ECHO_HEIGHTS) + 1.0) / ECHO_HEIGHTS - 1.0
     flat = unit_vectors(360.0 * np.arange(ECHO_AZIMUTHS) / ECHO_AZIMUTHS)

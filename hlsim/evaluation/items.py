@@ -272,7 +272,8 @@ def ear_name(audiogram: Audiogram) -> str:
     >>> ear_name(Audiogram.standard("N4")), ear_name(Audiogram([30, 40], [500, 4000]))
     ('N4', '30, 40 dB HL')
     """
-    names = [name for name, levels in STANDARD.items() if audiogram == Audiogram(levels)]
+    thresholds = replace(audiogram, ucl=())
+    names = [name for name, levels in STANDARD.items() if thresholds == Audiogram(levels)]
     levels = ", ".join(f"{level:g}" for level in audiogram.levels)
     return names[0] if names else f"{levels} dB HL"
 

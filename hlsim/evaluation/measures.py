@@ -203,7 +203,7 @@ def load_measure(name: str) -> Measure:
 
     The function is not tried: one that returns something else fails in the study. Its values are
     stored only if it has the attribute ``fingerprint``, such as a version, which you change with
-    its code.
+    its code. Those of a module (``nn.Module``) are stored without it.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.

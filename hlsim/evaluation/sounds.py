@@ -28,19 +28,19 @@ def perceive_items(
 ) -> list[ItemSounds]:
     """Return the sounds of some items as their ear perceives them, by the exact MSBG.
 
-    Items are ranked by how much their score changes between the two conditions of
-    ``evaluation.headline``, the largest rise first. The returned items are evenly spaced in this
+    Items with a score under both conditions of ``evaluation.headline`` are ranked by how much it
+    changes between them, the largest rise first. The returned items are evenly spaced in this
     ranking, and their names state the change and the rank. The sounds of an item, of at most 8 s,
     are what a normal ear perceives of the clean speech, and what the impaired ear perceives of the
-    output of each condition. A sound that cannot be computed is missing; ``failures`` has the
-    reason.
+    output of each condition. A sound that cannot be computed is missing; the ``failures`` of its
+    item have the reason.
 
     Args:
         evaluation: Evaluation with comparisons.
         count: Number of items to return, if there are as many.
         conditions: Names of the conditions with sounds; all of them if empty.
 
-    Returns: The sounds, or an empty list if there is no comparison or ``count`` is 0.
+    Returns: The sounds in pascals, or an empty list if there is no comparison or ``count`` is 0.
 
     >>> import pandas
     >>> from hlsim import Audiogram

@@ -161,11 +161,11 @@ class Condition:
 
     Args:
         name: Name in tables.
-        process: Function ``(signal, ear) -> output``, for the signal of an item and an
+        process: Function or module ``(signal, ear) -> output``, for the signal of an item and an
             ``Audiogram``, with an output of shape (time,); None if the outputs were recorded. A
-            module is set to evaluation mode. If it has the attribute ``may_crash = True``, its
-            compiled code may end the process, so even a study of one item runs in another process,
-            unless ``jobs`` is 1.
+            module is set to evaluation mode. If the function or module has the attribute
+            ``may_crash = True``, its compiled code may end the process, so even a study of one item
+            runs in another process, unless ``jobs`` is 1.
         kind: Role in the study, such as ``"unaided"``, ``"prescription"``, ``"aid"`` or
             ``"equaliser"``.
         of: Name of the condition to which this one belongs, such as the aid whose level it has;

@@ -132,8 +132,8 @@ class HaspiReference(Reference):
             validated, for each score, which takes less memory.
 
     Raises:
-        ValueError: Clean speech that lasts less than 0.7 s, is not finite, silent or below 20 dB
-            SPL; a rate, level or length out of range.
+        ValueError: Clean speech that lasts less than 0.7 s, has less than 16 ms of sound, is not
+            finite, silent or below 20 dB SPL; a rate, level or length out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -186,7 +186,9 @@ class HaspiReference(Reference):
     def _compare(
         self, batch: PreparedBatch, output: Tensor, cells: HairCells, noise: Noise, seed: int
     ) -> Tensor:
-        """Compute the ten features of HASPI, correlations, for each item. Shape: -> (items, 10).
+        """Compute the ten correlations that are the features of HASPI, (items, 10).
+
+        Arguments are those of ``Reference._compare``.
 
         Raises:
             UnscorableError: Clean speech is inaudible to a normal ear.

@@ -100,8 +100,9 @@ class HasqiReference(QualityReference):
             are computed, and the level is validated, for each score.
 
     Raises:
-        ValueError: Clean speech that lasts less than 0.7 s, is not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram, length or equalisation out of range.
+        ValueError: Clean speech that lasts less than 0.7 s, has less than 16 ms of sound, is not
+            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
+            of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

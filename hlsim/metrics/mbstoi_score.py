@@ -336,7 +336,8 @@ def _cancellation_weights() -> NDArray[np.float64]:
     two ears) has a closed form (equations 7 and 8).
 
     Returns:
-        Weights. Shape: (bands, pairs of features, delays * levels).
+        Weights. Those of squares are halved, because the caller adds both orders of a pair. Shape:
+        (bands, pairs of features, delays * levels).
     """
     w = 2.0 * np.pi * LOWEST_CENTRE_HZ * 2.0 ** (np.arange(BANDS) / 3.0)[:, None, None]
     t, g = DELAYS[:, None], LEVELS / 20.0

@@ -131,14 +131,15 @@ def apply_gains(
     suddenly. After a slight loss this is audible, because the inverse of the middle ear amplifies
     high frequencies by more than 40 dB. There, the envelope is interpolated instead of the gain.
 
-    Shape: (..., channels, time), (..., channels, steps), (rows, columns) -> (..., time).
+    Shape: (..., channels, time), (..., channels, steps), (rows, columns) -> (..., time), where time
+    is the number of steps times that of the samples in a step.
 
     Args:
-        channels: Band-pass signals.
+        channels: Band-pass signals in pascals.
         gains: Gain of each channel and step, from ``recruitment_gains``.
         kernel: Weights from ``interpolation_kernel``.
-        slight: Envelopes, (..., channels, steps), and expansion ratios, (..., channels). They are
-            needed if some ears have a slight loss.
+        slight: Envelopes in pascals, (..., channels, steps), and expansion ratios, (...,
+            channels). They are needed if some ears have a slight loss.
 
     >>> kernel = torch.from_numpy(interpolation_kernel()).float()
     >>> gains = torch.full((2, 8), 0.5)

@@ -277,7 +277,13 @@ def _inward_response(units: int) -> NDArray[np.complex128]:
 
 @constant
 def _outward_responses(units: int) -> NDArray[np.complex128]:
-    """Compute the responses of ``from_frame_rate``, (severities, frequencies), in the same way."""
+    """Compute the frequency responses of ``from_frame_rate``, one per degree of loss.
+
+    Args:
+        units: Length of the Fourier transform in units of 160 ms.
+
+    Returns: Responses up to half of the frame rate, (severities, frequencies).
+    """
     responses = _fourier_transform(_bank_taps(), units)
     conversion = _conversion(units, _BANK_HALF_LENGTH)
     return responses * conversion * (_UNIT / _UNIT_AT_FRAME_RATE)

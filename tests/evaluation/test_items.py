@@ -18,6 +18,7 @@ from hlsim.evaluation.items import (
     draw_aid_items,
     draw_scene_items,
     draw_simulator_items,
+    ear_name,
     read_ears,
 )
 from tests.helpers import write_table
@@ -176,3 +177,7 @@ def test_recordings_that_are_left_out_are_counted(tmp_path: Path) -> None:
     texts = [str(warning.message) for warning in warned]
     assert sum("left out: " in text and "broken.wav" in text for text in texts) == 1
     assert any("1 of 4 recordings of speech were drawn and left out" in text for text in texts)
+
+
+def test_a_standard_ear_keeps_its_name_with_measured_uncomfortable_levels() -> None:
+    assert ear_name(Audiogram.standard("N4", ucl={1000: 110})) == "N4"
