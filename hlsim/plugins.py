@@ -1,5 +1,7 @@
 """Plug-ins: simulators, enhancers, aids and measures from your own code, loaded by name."""
 
+import atexit
+import gc
 import importlib
 import importlib.machinery
 import importlib.util
@@ -47,6 +49,9 @@ def load_plugin(name: str, kind: str) -> Any:
             f"expected the name of the {kind} as package.module:name or path/to/file.py:name, "
             f"got {name!r}"
         )
+    # Commands end without a search for unused objects, but files of a user's code that are still
+    # open may need it to be written completely.
+    atexit.unregister(gc.freeze)
     source, attribute = parts["source"], parts["attribute"]
     try:
         if source.endswith(".py"):

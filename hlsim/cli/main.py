@@ -84,9 +84,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A character that the encoding lacks, in the name of a file, must not end the command.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    # Python ends by a search for unused objects, which takes half a second after torch is imported.
-    # The memory goes back to the system anyway.
-    atexit.register(gc.freeze)
+    if arguments is None:
+        # Python ends by a search for unused objects, which takes half a second after torch is
+        # imported. The memory goes back to the system anyway. ``load_plugin`` takes this back.
+        atexit.register(gc.freeze)
     try:
         options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
         options.run(options)

@@ -115,17 +115,41 @@ def test_evaluations_without_statistics_do_not_import_them() -> None:
 
 
 EXIT_SCRIPT = """
-import atexit, gc
+import atexit, gc, sys
 from hlsim.cli.main import main
 atexit.register(lambda: print("frozen", gc.get_freeze_count() > 0))
+sys.argv = ["hlsim", "--version"]
 try:
-    main(["--version"])
+    main(*eval(sys.stdin.readline()))
 finally:
-    print("ends")
+    for name in sys.stdin:
+        from hlsim.plugins import load_plugin
+        plugin = load_plugin(name.strip(), "measure")
 """
 
 
-def test_a_command_ends_without_a_search_for_unused_objects() -> None:
+def end_of_command(standard_input: str, folder: Path) -> str:
     call = [sys.executable, "-c", EXIT_SCRIPT]
-    ended = subprocess.run(call, capture_output=True, text=True, check=True)
-    assert ended.stdout.endswith("ends\nfrozen True\n")
+    ended = subprocess.run(
+        call, input=standard_input, capture_output=True, text=True, check=True, cwd=folder
+    )
+    return ended.stdout.splitlines()[-1]
+
+
+def test_a_command_ends_without_a_search_for_unused_objects(tmp_path: Path) -> None:
+    assert end_of_command("()", tmp_path) == "frozen True"
+    assert end_of_command("(['--version'],)", tmp_path) == "frozen False", "called from Python"
+
+
+def test_a_file_that_a_plug_in_leaves_open_is_written(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "class Log:\n"
+        "    def __init__(self):\n"
+        "        self.file = open('log.txt', 'w')\n"
+        "        self.file.write('loaded')\n"
+        "        self.call = self.__call__\n"
+        "    def __call__(self, item, output):\n"
+        "        return {}\n"
+    )
+    assert end_of_command("()\nown.py:Log\n", tmp_path) == "frozen False"
+    assert (tmp_path / "log.txt").read_text() == "loaded"
