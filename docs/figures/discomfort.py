@@ -9,13 +9,21 @@ ear is exceeded if the 99th percentile of the levels of a third of an octave, ov
 its uncomfortable level at 500, 1000, 2000 or 4000 Hz. HASPI, HASQI and the output level of speech
 at 65 dB SPL are means of the standard ears N2 to N5. An aid without measured levels stays a margin
 below predicted ones; the table has its own margin, the first, and larger ones.
+
+The words that such margins cost are those of a recogniser, with this file as a plug-in:
+
+    F=docs/figures/discomfort.py
+    python examples/machine_listener.py compare speech/valid noise/valid --model moonshine-tiny \\
+        --audiograms audiograms/valid.csv --step 4 --own-levels --out words-limited \\
+        --aids $F:margin_7 $F:margin_16 $F:margin_20 $F:margin_24 hearing-aid
 """
 
 import sys
+from functools import cache, partial
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import hlsim
 from compensators import load_compensator
@@ -84,6 +92,23 @@ def set_predicted_limits(ear: Audiogram, margin: float) -> Audiogram:
     """
     predicted = Audiogram(ear.levels, ear.frequencies).uncomfortable_levels([1000.0])[0]
     return Audiogram(ear.levels, ear.frequencies, ucl={1000.0: predicted - margin})
+
+
+@cache
+def load_limited_aid() -> nn.Module:
+    """Return ``hearing-aid`` with its limit by the ear."""
+    return load_compensator("hearing-aid", limit_to_ear=True).eval()
+
+
+def process_below_prediction(margin: float, waveform: Tensor, ear: Audiogram) -> Tensor:
+    """Process a waveform by ``hearing-aid``, limited to a margin in dB below predicted levels."""
+    output: Tensor = load_limited_aid()(waveform, set_predicted_limits(ear, margin))
+    return output
+
+
+margin_7, margin_16, margin_20, margin_24 = (
+    partial(process_below_prediction, margin) for margin in (PREDICTION_MARGIN_DB, 16.0, 20.0, 24.0)
+)
 
 
 def exceeded(output: Tensor, ear: Audiogram) -> bool:
