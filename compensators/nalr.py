@@ -84,7 +84,8 @@ class NALR(Aid):
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: There is no ear, or a threshold is outside -10 to 120 dB HL.
+            ValueError: There is no ear, an ear is not valid, or a threshold is outside -10 to 120
+                dB HL.
 
         >>> NALR().gains("N3").round()
         tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])

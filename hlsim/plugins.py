@@ -216,7 +216,7 @@ def _import_file(path: Path) -> ModuleType:
 def _describe(error: Exception) -> str:
     """Describe an exception in one line: its type, its text, and where it was raised.
 
-    Python's import system and this file are no such places.
+    Places in Python's import system and in this file are skipped.
     """
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     frames = [

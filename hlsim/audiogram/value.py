@@ -196,10 +196,10 @@ class Audiogram:
         """Return the levels from which on pure tones are uncomfortably loud, in dB HL.
 
         They are those that were measured, ``ucl``, or else predicted from the thresholds (see
-        ``hlsim.audiogram.discomfort``, which states the error of the prediction: 8.7 dB). Between
-        measured frequencies, their difference from the prediction is interpolated over log
-        frequency; beyond them it is constant. A measured level of 115 dB HL or more, which was not
-        reached, counts only above the prediction.
+        ``hlsim.audiogram.discomfort``, which states the error of the prediction, 8.7 dB RMS).
+        Between measured frequencies, the difference of the levels from the prediction is
+        interpolated over log frequency; beyond them it is constant. A measured level of 115 dB HL
+        or more means that it was not reached, so it can raise the prediction, but not lower it.
 
         Args:
             frequencies: Frequencies of the result in Hz.

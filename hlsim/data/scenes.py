@@ -76,8 +76,8 @@ def make_scene(
         target: Speech at its level at the centre of the head without the head, (time,).
         maskers: Other talkers or noises at their relative levels, (time,) or longer.
         azimuths: Azimuth of each masker in degrees, -360 to 360, 0 in front, 90 on the left.
-        diffuse: Recording of noise with the level of a masker that becomes diffuse, at least as
-            long as the target.
+        diffuse: Recording of noise with the level of a masker that becomes diffuse, (time,) or
+            longer.
         snr: Signal-to-noise ratio at the microphones in dB, -100 to 100: the active level of the
             target, with its echoes, minus the level of all other sounds, with the powers of all
             microphones averaged.
@@ -93,9 +93,10 @@ def make_scene(
 
     Raises:
         MissingExtraError: There is a room, and pyroomacoustics is not installed.
-        ValueError: A signal is not valid, silent or too short, there is no masker and no diffuse
-            noise, there is not one azimuth for each masker, a number is out of range, ``room`` is
-            no room, or a source is outside the room.
+        ValueError: A signal is not valid, a masker or the diffuse noise is shorter than the target,
+            all of them are silent, there is no masker and no diffuse noise, there is not one
+            azimuth for each masker, a number is out of range, ``room`` is no room, or a source is
+            outside the room.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()

@@ -497,11 +497,12 @@ def _write_signals(
         pair: The scene and the listener.
 
     Returns:
-        By the name of the condition, the file with its outputs for both ears, or the error that
-        prevented it.
+        By the name of the condition, the file with its outputs for both ears, or the ValueError
+        that prevented it; the file of an earlier run is then deleted.
 
     Raises:
-        ValueError: A file of the scene is broken, or has another rate or length.
+        ValueError: A file of the scene is broken, or has another rate or length; or the reference
+            cannot be written.
     """
     signals, reference = _read_scene(pair, rate, microphones)
     write_audio(_reference_file(out, pair), reference, rate)

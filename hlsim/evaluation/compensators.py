@@ -352,7 +352,8 @@ def _make_conditions(
 def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
     """Return the evaluations of clean speech and of speech in noise, as ``clean`` and ``noisy``.
 
-    An item that lacks a value in one condition is in no group. A group without items is left out.
+    Each has comparisons of its own. An item that lacks a value in one condition is in no group. A
+    group without items is left out.
 
     Raises:
         ValueError: No item has all values.

@@ -242,7 +242,7 @@ class _Channels(NamedTuple):
     Attributes:
         channels: Range of these channels among the 32 of the ear.
         spectrum: Result of ``lag_spectrum`` for the envelopes, with which the channels of outputs
-            are aligned. Shape: (items, channels, frequencies).
+            are aligned. Shape: (items, channels, blocks, frequencies).
         delays: Delays in samples that compensate for different group delays. Shape: (items,
             channels).
         amplitude: Contribution of these channels to the mean amplitude of each frame, see

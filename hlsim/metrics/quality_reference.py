@@ -299,7 +299,8 @@ class _Channels:
     Attributes:
         channels: Range of these channels among the 32 of the ear.
         envelope, motion: Results of ``lag_spectrum`` for the clean signal's envelope and motion,
-            with which those of an output are aligned. Shape: (items, channels, frequencies).
+            with which those of an output are aligned. Shape: (items, channels, blocks,
+            frequencies).
         delays: Delays in samples that compensate for different group delays. Shape: (items,
             channels).
         smooth_levels: Levels in dB over threshold, smoothed over segments. Shape: (items, channels,

@@ -158,13 +158,14 @@ class MSBG(StoredEars, nn.Module):
             audiogram: One ear, or ears whose thresholds, (..., 8), broadcast over the leading
                 dimensions of the waveform. By default, the ears of the constructor.
 
-        Shape: (..., time) -> (..., time), as long as the input unless ``aligned`` is false.
+        Shape: (..., time), (..., 8) -> (..., time), where the leading dimensions broadcast. The
+        output is as long as the input unless ``aligned`` is false.
 
         Raises:
-            ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (as in the
-                standard audiogram ``"N7"``), the shapes do not fit, or the waveform is not a
-                floating-point tensor with time last, or has no samples or one above 1e9 in
-                magnitude.
+            ValueError: There is no audiogram or an invalid one, a threshold is outside -10 to 100
+                dB HL (as in the standard audiogram ``"N7"``), the shapes do not fit, or the
+                waveform is not a floating-point tensor with time last, or has no samples or one
+                above 1e9 in magnitude.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)

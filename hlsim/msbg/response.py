@@ -126,12 +126,13 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
 def _taps(rate: int, kind: str) -> NDArray[np.float64]:
     """Compute one impulse response for each severity, from ``fixed_response`` of its filter bank.
 
+    Let R be this frequency response, and R0 that for ears without a loss.
+
     Args:
         rate: Sample rate in Hz.
-        kind: ``"phase"`` for the phase of this response and a magnitude of 1, or less where the
-            response is below a tenth of its maximum; ``"difference"`` for a magnitude of 1 and this
-            phase minus that for ears without a loss; ``"normal ear"`` for this phase with the
-            magnitude for ears without a loss.
+        kind: ``"phase"`` for the phase of R and the magnitude 1, or less where R is below a tenth
+            of its maximum; ``"difference"`` for the phase of R minus that of R0 and the magnitude
+            1; ``"normal ear"`` for the phase of R and the magnitude of R0.
 
     Returns:
         Coefficients, (severities, 2 * half_length(rate)).

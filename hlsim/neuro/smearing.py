@@ -233,11 +233,12 @@ class _Block:
         """Add the gradients with respect to gains and matrices, the backward pass of ``factors``.
 
         Args:
-            factor_slopes: Gradients with respect to the results of ``factors``.
-            gains: Gains of all items and steps.
-            matrices: Matrices of ``factors``.
-            gains_slope: Tensor to which the gradient with respect to the gains is added.
-            matrix_slopes: Two tensors for the gradients with respect to the matrices, or none.
+            factor_slopes: Gradients with respect to the results of ``factors``, two tensors of the
+                shape of the block.
+            gains: Gains of all items and steps, (items, steps, n).
+            matrices: Matrices of ``factors``, over the square root of 8.
+            gains_slope: Tensor of the shape of ``gains`` to which their gradient is added.
+            matrix_slopes: Two tensors of the shape of ``matrices`` for their gradients, or none.
         """
         rows = gains[self.items, self.steps]
         for index, (slope, matrix) in enumerate(zip(factor_slopes, matrices, strict=True)):

@@ -125,8 +125,9 @@ class TrainingModule(L.LightningModule):
 def relative_learning_rate(step: int, steps: int) -> float:
     """Compute the learning rate at a step, relative to the recipe's ``learning_rate``.
 
-    The rate rises linearly over the first 50 steps. All the time, it also falls along half a period
-    of a cosine, to 1 % at the end.
+    The rate rises linearly over the first 50 steps, from 1/50. It is also multiplied by half a
+    period of a cosine, which falls from 1 at the first step to 0 after the last one, but by 0.01 at
+    least.
 
     Args:
         step: Number of the step, from 0.

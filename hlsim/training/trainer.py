@@ -197,13 +197,15 @@ def train_network(
             bar instead of the steps and the remaining time.
 
     Returns:
-        The folder ``checkpoint`` below ``out``.
+        The folder ``checkpoint`` below ``out``. If all steps were taken before, nothing is done.
 
     Raises:
-        ValueError: The folder contains another training, one with another number of devices, its
-            network alone, or a broken state; another process is writing to it; there is no such
-            device, or there are more than 64; gradients would be accumulated; the loss is not
-            finite; or a validation score is NaN.
+        ValueError: The folder contains another training, the same one with another number of
+            devices, a trained network without a state, or a broken state; another process is
+            writing to it; Lightning rejects an option, for example a device that does not exist;
+            there are more than 64 devices; gradients would be accumulated; the loss is not finite;
+            or a validation score is NaN.
+        TypeError: An option is unknown, or is set by this function.
         KeyboardInterrupt: The training was interrupted. It resumes from its last validation.
     """
     recipe = module.recipe

@@ -63,7 +63,7 @@ class Triplets(NamedTuple):
 
 @cache
 def load_digits() -> Tensor:
-    """Load the bundled digits, each scaled to RMS 1 without the silence around it.
+    """Load the bundled digits, each scaled so that its spoken part has RMS 1.
 
     Returns:
         Samples at 16 kHz, (voices, 10, SLOT_SAMPLES), where the second index is the digit, 0 to 9.

@@ -100,8 +100,9 @@ def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Ten
     """Compute the states of some items, see ``_SelectiveScan`` for the shapes of the arguments.
 
     Returns:
-        Decays from each time to the next, (items, time - 1, states, channels); drives before their
-        weights, (items, time, 1, channels); and states, (items, time, states, channels).
+        Decays from each time to the next, (items, time - 1, states, channels); products of
+        ``delta`` and ``u``, which ``B`` weights, (items, time, 1, channels); and states, (items,
+        time, states, channels).
     """
     decay = (delta[:, 1:].unsqueeze(-2) * A).exp_()
     drive = (delta * u).unsqueeze(-2)
