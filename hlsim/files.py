@@ -374,10 +374,17 @@ def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, lis
         contents: Description of the contents for error messages.
 
     Raises:
-        ValueError: The file cannot be read, or has another encoding.
+        ValueError: The file cannot be read, or has another encoding, such as UTF-16 without its
+            mark.
     """
     try:
-        with io.StringIO(_decode(path.read_bytes()), newline="") as file:
+        text = _decode(path.read_bytes())
+        if "\0" in text:
+            raise ValueError(
+                f"{path}: {contents} must be a CSV file, got zero bytes, as in UTF-16 without a "
+                "byte order mark; save it as UTF-8"
+            )
+        with io.StringIO(text, newline="") as file:
             header = file.readline()
             file.seek(0)
             reader = csv.reader(file, delimiter=max(",;\t", key=header.count))

@@ -58,7 +58,10 @@ def test_tables_of_spreadsheets_are_read(tmp_path: Path, text: str, encoding: st
     assert rows == [{"a": "1", "b": "ü"}, {"a": "3", "b": ""}]
 
 
-@pytest.mark.parametrize("data", [None, b"a,b\n1,2,3\n", b"a\n\x81\n"])
+WITHOUT_MARK = "a,b\n1,2\n".encode("utf-16-le")
+
+
+@pytest.mark.parametrize("data", [None, b"a,b\n1,2,3\n", b"a\n\x81\n", WITHOUT_MARK])
 def test_tables_that_cannot_be_read_are_named(tmp_path: Path, data: bytes | None) -> None:
     if data is not None:
         (tmp_path / "t.csv").write_bytes(data)

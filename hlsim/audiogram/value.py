@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Real
@@ -575,15 +576,21 @@ def _parse_level(text: str, column: str, lowest: float, highest: float, advice: 
     """Convert the text of a threshold or an uncomfortable level in dB HL into a number.
 
     Args:
-        text: Text to convert, which may have a decimal comma.
+        text: Text to convert, which may have a decimal comma. A comma before three digits is
+            rejected, because it may separate thousands.
         column: Name of the column, for the message.
         lowest: Lowest level allowed, in dB HL.
         highest: Highest level allowed, in dB HL.
         advice: End of the message about a text that is not valid.
 
     Raises:
-        ValueError: The text is not a number from ``lowest`` to ``highest``.
+        ValueError: The text is not a number from ``lowest`` to ``highest``, or is ambiguous.
     """
+    if re.fullmatch(r"\D?[1-9]\d*,\d{3}", text):
+        raise ValueError(
+            f"column {column} is {text!r}, where the comma may separate thousands or decimals; "
+            f"write decimals with a point, {text.replace(',', '.')}"
+        )
     try:
         level = float(text.replace(",", "."))
     except ValueError:

@@ -97,7 +97,8 @@ def _process(
 ) -> None:
     """Process one file, or each file of a folder, for each ear, and print one line per output.
 
-    A file of a folder that fails causes a warning, and the others are processed.
+    A file of a folder that fails causes a warning, which names its output of an earlier run. The
+    others are processed.
 
     Args:
         options: Options of the command.
@@ -128,7 +129,10 @@ def _process(
             except ValueError as error:
                 if source == options.input:
                     raise
-                progress.print(f"hlsim: warning: {source}: not processed: {error}", sys.stderr)
+                text = f"{source}: not processed: {error}"
+                if target.exists():
+                    text += f"; {target} is the output of an earlier run"
+                progress.print(f"hlsim: warning: {text}", sys.stderr)
                 failures += 1
             else:
                 progress.print(f"{target}: {text}")

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from hlsim.calibration import NEURO_RATE, dbfs, set_level
+from hlsim.calibration import HIGHEST_SPL, NEURO_RATE, dbfs, set_level
 from hlsim.checks import check_finite, check_rate, check_waveform
 from hlsim.dsp.active_level import active_level_db
 from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
@@ -40,7 +40,7 @@ def mix(
     Raises:
         ValueError: The shapes, or that of the SNR, do not fit; a signal is not floating-point with
             time last; the noise is silent or shorter than the speech, samples are NaN or infinite,
-            the SNR is NaN, or the sample rate is out of range.
+            the SNR is NaN or too low for any level of noise, or the sample rate is out of range.
 
     Example:
         >>> import hlsim
@@ -67,8 +67,6 @@ def mix(
     check_finite(masker, "noise")
     if bool((masker == 0.0).all((-2, -1) if channels else -1).any()):
         raise ValueError("expected noise, got silence; use another part of the recording")
-    if bool(ratio.isnan().any()):
-        raise ValueError(f"expected an SNR in dB, got {snr}")
     level = dbfs(signal)
     if sample_rate is not None:
         rate = check_rate(sample_rate)
@@ -90,5 +88,10 @@ def mix(
             f"{tuple(ratio.shape)}; reshape it"
         )
     noise_level = (level - ratio).clamp_min(-200.0)  # the level of silence
+    if not bool((noise_level <= HIGHEST_SPL).all()):  # also if it is NaN
+        raise ValueError(
+            f"expected an SNR in dB, such as 5 or -10, got {snr}; choose a higher one, at which "
+            f"the RMS of the noise is at most {HIGHEST_SPL:g} dB above 1.0"
+        )
     scaled = set_level(masker, noise_level, full_scale_spl=0.0)
     return as_type_of(speech, signal + scaled.reshape(signal.shape))

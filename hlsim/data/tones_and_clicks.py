@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import NEURO_RATE
+from hlsim.checks import check_number
 from hlsim.data.augment import draw_uniform
 
 _LOWEST_TONE, _HIGHEST_TONE = 100.0, 7500.0  # in Hz
@@ -38,9 +39,15 @@ def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
     Returns:
         Sounds with shape (items, samples).
 
+    Raises:
+        ValueError: There are fewer than 0 items, or no samples.
+
     >>> draw_sounds(4, 16000, torch.Generator()).shape
     torch.Size([4, 16000])
     """
+
+    check_number("items", items, 0, whole=True)
+    check_number("samples", samples, 1, whole=True)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return draw_uniform(low, high, (items, *shape), generator)

@@ -120,6 +120,7 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
         ("250 Hz,2019\n10,95\n", ["line 2", "2019", "rename"]),
         ("250 Hz,1000,30000 Hz\n10,20,30\n", ["line 2", "30000 Hz"]),
         ("250 Hz,1,000 Hz\n10,20,30\n", ["line 2", "'1'"]),
+        ("250 Hz;500 Hz\n10,5;1,000\n", ["line 2", "500 Hz is '1,000'", "point, 1.000"]),
         ("250 Hz,4000_masked\n10,20\n", ["line 2", "4000_masked", "rename"]),
         ("250 Hz,4000 Hz,4000_masked\n10,20,30\n", ["line 2", "4000_masked", "30"]),
         ("250 Hz,500 Hz left/right\n10,20\n", ["line 2", "500 Hz left/right"]),

@@ -414,6 +414,7 @@ def test_folders_keep_their_tree_and_bad_files_are_reported(
     assert "no checkpoint 'nobody'" in capsys.readouterr().err
     assert run(*call, "nalr") == 2
     printed = capsys.readouterr()
+    assert "earlier run" not in printed.err
     assert "broken.wav: cannot be read" in printed.err and "1 of 3 outputs failed" in printed.err
     assert printed.out.count("players will clip") == 2
     written = {
@@ -422,6 +423,10 @@ def test_folders_keep_their_tree_and_bad_files_are_reported(
         if "out" in path.parts
     }
     assert written == {"one.wav", "a/two.wav"} and printed.out.count("dB SPL, output") == 2
+    (tmp_path / "in" / "one.flac").write_text("this is no audio, either")
+    assert run(*call, "nalr") == 2
+    warning = f"{tmp_path / 'out' / 'one.wav'} is the output of an earlier run"
+    assert warning in capsys.readouterr().err
     (tmp_path / "in" / "one.mp3").touch()
     assert run(*call, "nalr") == 2 and "2 files would be written to" in capsys.readouterr().err
 

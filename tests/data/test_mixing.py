@@ -74,6 +74,7 @@ STEREO = {"speech": torch.ones(2, 2, 1000), "noise": torch.ones(2, 2, 1000)}
         ({"noise": torch.full((1000,), torch.inf)}, "noise has samples that are NaN"),
         ({"speech": torch.full((1000,), torch.nan)}, "speech has samples that are NaN"),
         ({"snr": float("nan")}, "expected an SNR in dB"),
+        ({"snr": -1000.0}, "expected an SNR in dB, .* got -1000.0; choose a higher one"),
         ({"snr": torch.zeros(2)}, r"one per signal in the shape \(\), got the shape \(2,\)"),
         ({**STEREO, "snr": torch.zeros(2)}, r"one per signal in the shape \(2, 2\)"),
         (

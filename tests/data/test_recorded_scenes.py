@@ -86,6 +86,13 @@ def test_clips_of_scenes_have_clean_speech(tmp_path: Path, row: Utterance) -> No
     np.testing.assert_allclose(ratios, [[1.0, 4 / 3], [1 / 3, 2 / 3]], rtol=1e-3)
 
 
+def test_short_scenes_are_repeated_in_all_channels(tmp_path: Path, row: Utterance) -> None:
+    files = [SceneFiles.from_utterance(row, tmp_path)]
+    scenes = SceneClips(files, sample_rate=RATE, seconds=2.5, repeat=True)
+    recording, clip = scenes.read_recording(0), scenes.cut_clip(0, 0.0)
+    assert torch.equal(clip, torch.cat([recording] * 3, -1)[:, : scenes.samples])
+
+
 @pytest.mark.parametrize("reference", ["front", "0", "1 3", "2 3", "1 2 3"])
 def test_wrong_references_are_errors(reference: str) -> None:
     with pytest.raises(ValueError, match="the number of a channel in the column 'reference'"):

@@ -1,5 +1,6 @@
 """Tones are steady, clicks are short, and both depend on the seed alone."""
 
+import pytest
 import torch
 
 from hlsim.data.tones_and_clicks import draw_sounds
@@ -27,3 +28,8 @@ def test_clicks_are_single_samples_that_depend_on_the_seed_alone() -> None:
     counts = (draw(40)[1::2] != 0.0).sum(-1)
     assert int(counts.min()) >= 1 and int(counts.max()) <= 8 and len(counts.unique()) > 2
     assert torch.equal(draw(6), draw(6)) and not torch.equal(draw(6), draw(6, seed=1))
+
+
+def test_a_sound_has_at_least_one_sample() -> None:
+    with pytest.raises(ValueError, match="expected samples to be a whole number from 1, got 0"):
+        draw(2, samples=0)
