@@ -30,11 +30,15 @@ _BLOCK_SECONDS = 8.0
 class Meter:
     """Mean square and peak of a signal, measured while its parts pass through ``measure``.
 
+    Args:
+        limit: Magnitude for ``share_above``.
+
     Attributes:
         power: Mean square of all samples of all channels.
         peak: Largest magnitude of a sample.
+        share_above: Share of the samples whose magnitude is above the limit, 0 to 1.
 
-    Both are final once all parts have passed. A meter measures one signal.
+    They are final once all parts have passed. A meter measures one signal.
 
     >>> import torch
     >>> meter = Meter()
@@ -45,14 +49,16 @@ class Meter:
     (1.0, 1.0)
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limit: float = math.inf) -> None:
+        self.limit = limit
         self.power = 0.0
         self.peak = 0.0
+        self.share_above = 0.0
 
     def measure(
         self, parts: Iterable[Tensor], samples: int, show: Callable[[float], None]
     ) -> Iterator[Tensor]:
-        """Yield all parts unchanged, and update ``power`` and ``peak``.
+        """Yield all parts unchanged, and update the attributes.
 
         Args:
             parts: Parts of the signal, (channels, time).
@@ -66,6 +72,7 @@ class Meter:
             passed += part.shape[-1]
             self.power += float(part.double().square().sum()) / (len(part) * samples)
             self.peak = max(self.peak, float(part.abs().max()))
+            self.share_above += int((part.abs() > self.limit).sum()) / (len(part) * samples)
             show(passed / samples)
 
 

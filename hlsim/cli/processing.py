@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 PLAYED_PEAK = 0.9
 """Peak to which ``--no-clipping`` scales an output that exceeds full scale, 1.0."""
 
+_AUDIBLE_SHARE = 0.001
+"""Share of samples above the limit of an aid from which on the printed line says so."""
+
 
 def simulate(parser: Parser) -> None:
     """Declare the options of the command ``simulate``."""
@@ -165,6 +168,8 @@ def _process_file(
     """
     import torch
 
+    from compensators.directional import behind_front_end
+    from compensators.limiter import LIMITED
     from hlsim.audio import scan_audio, write_parts
     from hlsim.calibration import POWER_FLOOR
     from hlsim.cli.long_recordings import Meter, process_recording, read_all
@@ -175,13 +180,20 @@ def _process_file(
     gain = 10.0 ** (gain_db / 20.0)
     channels = model.ears if getattr(model, "takes_microphones", False) else recording.channels
     size = channels, recording.samples, recording.sample_rate
-    meter = Meter()
+    limit_spl = getattr(behind_front_end(model), "limit_spl", math.inf)
+    limit_dbfs = limit_spl - options.full_scale_spl - gain_db
+    meter = Meter(LIMITED * 10.0 ** (limit_dbfs / 20.0))
     with torch.no_grad():
         outputs = process_recording(model, recording, gain, ear, **sliders)
         write_parts(target, meter.measure(outputs, recording.samples, show), *size)
     text = f"input {level + gain_db:.1f} dB SPL"
     output_level, _ = level_and_gain(max(meter.power, POWER_FLOOR), options)
     text += f", output {output_level + gain_db:.1f} dB SPL"
+    if meter.share_above > _AUDIBLE_SHARE:
+        text += (
+            f"; {100.0 * meter.share_above:.2g} % of the samples exceeded the aid's limit of "
+            f"{limit_spl:g} dB SPL and are distorted"
+        )
     if meter.peak > 1.0 and options.no_clipping:
         factor = PLAYED_PEAK / meter.peak
         write_parts(target, (factor * part for part in read_all(scan_audio(target))), *size)

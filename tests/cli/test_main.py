@@ -450,6 +450,18 @@ def test_notes_about_clipping_and_a_missing_upper_band(
         assert (note in text) == (note == expected)
 
 
+def test_an_output_that_the_limit_of_the_aid_distorts_is_named(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The gain of CAMFIT for a steep loss is up to 100 dB at the onsets of high sounds."""
+    call = ("compensate", utterance, tmp_path / "out.wav", "--spl", "65", "--compensator", "camfit")
+    assert run(*call, "--audiogram", "S2") == 0
+    note = "% of the samples exceeded the aid's limit of 110 dB SPL and are distorted"
+    assert note in capsys.readouterr().out
+    assert run(*call, "--audiogram", "N2") == 0
+    assert "distorted" not in capsys.readouterr().out
+
+
 def test_the_band_that_a_simulator_of_a_user_lacks_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
