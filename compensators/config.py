@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from hlsim.checks import check_number
+from hlsim.dsp.sphere import SPACINGS
 from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase, number
 
 
@@ -124,5 +125,5 @@ class BeamformerConfig(ModelConfig):
     hidden: int = number(64, 1, 512)
     seconds: float = number(0.06, 0.01, 2.0)
     loading: float = number(1e-4, 1e-6, 1.0)
-    spacing: float = number(0.01, 0.002, 0.1)
+    spacing: float = number(0.01, *SPACINGS)
     aid: dict[str, Any] = field(default_factory=dict)

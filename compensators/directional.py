@@ -31,7 +31,13 @@ from hlsim.checks import (
     check_waveform,
 )
 from hlsim.dsp.fft import fft_length
-from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
+from hlsim.dsp.sphere import (
+    SPACINGS,
+    SPEED_OF_SOUND,
+    evenly_spread_directions,
+    head_responses,
+    unit_vectors,
+)
 from hlsim.torchtools import Audio, as_samples, as_type_of, compute_once
 
 LOOK_AHEAD = 0.001
@@ -294,7 +300,7 @@ class DifferentialMicrophone(FilterAndSum):
         sample_rate: int = NEURO_RATE,
     ) -> None:
         check_names([pattern], PATTERNS, "patterns")
-        check_number("spacing", spacing, 0.002, 0.1)
+        check_number("spacing", spacing, *SPACINGS)
         check_number("lowest", lowest, 20.0, 2000.0)
         rate = check_rate(sample_rate)
         responses = differential_responses(PATTERNS[pattern], spacing, lowest, rate)
@@ -381,7 +387,7 @@ class BinauralMVDR(FilterAndSum):
         self, *, loading: float = 1e-4, spacing: float = 0.01, sample_rate: int = NEURO_RATE
     ) -> None:
         check_number("loading", loading, 1e-6, 1.0)
-        check_number("spacing", spacing, 0.002, 0.1)
+        check_number("spacing", spacing, *SPACINGS)
         rate = check_rate(sample_rate)
         look_ahead = look_ahead_samples(rate)
         super().__init__(mvdr_taps(loading, spacing, rate, look_ahead), look_ahead, rate)

@@ -22,7 +22,7 @@ from hlsim.checks import check_attributes, check_rate, check_waveform
 from hlsim.dsp.fft import correlate
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.interpolation import interpolate
-from hlsim.dsp.resample import HIGHEST_RATE, resample
+from hlsim.dsp.resample import HIGHEST_RESAMPLING_RATE, resample
 from hlsim.msbg import MSBG
 from hlsim.neuro import load_pretrained
 from hlsim.plugins import WaveformPlugin
@@ -167,7 +167,9 @@ class PluginSimulator(nn.Module):
                 f"got {scale:g}; build it without another scale"
             )
         self.plugin_rate = check_rate(
-            getattr(function, "sample_rate", NEURO_RATE), _LOWEST_PLUGIN_RATE, HIGHEST_RATE
+            getattr(function, "sample_rate", NEURO_RATE),
+            _LOWEST_PLUGIN_RATE,
+            HIGHEST_RESAMPLING_RATE,
         )
         self.emulates_msbg: bool = getattr(function, "emulates_msbg", False)
         self.needs_exact_lengths: bool = getattr(function, "needs_exact_lengths", False)

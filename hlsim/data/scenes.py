@@ -13,7 +13,7 @@ from hlsim.calibration import NEURO_RATE, set_level
 from hlsim.checks import check_number, check_rate, check_seed, check_waveform
 from hlsim.data.mixing import mix
 from hlsim.data.rooms import REVERBERATION_TIMES, Room, draw_room, find_arrivals
-from hlsim.dsp.sphere import evenly_spread_directions, head_responses, unit_vectors
+from hlsim.dsp.sphere import SPACINGS, evenly_spread_directions, head_responses, unit_vectors
 from hlsim.torchtools import compute_once
 
 DIFFUSE_DIRECTIONS = 64
@@ -107,7 +107,7 @@ def make_scene(
     rate = check_rate(sample_rate)
     check_number("snr", snr, -100.0, 100.0)
     check_seed(seed)
-    check_number("spacing", spacing, 0.002, 0.1)
+    check_number("spacing", spacing, *SPACINGS)
     if isinstance(maskers, Tensor) or not isinstance(azimuths, Sequence):
         raise ValueError(
             "expected lists of maskers and azimuths, got another type; write [masker], [120.0]"

@@ -38,8 +38,8 @@ ZERO_CROSSINGS = 64
 KAISER_BETA = 14.769656459379492
 """Shape parameter of the Kaiser window."""
 
-HIGHEST_RATE = 1_000_000
-"""Highest accepted sample rate in Hz."""
+HIGHEST_RESAMPLING_RATE = 1_000_000
+"""Highest sample rate in Hz from which or to which signals are resampled."""
 
 MAX_KERNEL_VALUES = 100_000_000
 """Largest number of values of a kernel without its margins, 0.4 GB in float32.
@@ -72,8 +72,8 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     >>> resample(torch.randn(2, 44100), 44100, 16000).shape
     torch.Size([2, 16000])
     """
-    source_rate = check_rate(source_rate, 1, HIGHEST_RATE)
-    target_rate = check_rate(target_rate, 1, HIGHEST_RATE)
+    source_rate = check_rate(source_rate, 1, HIGHEST_RESAMPLING_RATE)
+    target_rate = check_rate(target_rate, 1, HIGHEST_RESAMPLING_RATE)
     check_time_last(waveform)
     if source_rate == target_rate:
         return waveform

@@ -14,6 +14,9 @@ SPEED_OF_SOUND = 343.0
 HEAD_RADIUS = 0.0875
 """Radius of an average head in m."""
 
+SPACINGS = (0.002, 0.1)
+"""Smallest and largest distance between the two microphones of a side in m."""
+
 _ORDERS_ABOVE = 20
 """Number of terms of the series after the order at which the terms begin to fall."""
 

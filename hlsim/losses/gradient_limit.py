@@ -28,7 +28,7 @@ LIMITER_SAMPLES = 4096
 def limit_gradient_spikes(
     output: Tensor, sample_rate: int, lengths: Tensor | None = None
 ) -> Tensor:
-    """Return a waveform unchanged up to its end, and limit its gradient in the backward pass.
+    """Return a waveform unchanged, and limit its gradient in the backward pass.
 
     In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
     times as large as that of all other samples, which then hardly affect the training step. The
@@ -37,8 +37,8 @@ def limit_gradient_spikes(
     pauses, which are blocks of the waveform whose RMS is more than 30 dB below that of the loudest
     block, it may be once the usual magnitude. Where it is larger, the whole block is scaled down to
     the limit. Limiting single samples would give the gradient a non-zero mean, from which a
-    convolutional network learns an inaudible constant pressure. NaN in a gradient is passed on. The
-    gradient has no derivative of its own.
+    convolutional network learns an inaudible constant pressure. Samples after the end of an item
+    have the gradient 0. NaN in a gradient is passed on. The gradient has no derivative of its own.
 
     Shape: (..., time) -> (..., time).
 
@@ -55,10 +55,7 @@ def limit_gradient_spikes(
     >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
     True
     """
-    limited = _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
-    # Otherwise the gradient after the end of an item would limit that of its last block, because
-    # what an ear perceives depends on later samples.
-    return limited if lengths is None else silence_after(limited, lengths)
+    return _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
 
 
 class _GradientLimiter(torch.autograd.Function):
@@ -77,10 +74,14 @@ class _GradientLimiter(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (waveform,) = ctx.saved_tensors
         time = gradient.shape[-1]
+        if ctx.lengths is not None:
+            # Otherwise the gradient after the end of an item would limit that of its last block,
+            # because what an ear perceives depends on later samples.
+            gradient = silence_after(gradient, ctx.lengths)
         powers = _split(waveform, ctx.block).square().mean(-1)
         sizes = _split(gradient.abs(), ctx.block)
         sounding = powers >= SOUNDING * powers.amax(-1, keepdim=True)
-        # Samples after the end of an item have no gradient, and do not count.
+        # Samples without a gradient, such as those after the end of an item, do not count.
         counted = sounding.unsqueeze(-1) & (sizes > 0.0)
         candidates = torch.where(counted, sizes, math.nan).flatten(-2)
         usual = _usual_sizes(candidates, time, ctx.lengths).nan_to_num(nan=math.inf)
