@@ -111,6 +111,7 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
     text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
     parser.series("--gain-ears", str.upper, text, ["N3", "S2"])
+    _declare_precision(parser)
     text = "measure thresholds for digits in noise as well, for the ears of the gain curves"
     parser.flag("--srt", text)
     text = (
@@ -194,6 +195,7 @@ def haspi_report(parser: Parser) -> None:
     option("--audiograms", input_path, text)
     text = "measures, the most important first: haspi, hasqi, haaqi, stoi, pesq"
     parser.series("--measures", str, text, ["haspi"])
+    _declare_precision(parser)
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     text = "use the better ear's scores; needs a manifest or a table of ears with both ears"
     parser.flag("--better-ear", text)
@@ -252,6 +254,7 @@ def clarity(parser: Parser) -> None:
     parser.series("--microphones", count, text, [1])
     text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1, dest="stride")
+    _declare_precision(parser)
     parser.enhancers("waveforms with shape (2, time) in pascals")
     parser.linked("")
     text = "level in dB SPL of a file whose RMS is 1.0"
@@ -345,6 +348,15 @@ def _declare_items(parser: Parser, levelled: str, items: int, levels: list[int])
     parser.series("--levels", sound_level, f"levels of the {levelled} in dB SPL, in turn", levels)
     option("--items", count, "number of items", items)
     option("--seconds", positive_number, "length of an item in seconds", 3.0)
+
+
+def _declare_precision(parser: Parser) -> None:
+    """Declare ``--precision``, the number of bits for HASPI, HASQI and HAAQI."""
+    text = (
+        "bits of the numbers with which HASPI, HASQI and HAAQI are computed, 32 or 64; with 64 "
+        "they are those of pyclarity, in twice the time"
+    )
+    parser.option("--precision", int, text, 32, choices=[32, 64])
 
 
 def _declare_study(parser: Parser) -> None:

@@ -109,6 +109,7 @@ def evaluate_scenes(
     stride: int = 1,
     enhancers: Sequence[str] = (),
     measures: Sequence[str] = (),
+    precision: int = 32,
     linked: bool = False,
     full_scale_spl: float = FULL_SCALE_SPL,
     seed: int = 0,
@@ -151,6 +152,7 @@ def evaluate_scenes(
             reduce noise, for signals in pascals with shape (..., time). Each adds a condition
             before NAL-R and before each aid.
         measures: Further measures: names of hlsim's own, or ``package.module:name`` of yours.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         linked: Whether one level sets the gains of both ears, in compensators that support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
@@ -173,7 +175,7 @@ def evaluate_scenes(
     """
     check_scheduler(running.get("dask"))
     names = ["haspi", "hasqi", *measures]
-    find_measures(names)
+    find_measures(names, precision)
     check_number("stride", stride, 1, whole=True)
     all_pairs = _read_pairs(Path(scenes), listeners, scenes_listeners)
     pairs = all_pairs[::stride]
@@ -215,6 +217,7 @@ def evaluate_scenes(
         recordings,
         [replace(condition, process=None) for condition in conditions],
         names,
+        precision=precision,
         better_ear=True,
         planned=[("haspi", NAL_R, name) for name in aid_names],
         listen=listen,

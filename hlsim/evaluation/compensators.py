@@ -80,6 +80,7 @@ def evaluate_compensators(
     enhancers: Sequence[str] = (),
     simulator: str | Path = "neuro-msbg",
     measures: Sequence[str] = (),
+    precision: int = 32,
     items: int = 400,
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
@@ -122,6 +123,7 @@ def evaluate_compensators(
         simulator: Name or folder of the Neuro-MSBG whose training loss is compared with that of
             the exact MSBG, because an aid may exploit errors of the network.
         measures: Names of measures in addition to HASPI and HASQI.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         items: Number of items. With noise, 400 items are 200 of clean and 200 of noisy speech.
         seconds: Length of an item in seconds, 0.7 or more. HASPI is not reliable much below 3.
         levels: Levels of the clean speech in dB SPL, through which the items cycle.
@@ -165,7 +167,7 @@ def evaluate_compensators(
     check_scheduler(running.get("dask"))
     loudness = check_loudness(loudness)
     check_number("seconds", seconds, SHORTEST_SECONDS)
-    scores = find_measures(["haspi", "hasqi", *measures])
+    scores = find_measures(["haspi", "hasqi", *measures], precision)
     network = load_pretrained(simulator)
     if (manifest is None) == (speech is None) or (noise is not None and speech is None):
         raise ValueError(
@@ -248,6 +250,7 @@ def evaluate_compensators(
         store=store,
         settings={
             **settings,
+            "precision": precision,
             "rival": rival_name,
             "loudness": loudness,
             "audiogram": None if audiogram is None else as_audiogram(audiogram).to_dict(),

@@ -40,6 +40,13 @@ NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
 
 
+PRECISIONS = {32: torch.float32, 64: torch.float64}
+"""Number types in which HASPI, HASQI and HAAQI can be computed, by their number of bits.
+
+64 bits take twice the time, and give the digits of pyclarity.
+"""
+
+
 @dataclass(frozen=True)
 class _CleanSignal:
     """Clean signal that is hashable, so that it can be an argument of ``compute_once``.
@@ -80,18 +87,18 @@ def _prepare(
     return REFERENCES[score](clean.samples, *ear, **settings)
 
 
-def _score_for_ear(name: str, item: Item, output: Tensor) -> Values:
+def _score_for_ear(name: str, precision: torch.dtype, item: Item, output: Tensor) -> Values:
     """Compute HASPI, HASQI or HAAQI of an output, (time,), as a dict with the one column ``name``.
 
     As in pyclarity, the ear's internal noise is drawn, with the seed of the item, and the sample
-    rate is rounded to whole kHz. Single precision takes half the time of double precision.
+    rate is rounded to whole kHz. ``precision`` is the number type of the computation.
     """
-    samples = item.clean.float()
+    samples = item.clean.to(precision)
     clean = _CleanSignal(value_hash(samples), samples)
     # HASPI compares with the clean signal in a normal ear, the others with that in the item's ear.
     prepared_ear, scored_ear = ([], [item.ear]) if name == "haspi" else ([item.ear], [])
     reference = _prepare(name, clean, item.sample_rate, item.full_scale_spl, *prepared_ear)
-    score = reference.score(output.float(), *scored_ear, noise="seeded", seed=item.seed)
+    score = reference.score(output.to(precision), *scored_ear, noise="seeded", seed=item.seed)
     return {name: float(score)}
 
 
@@ -103,44 +110,64 @@ def _score_signal(name: str, score: Callable[..., Any], item: Item, output: Tens
     return {name: score(output, item.clean, item.sample_rate)}
 
 
-_SCORES: dict[str, tuple[Callable[[Item, Tensor], Values], list[str]]] = {
-    **{name: (partial(_score_for_ear, name), ["numpy"]) for name in REFERENCES},
-    "stoi": (partial(_score_signal, "stoi", fidelity.stoi), ["pystoi", "scipy"]),
-    "pesq": (partial(_score_signal, "pesq", fidelity.pesq_wb), ["pesq"]),
-}
-"""Functions that compute scores, and the packages on which their values depend, by name.
+def _ear_measure(name: str, bits: int = 32) -> Measure:
+    """Return the measure that computes HASPI, HASQI or HAAQI with 32 or 64 bits.
 
-NumPy draws the noise of the ear.
-"""
+    The number of bits is part of the key of stored scores.
+    """
+    compute = partial(_score_for_ear, name, PRECISIONS[bits])
+    packages = ["numpy"]  # NumPy draws the ear's noise.
+    return Measure(name, compute, packages, f"{bits} bits", uses_facts=False, scores=[name])
+
 
 MEASURES = {
-    name: Measure(
-        name, compute, packages, uses_facts=False, scores=[name], may_crash=name == "pesq"
-    )
-    for name, (compute, packages) in _SCORES.items()
+    **{name: _ear_measure(name) for name in REFERENCES},
+    "stoi": Measure(
+        "stoi",
+        partial(_score_signal, "stoi", fidelity.stoi),
+        ["pystoi", "scipy"],
+        uses_facts=False,
+        scores=["stoi"],
+    ),
+    "pesq": Measure(
+        "pesq",
+        partial(_score_signal, "pesq", fidelity.pesq_wb),
+        ["pesq"],
+        uses_facts=False,
+        scores=["pesq"],
+        may_crash=True,
+    ),
 }
-"""The scores of the option ``--measures``, each under its name. The higher, the better."""
+"""The scores of the option ``--measures``, each under its name. Higher is better for all of them.
+
+HASPI, HASQI and HAAQI are computed with 32 bits.
+"""
 
 
-def find_measures(names: Sequence[str]) -> list[Measure]:
+def find_measures(names: Sequence[str], precision: int = 32) -> list[Measure]:
     """Return the measures with the listed names, without duplicates.
 
     Args:
         names: Names in ``MEASURES``, or ``package.module:name`` of your own functions, see
             ``load_measure``.
+        precision: Number of bits of the numbers with which HASPI, HASQI and HAAQI are computed, 32
+            or 64.
 
     Raises:
-        ValueError: There is no such measure, or your function cannot be loaded.
+        ValueError: There is no such measure or precision, or your function cannot be loaded.
         MissingExtraError: The package of STOI or PESQ is needed, and is not installed.
 
     >>> [measure.name for measure in find_measures(["haspi", "hasqi"])]
     ['haspi', 'hasqi']
     """
     check_names([name for name in names if ":" not in name], MEASURES, "measures")
+    if precision not in PRECISIONS:
+        raise ValueError(f"expected precision 32 or 64 (bits), got {precision!r}; pass one of them")
     for name, package, extra in (("stoi", "pystoi", "eval"), ("pesq", "pesq", "pesq")):
         if name in names:
             require(package, extra)
-    return [MEASURES.get(name) or load_measure(name) for name in dict.fromkeys(names)]
+    known = MEASURES | {name: _ear_measure(name, precision) for name in REFERENCES}
+    return [known.get(name) or load_measure(name) for name in dict.fromkeys(names)]
 
 
 class _PluginMeasure:

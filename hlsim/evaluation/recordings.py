@@ -52,6 +52,7 @@ def haspi_report(
     manifest: str | Path | DataFrame | None = None,
     root: str | Path | None = None,
     measures: Sequence[str] = ("haspi",),
+    precision: int = 32,
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,
@@ -83,6 +84,7 @@ def haspi_report(
             the current folder for a DataFrame.
         measures: Names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
             ``stoi``, ``pesq`` or ``package.module:name``.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         baseline: Condition with which all other conditions are compared. By default, all
             conditions are compared with each other.
         better_ear: Whether to use the better ear's score of each utterance. An utterance that
@@ -105,7 +107,8 @@ def haspi_report(
     Raises:
         ValueError: Folders, manifest and ears do not go together, files do not match, a row of
             the manifest is not valid, ``better_ear`` is set and an utterance lacks an ear or has
-            other speech at it, there is no such measure or baseline, or nothing could be scored.
+            other speech at it, there is no such measure, precision or baseline, or nothing could
+            be scored.
         MissingExtraError: pandas, joblib or the package of a measure is not installed.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
@@ -156,6 +159,7 @@ def haspi_report(
         recordings,
         [Condition(name, kind="recorded") for name in names],
         measures,
+        precision=precision,
         baseline=baseline,
         better_ear=better_ear,
         store=store,
@@ -169,6 +173,7 @@ def score_recordings(
     conditions: Sequence[Condition],
     measures: Sequence[str],
     *,
+    precision: int = 32,
     baseline: str | None = None,
     better_ear: bool = False,
     planned: Sequence[PlannedComparison] = (),
@@ -182,6 +187,7 @@ def score_recordings(
         recordings: One recording per utterance and ear.
         conditions: Conditions under which outputs were recorded.
         measures: Names of measures, the most important first.
+        precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
         baseline: Condition with which all others are compared; by default, all pairs are compared.
         better_ear: Whether to use the better ear's score of each utterance.
         planned: Planned comparisons; by default that of the first with the last condition by the
@@ -195,7 +201,7 @@ def score_recordings(
         The evaluation. With ``better_ear``, its table has one row per utterance and condition.
 
     Raises:
-        ValueError: There is no such measure, nothing could be scored, or
+        ValueError: There is no such measure or precision, nothing could be scored, or
             ``better_ear`` is set and an utterance lacks an ear or has different speech for both
             ears.
         MissingExtraError: pandas, joblib or the package of a measure is not installed.
@@ -213,10 +219,11 @@ def score_recordings(
     utterances = _pair_ears(recordings) if better_ear else []
     settings = {
         "seed": recordings[0].seed,
+        "precision": precision,
         "baseline": baseline,
         "better_ear": better_ear,
     }
-    columns = [*find_measures(measures), LEVELS, ALIGNMENT]
+    columns = [*find_measures(measures, precision), LEVELS, ALIGNMENT]
     evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
     scores, names = evaluation.scores, evaluation.names
     notes = [*_describe_unrelated(evaluation.table), *_describe_lags(evaluation.table)]

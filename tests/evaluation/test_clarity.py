@@ -377,6 +377,7 @@ LEFT_EAR_ONLY = {"L0001": {**EAR, "audiogram_levels_r": None}}
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
+        ({"precision": 16}, "expected precision 32 or 64"),
         ({"stride": 0}, "expected stride to be a whole number from 1"),
         ({"outputs": {"aid": SPEECH}}, "no file is an output of aid"),
     ],

@@ -97,19 +97,24 @@ def test_clean_speech_is_prepared_once_for_all_conditions_and_listeners(
     assert len(prepared) == 2  # files
 
 
-def test_a_score_is_that_of_the_function_in_single_precision(corpus: Path) -> None:
+def test_a_stored_score_has_the_precision_that_is_asked_for(corpus: Path) -> None:
     paths = {"clean": corpus / "clean", "after": corpus / "after"}
     settings = {**paths, "audiogram": N4, "store": corpus / "scores.jsonl", "jobs": 1}
-    table = haspi_report(**settings).table
-    expected = []
-    for name in table.name:
-        clean = corpus / "clean" / f"{name}.flac"
-        output = first_channel(corpus / "after" / f"{name}.wav")
+    single = haspi_report(**settings).table.haspi
+    double = haspi_report(**settings, precision=64)
+    exact = []
+    for row in double.table.itertuples():
+        clean = corpus / "clean" / f"{row.name}.flac"
+        output = first_channel(corpus / "after" / f"{row.name}.wav")
         options: dict[str, Any] = {"sample_rate": read_audio(clean)[1], "noise": "seeded"}
         options |= {"seed": int(sha256(clean)[:8], 16), "whole_khz": True}
-        expected.append(float(haspi(output.float(), first_channel(clean).float(), N4, **options)))
-    assert list(table.haspi) == expected
-    assert list(haspi_report(**settings).table.haspi) == expected  # from the store
+        exact.append(float(haspi(output, first_channel(clean), N4, **options)))
+    assert list(double.table.haspi) == exact
+    assert list(single) != exact
+    assert list(haspi_report(**settings).table.haspi) == list(single)
+    assert double.settings["precision"] == 64
+    with pytest.raises(ValueError, match="expected precision 32 or 64"):
+        haspi_report(**settings, precision=16)
 
 
 def test_a_single_condition_is_scored_without_a_comparison(corpus: Path) -> None:
