@@ -28,7 +28,7 @@ class Aid(StoredEars, nn.Module):
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Attributes:
         highest_level: Highest hearing threshold that the aid accepts, in dB HL.

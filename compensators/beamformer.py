@@ -73,7 +73,7 @@ class AdaptiveBeamformer(FilterAndSum):
             rates than 16000 are resampled, which adds up to 8.5 ms of look-ahead; streams need
             16000.
             Outputs contain the frequencies below 8 kHz only.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
         ValueError: The rate or the level is out of range.
@@ -200,7 +200,7 @@ class BeamformingAid(DirectionalAid, HubModel):
         audiogram: Ears of the listener, which are used by all calls that pass none.
         config: Sizes and choices of both, by default ``BeamformerConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, see ``AdaptiveBeamformer``.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Attributes:
         highest_frequency: Highest frequency of outputs in Hz.

@@ -72,7 +72,7 @@ class HearingAid(Wearable, HubModel):
         audiogram: One or more ears, which are used by all calls that pass none.
         config: Sizes of the networks, and limits of the gains; by default ``HearingAidConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal.
         limit_to_ear: Limit the level of the output in each band to 4 dB below the uncomfortable

@@ -50,7 +50,7 @@ def load_compensator(
             such as ``"hearing-aid"``; or the folder of a checkpoint or of a training run. If an aid
             was trained for one ear, ``trained_for`` returns this ear.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal. ``WDRC``, ``CAMFIT`` and
             ``HearingAid`` support this, also behind a front end.

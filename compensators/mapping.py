@@ -61,7 +61,7 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         config: Sizes and choices, by default ``MappingConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Outputs contain the
             frequencies below 8 kHz only.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Attributes:
         highest_frequency: Highest frequency of outputs in Hz.

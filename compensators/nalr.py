@@ -30,8 +30,8 @@ class NALR(Aid):
             The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz are used, interpolated over log
             frequency where they were not measured.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, for the warning about loud
-            signals. It does not change the output.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200, for the warning
+            about loud signals. It does not change the output.
 
     Raises:
         ValueError: A rate or level is out of range, or an ear is not valid.

@@ -51,7 +51,7 @@ class WDRC(Wearable):
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Streams need 16000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
         attack: Time constant in seconds with which the measured level of a band rises, 0 to 1.
         release: Time constant in seconds with which this level falls, 0.01 to 2.
         limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds. A band is not

@@ -89,7 +89,7 @@ class Wearable(Aid):
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
             kHz; components above get the gain of the highest band. A ``Stream`` accepts only 16000
             Hz. Whole signals at other rates are resampled, which adds up to 8.5 ms of look-ahead.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
         linked: Give two ears, (..., 2, time), gains from their mean power, so that the differences
             in level between them stay if their audiograms are equal. The output of each ear is
             limited separately.
@@ -370,19 +370,21 @@ class Wearable(Aid):
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None
     ) -> tuple[torch.Size, Tensor]:
-        """Validate the arguments of a call, and fit the aid to the ear of each item.
+        """Fit the aid to the ear of each item of a call.
 
         Args:
-            waveform: Input of the aid, (..., time).
-            audiogram: One ear, or ears whose shape (..., 8) broadcasts over the leading dimensions.
+            waveform: Input of the aid, (..., time), whose samples are not validated here.
+            audiogram: One ear, or ears whose shape (..., 8) broadcasts over the leading dimensions;
+                None for the ears of the constructor.
 
         Returns:
             The common leading dimensions of waveform and ears, whose product is the number of
             items, and the parameters from ``fit_with_limits``, (items, n).
 
         Raises:
-            ValueError: There is no ear, an ear is not valid, shapes do not fit, or the waveform is
-                on another device than the weights.
+            ValueError: There is no ear, an ear is not valid, shapes do not fit, the waveform of a
+                ``linked`` aid is not of shape (..., 2, time), or the waveform is on another device
+                than the weights.
         """
         check_device(self, waveform.device)
         thresholds = self.resolve_thresholds(waveform, audiogram)

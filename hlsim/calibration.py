@@ -49,7 +49,7 @@ def gain_to_pascals(full_scale_spl: float) -> float:
     """Compute the factor that converts samples to pascals, where 1 Pa counts as 94 dB SPL.
 
     Args:
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
         ValueError: The level is not a number, or out of range.
@@ -96,7 +96,8 @@ def full_scale_at(spl: float, waveform: Tensor) -> float:
         Level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: The result is not a possible full scale; the recording may be silent.
+        ValueError: The result is outside 0 to 200, or there are no samples; the recording may be
+            silent.
 
     >>> round(full_scale_at(65.0, torch.tensor([[0.1, -0.1]])))
     85
@@ -117,7 +118,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
         spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
             dimensions, from the level of silence (-106 at the default scale) to 140 dB SPL. For
             a waveform on a GPU, it is not validated, because that would synchronise with the GPU.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
         ValueError: The waveform is not a floating-point tensor with time last, ``spl`` is not a

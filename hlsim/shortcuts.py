@@ -189,7 +189,7 @@ def listen(
 
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0, 0 to 200.
         signals: Signals by the label to show, in which an underscore becomes a space, ``(time,)``,
             or ``(2, time)`` in stereo, left first. Their lengths may differ.
 

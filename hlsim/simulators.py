@@ -57,8 +57,8 @@ class Attenuation(StoredEars, nn.Module):
     Args:
         audiogram: Ear or ears; they may be passed with each call instead.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0. It has no influence on the
-            output, but on the warning about loud signals.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200. It has no influence
+            on the output, but on the warning about loud signals.
 
     Attributes:
         reach: Number of samples before and after an output sample that influence it.
@@ -138,7 +138,7 @@ class PluginSimulator(nn.Module):
         name: ``package.module:name`` or ``path/to/file.py:name``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Signals are resampled
             to the rate of your simulator and back.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
         ValueError: There is no such simulator, its attribute ``full_scale_spl`` is not 94, or its
@@ -259,7 +259,7 @@ def load_simulator(
             (``PluginSimulator``); or a module, which is set to evaluation mode. If a module has an
             attribute ``sample_rate``, ``full_scale_spl`` or ``aligned``, it is validated.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
         ValueError: There is no such simulator, the rate or the level is out of range, the module

@@ -185,14 +185,14 @@ def warn_of_other_ears(
 
 
 def build_simulator(options: argparse.Namespace, sample_rate: int) -> Any:
-    """Load the simulator that ``--simulator`` names.
+    """Load the simulator that ``--simulator`` names, at the scale of ``--full-scale-spl``.
 
     Args:
-        options: Options of the command.
-        sample_rate: Sample rate in Hz of the signals to process.
+        options: Options ``simulator`` and ``full_scale_spl``.
+        sample_rate: Sample rate in Hz of the signals to process, 16000 to 48000.
 
     Raises:
-        ValueError: There is no such simulator, or the sample rate is out of range.
+        ValueError: See ``load_simulator``.
     """
     from hlsim.simulators import load_simulator
 
@@ -202,15 +202,15 @@ def build_simulator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 
 def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
-    """Load the compensator that ``--compensator`` names.
+    """Load the compensator that ``--compensator`` names, at the scale of ``--full-scale-spl``.
 
     Args:
-        options: Options of the command.
-        sample_rate: Sample rate in Hz of the signals to process.
+        options: Options ``compensator`` and ``full_scale_spl`` and, where a command has them,
+            ``linked``, ``limit_to_ear``, ``loudness`` and the sliders, which are not set here.
+        sample_rate: Sample rate in Hz of the signals to process, 16000 to 48000.
 
     Raises:
-        ValueError: There is no such compensator, the sample rate is out of range, or the
-            compensator lacks a slider or a setting that is passed.
+        ValueError: See ``load_compensator``; or the compensator lacks a slider that is passed.
     """
     from compensators import load_compensator
     from compensators.directional import behind_front_end
@@ -237,8 +237,8 @@ def build_single_microphone_aid(options: argparse.Namespace, sample_rate: int) -
     """Load the compensator that ``--compensator`` names, which must take one signal per ear.
 
     Args:
-        options: Options of the command.
-        sample_rate: Sample rate in Hz of the signals to process.
+        options: See ``build_compensator``.
+        sample_rate: Sample rate in Hz of the signals to process, 16000 to 48000.
 
     Raises:
         ValueError: See ``build_compensator``; or the compensator takes several microphones.

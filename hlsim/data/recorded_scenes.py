@@ -45,7 +45,7 @@ class SceneFiles(NamedTuple):
         A row without references is a scene with a single microphone.
 
         Raises:
-            ValueError: The row has no noisy speech.
+            ValueError: The row has no noisy speech, or its reference is not valid.
         """
         if not row.noisy:
             raise ValueError(

@@ -244,9 +244,9 @@ def read_folders(
     """Return one recording per ear and file of a folder of clean speech.
 
     Args:
-        clean: Folder of clean speech.
-        folders: Folder of the outputs by condition. The files of all folders have the same names,
-            whatever their extension.
+        clean: Folder of clean speech, in which subfolders are searched, too.
+        folders: Folder of the outputs by condition. A file has the same path in all folders, apart
+            from its extension.
         ears: Name of the listener, name of the ear and audiogram of each ear; names may be empty.
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 

@@ -518,10 +518,11 @@ def _measure_item(task: _Task) -> list[tuple[Values | str, list[str]]]:
 
 
 def _check_values(measure: Measure, values: dict[str, Any]) -> Values:
-    """Return the values of a measure with numbers as floats.
+    """Convert the numbers among the values of a measure to floats, in place, and return them.
 
     Raises:
         ValueError: A number is NaN or infinite.
+        TypeError: A value is neither a text nor a number.
     """
     for name, value in values.items():
         if isinstance(value, str):

@@ -58,7 +58,7 @@ class FrozenSimulator:
         simulator: Name, folder or module, see ``load_simulator``. A module is changed, not copied,
             and so is ``normal``.
         sample_rate: Sample rate in Hz.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
+        full_scale_spl: Level in dB SPL of RMS 1.0, 0 to 200.
         normal: Normal ear that belongs to the simulator. By default, the filter of MSBG's normal
             ear or the simulator at 0 dB HL, see ``HearingLossLoss``.
         choice: Reference of the criteria that have a choice: ``"clean"`` speech, or

@@ -90,7 +90,7 @@ class MSBG(StoredEars, nn.Module):
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. At rates below 44100
             the last 80 Hz below half the rate fade out; at rates above 44100 outputs end at
             22.05 kHz.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
+        full_scale_spl: Level in dB SPL of RMS 1.0, 0 to 200.
         aligned: Whether the delay of the model is removed, so that the output has as many samples
             as the input. Otherwise the output, with ``rescale_active``, is that of pyclarity,
             sample by sample at 44.1 kHz, with its delay. If spectra are smeared, this output is

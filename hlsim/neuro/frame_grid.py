@@ -158,7 +158,7 @@ def synthesise_frames(real: Tensor, imaginary: Tensor, length: int) -> Tensor:
     Args:
         real: Real parts of the spectra.
         imaginary: Imaginary parts of the spectra.
-        length: Number of samples of the result.
+        length: Number of samples of the result, at most 24 * (frames - 3).
 
     >>> waveform = torch.randn(1, 240)
     >>> bool(torch.allclose(synthesise_frames(*analyse_frames(waveform), 240), waveform, atol=1e-5))
@@ -174,6 +174,8 @@ class _Analysis(torch.autograd.Function):
     spectrum, and its odd part an imaginary one. With their gradients, two products with matrices of
     half the size take half the time of a Fourier transform, and real and imaginary parts are
     contiguous.
+
+    Shape: (items, time), matrices (2, 48, 97) -> (items, frames, 97) twice.
     """
 
     @staticmethod
@@ -202,7 +204,13 @@ class _Analysis(torch.autograd.Function):
 
 
 class _Synthesis(torch.autograd.Function):
-    """Overlapping sum of frames with some spectra, and its gradient by ``_Analysis``."""
+    """Signals from the spectra of their frames, by products with matrices, and their gradient.
+
+    The matrices give the even and the odd part of each frame, and overlapping frames are added up.
+    The gradient is that of a linear function: ``_Analysis`` with the transposed matrices.
+
+    Shape: (items, frames, 97) twice, matrices (2, 97, 48) -> (items, length).
+    """
 
     @staticmethod
     def forward(real: Tensor, imaginary: Tensor, matrices: Tensor, length: int) -> Tensor:
@@ -225,12 +233,18 @@ class _Synthesis(torch.autograd.Function):
 
 
 def _transform_units(time: int) -> int:
-    """Return the length of Fourier transforms of at least some samples, in units of 160 ms."""
+    """Return the length of Fourier transforms of ``time`` samples at 16 kHz or more, in units.
+
+    A unit has 160 ms (``_UNIT``).
+    """
     return fft_length(math.ceil(time / _UNIT))
 
 
 def _precise(waveform: Tensor) -> Tensor:
-    """Convert to double precision for onnxruntime, whose float32 transforms are off by 1e-3."""
+    """Return signals as they are or, in an export to ONNX, in double precision.
+
+    The float32 transforms of onnxruntime are off by 1e-3.
+    """
     return waveform.double() if torch.compiler.is_exporting() else waveform
 
 
@@ -361,6 +375,9 @@ def _centred_taps(responses: NDArray[np.complex128], advance: float) -> NDArray[
     Args:
         responses: Frequency responses at the frequencies of ``_grid``, (responses, frequencies).
         advance: Number of samples at 44.1 kHz by which the responses are advanced.
+
+    Returns:
+        Impulse responses with time 0 in the middle, (responses, 2 * ``_BANK_HALF_LENGTH``).
     """
     omega, points = _grid()
     fade = fade_out_weights(len(omega), MSBG_RATE / points, NEURO_RATE / 2)

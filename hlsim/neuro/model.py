@@ -72,7 +72,7 @@ class NeuroMSBG(EarNetwork, HubModel):
         config: Sizes and choices, by default ``NeuroConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
             the frequencies below 8 kHz only.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
         compute_prior: Compute the constants of MSBG's formulae, which takes 0.2 s for the first
             default network, and up to 2 s with a longer transform. With False, they are NaN until a
             state dict is loaded.
@@ -314,7 +314,7 @@ def load_pretrained(
         name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or the folder of
             a checkpoint or of a training run. ``hlsim.list_pretrained`` lists the names.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, it is no simulator, or the rate or

@@ -36,7 +36,7 @@ class EarNetwork(nn.Module):
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
             the frequencies below 8 kHz only.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Attributes:
         checkpoint: Whether to use gradient checkpointing: activations are computed again in the

@@ -193,7 +193,7 @@ class _Block:
         frames: Frames of the block.
         steps: Steps of the block, and the one after them.
         step: Number of frames per step.
-        buffers: Tensors of the shape of the block.
+        buffers: Tensors of the shape of the block, (items, frames, frequencies).
     """
 
     items: slice
@@ -207,12 +207,16 @@ class _Block:
         return [values[self.items, self.frames] for values in maps]
 
     def factors(self, gains: Tensor, matrices: Sequence[Tensor], out: Sequence[Tensor]) -> Planes:
-        """Compute the factors of gains over the square root of 8, see ``smear_and_amplify``.
+        """Compute the factors by which gains multiply the block's spectra, over the root of 8.
+
+        The gains of a frame, interpolated linearly between steps, are multiplied by each matrix.
 
         Args:
-            gains: Gains of all items and steps.
-            matrices: Matrices for real and imaginary parts, over the square root of 8.
-            out: Two tensors for the results.
+            gains: Gains of all items and steps, (items, steps + 1, channels).
+            matrices: Matrices for real and imaginary parts, divided by the square root of 8,
+                (items, channels, frequencies) each.
+            out: Two tensors of the shape of the block, which are filled with the real and the
+                imaginary parts of the factors, and returned.
         """
         for matrix, result in zip(matrices, out, strict=True):
             rows = gains[self.items, self.steps] @ matrix[self.items]
@@ -235,8 +239,9 @@ class _Block:
         Args:
             factor_slopes: Gradients with respect to the results of ``factors``, two tensors of the
                 shape of the block.
-            gains: Gains of all items and steps, (items, steps, n).
-            matrices: Matrices of ``factors``, over the square root of 8.
+            gains: Gains of all items and steps, (items, steps + 1, channels).
+            matrices: Matrices of ``factors``, divided by the square root of 8, (items, channels,
+                frequencies) each.
             gains_slope: Tensor of the shape of ``gains`` to which their gradient is added.
             matrix_slopes: Two tensors of the shape of ``matrices`` for their gradients, or none.
         """

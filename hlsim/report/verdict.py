@@ -115,10 +115,14 @@ def describe_means(evaluation: Evaluation) -> str:
 
 
 def describe_missing_pairs(evaluation: Evaluation) -> list[str]:
-    """Return a list with a note about conditions that were not compared, or an empty list.
+    """Return a list with a sentence that names the pairs without a comparison, or an empty list.
+
+    Two conditions are not compared if no item has the scores of both. If the evaluation has a
+    setting ``baseline``, only pairs that begin with it count, otherwise all pairs. Without any
+    comparison, the list is empty, because ``describe_means`` says so.
 
     Args:
-        evaluation: Evaluation with comparisons.
+        evaluation: The evaluation.
 
     >>> describe_missing_pairs(Evaluation([], [], [], None))
     []

@@ -179,7 +179,11 @@ class TrainingData:
 
 
 def _read_ears(table: Path) -> list[tuple[float, ...]]:
-    """Read the ears of a table, as eight thresholds in dB HL each."""
+    """Read the ears of a table, as eight thresholds in dB HL each.
+
+    Raises:
+        ValueError: The table cannot be read, or a threshold is above 100 dB HL.
+    """
     return [ear.thresholds for _, ear in read_audiograms(table, simulated=True)]
 
 
@@ -479,8 +483,9 @@ def make_data(
         ear: Ear of a personal compensator; None for random and measured ears.
 
     Raises:
-        ValueError: Files are missing or invalid, or used for both training and validation, or the
-            recipe requires noise and there is none.
+        ValueError: Files are missing or invalid, or used for both training and validation, the
+            recipe requires noise and there is none, or the microphones of its network do not fit
+            the data (see ``_CompensatorBatches``).
 
     >>> from hlsim.data.bundled import SPEECH
     >>> batches = make_data(TrainingData(SPEECH), CompensatorRecipe())

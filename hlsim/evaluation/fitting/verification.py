@@ -132,7 +132,7 @@ def verify(
             shorter, and up to 1 s later or earlier.
         ear: Audiogram of the ear.
         sample_rate: Sample rate of both in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0.
+        full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
         prescription: Aid whose gains are the targets: ``nalr``, ``nalrp``, ``wdrc``,
             ``camfit``, or a checkpoint.
 

@@ -117,10 +117,12 @@ def value_hash(value: Any) -> str:
 
     Args:
         value: Text, number, list, or dict (in any order), nested as you like, with tensors, arrays,
-            dataclasses, functions (of which only the name counts), and modules with a fingerprint.
+            dataclasses, functions and classes (of which only the name counts), and modules with a
+            fingerprint.
 
     Raises:
-        TypeError: The value contains something else, such as a lambda.
+        TypeError: The value contains something else, such as a lambda or another function within a
+            function, or a module whose ``fingerprint`` is None.
 
     >>> value_hash({"a": 1, "b": [2.0]}) == value_hash({"b": [2.0], "a": 1})
     True
@@ -135,7 +137,10 @@ def _is_from_hlsim(module: nn.Module) -> bool:
 
 
 def _is_known(kind: type) -> bool:
-    """Return whether a class belongs to hlsim, torch or Python."""
+    """Return whether a class belongs to hlsim or torch, or is built into Python.
+
+    Classes of Python's library, such as ``abc.ABC``, are not known.
+    """
     return kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "builtins")
 
 
@@ -146,7 +151,7 @@ def _attributes(module: nn.Module) -> dict[str, Any]:
     """Return the attributes of a module without those that every ``nn.Module`` has.
 
     Parameters, buffers and submodules are not included. Private attributes are left out if the
-    class belongs to hlsim, torch or Python, because calls have computed them.
+    class belongs to hlsim or torch, because calls have computed them.
     """
     return {
         name: value

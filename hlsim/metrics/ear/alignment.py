@@ -27,6 +27,8 @@ early.
 def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
     """Compute the spectra of signals without their means, for the correlation in ``bulk_delays``.
 
+    They have no gradient.
+
     Args:
         signals: Signals at 24 kHz. Shape: (items, time).
         extent: Number of samples of each item before padding.
