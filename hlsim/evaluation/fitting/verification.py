@@ -42,7 +42,8 @@ SIMILARITY_FLOOR = 0.4
 
 Of the bundled recordings, two different ones reach 0.3. Outputs of the bundled aids, also in noise,
 have at least 0.6, but those of CAMFIT for steep losses (S2, S3) as little as 0.1: its gain of up to
-100 dB is so high at onsets that the limit of the peaks distorts them, and distortion has other bands.
+100 dB is so high at onsets that the limit of the peaks distorts them, and distortion lies in other
+bands.
 """
 
 
