@@ -46,6 +46,8 @@ class NALR(Aid):
     highest_level = HIGHEST_LEVEL
     grid: ClassVar[tuple[float, ...]] = FREQUENCIES
     """Frequencies in Hz between which the gains of the filter are straight lines."""
+    reach = ORDER // 2
+    """Number of samples before and after an output sample that influence it."""
 
     def prescribe(self, thresholds: Tensor, points: tuple[float, ...]) -> Tensor:
         """Compute the prescribed gains in dB.
@@ -69,8 +71,7 @@ class NALR(Aid):
             gains = self.prescribe(thresholds.double(), self.grid)
             taps = filters_with_gains(gains, self.grid, self.sample_rate, ORDER).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
-            delay = ORDER // 2
-            output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
+            output = torch.fft.irfft(spectrum, points)[..., self.reach : self.reach + time]
             return output.to(waveform.dtype)
 
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:

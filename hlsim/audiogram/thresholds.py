@@ -163,31 +163,6 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
     return grids if any(grids) else []
 
 
-def store_thresholds(
-    audiogram: AudiogramLike | None, highest: float = HIGHEST_SIMULATED
-) -> Tensor | None:
-    """Convert ears into thresholds, (..., 8) in dB HL, for a module to store.
-
-    The result is a copy without a gradient, because the caller may write into a tensor later.
-
-    Args:
-        audiogram: One or more ears, or None, for which the result is None.
-        highest: Highest level allowed, in dB HL.
-
-    Raises:
-        ValueError: The ears are not valid, see ``as_thresholds``.
-
-    >>> store_thresholds("N3").shape
-    torch.Size([8])
-    """
-    if audiogram is None:
-        return None
-    with torch.inference_mode(False):  # the module may be trained later
-        if isinstance(audiogram, Tensor):
-            on_host(audiogram)  # so that its values are validated
-        return as_thresholds(audiogram, highest=highest).detach().clone()
-
-
 def resolve_thresholds(
     stored: Tensor | None,
     audiogram: AudiogramLike | None,
@@ -256,14 +231,24 @@ class StoredEars:
     def store_ears(self, audiogram: AudiogramLike | None) -> None:
         """Store the ears that calls without an audiogram use.
 
+        The stored thresholds are a copy without a gradient, because the caller may write into a
+        tensor later.
+
         Args:
             audiogram: One or more ears, or None.
 
         Raises:
             ValueError: An ear is not valid.
         """
-        self.thresholds = store_thresholds(audiogram, highest=self.highest_level)
+        self.thresholds = None
         self._two_ears = has_listeners(audiogram)
+        if audiogram is None:
+            return
+        with torch.inference_mode(False):  # the module may be trained later
+            if isinstance(audiogram, Tensor):
+                on_host(audiogram)  # so that its values are validated
+            thresholds = as_thresholds(audiogram, highest=self.highest_level)
+            self.thresholds = thresholds.detach().clone()
 
     def resolve_thresholds(self, waveform: Tensor, audiogram: AudiogramLike | None) -> Tensor:
         """Return the thresholds of the passed or else of the stored ears, checked for a waveform.

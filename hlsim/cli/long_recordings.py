@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from compensators import NALR
 from compensators.long_signals import process_blocks
-from compensators.nalr import ORDER
 from compensators.wearable import Wearable
 from hlsim.audio import AudioInfo, read_parts
 from hlsim.audiogram.listener import Listener
@@ -106,23 +105,13 @@ def process_recording(
         outputs = process_blocks(model, read, recording.samples, ears, **sliders)
     else:
         blocks = divide_recording(model, recording.samples, recording.sample_rate)
-        process = _process_channels if len(blocks) > 1 else _process_all
-        if getattr(model, "takes_microphones", False):
-            process = _process_microphones
+        takes_microphones = getattr(model, "takes_microphones", False)
+        process = _process_microphones if takes_microphones else _process_channels
         outputs = (
             block.cut_output(process(model, part, ears, sliders))
             for block, part in zip(blocks, read(blocks), strict=True)
         )
     return (output / gain for output in outputs)
-
-
-def _process_all(model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]) -> Tensor:
-    """Return the output of a model for all channels at once.
-
-    Shape: (channels, time) -> (channels, time).
-    """
-    output: Tensor = model(part, ears, **sliders)
-    return output
 
 
 def _process_microphones(
@@ -198,9 +187,7 @@ def divide_recording(model: nn.Module, samples: int, rate: int) -> list[Block]:
         # At high rates, MSBG works at 44.1 instead of 22.05 kHz, and takes twice the memory.
         return block_bounds(samples, rate, None if rate <= HALF_RATE_HZ else _BLOCK_SECONDS / 2)
     hop = round(_BLOCK_SECONDS * rate)
-    if isinstance(model, NALR):
-        return split_into_blocks(samples, hop, ORDER, ORDER)
-    if isinstance(model, Attenuation):
+    if isinstance(model, NALR | Attenuation):
         return split_into_blocks(samples, hop, model.reach, model.reach)
     field = model.receptive_field if isinstance(model, EarNetwork) else None
     if field is None:

@@ -3,17 +3,15 @@
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
+    StoredEars,
     check_two_channels,
-    has_listeners,
-    resolve_thresholds,
-    store_thresholds,
 )
 from hlsim.calibration import (
     NEURO_RATE,
@@ -55,14 +53,7 @@ _LEVEL_WEIGHTS = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
 """
 
 
-class _Unregistered(NamedTuple):
-    """Thresholds and criterion of a loss, which are in no state dict."""
-
-    thresholds: Tensor | None
-    criterion: Any
-
-
-class HearingLossLoss(nn.Module):
+class HearingLossLoss(StoredEars, nn.Module):
     """Difference between what an impaired ear and what a normal ear perceives.
 
     The impaired ear perceives the output of an aid, and the normal ear clean speech. A simulator
@@ -194,13 +185,13 @@ class HearingLossLoss(nn.Module):
                 f"expected a criterion that compares perceived levels for loudness={loudness!r}, "
                 f"got {', '.join(self.criteria)}; add coherent-bands, or leave out loudness"
             )
-        self._two_ears = has_listeners(audiogram)
+        self.store_ears(audiogram)
         self._has_warned_of_order = False
         self._frozen = FrozenSimulator(
             simulator, self.sample_rate, self.full_scale_spl, normal, reference, checkpoint
         )
         # nn.Module does not register what is in a tuple.
-        self._unregistered = _Unregistered(store_thresholds(audiogram), criterion)
+        self._criterion = (criterion,)
 
     @property
     def simulator(self) -> nn.Module:
@@ -334,8 +325,7 @@ class HearingLossLoss(nn.Module):
                 "this loss",
                 stacklevel=3,
             )
-        stored = self._unregistered.thresholds
-        ears = resolve_thresholds(stored, audiogram, clean, two_ears=self._two_ears)
+        ears = self.resolve_thresholds(clean, audiogram)
         batch = broadcast_shape(clean.shape[:-1], ears.shape[:-1])
         if batch.numel() > max(clean[..., 0].numel(), ears[..., 0].numel()):
             raise ValueError(
@@ -436,7 +426,7 @@ class HearingLossLoss(nn.Module):
             return tensor.to(device, tensor.dtype if is_half else moved.dtype)
 
         super()._apply(function, recurse)
-        for module in (self.simulator, self._frozen.normal, self._unregistered.criterion):
+        for module in (self.simulator, self._frozen.normal, *self._criterion):
             if isinstance(module, nn.Module):
                 module._apply(move)
         return self
