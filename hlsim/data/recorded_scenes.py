@@ -71,17 +71,29 @@ class SceneFiles(NamedTuple):
 
     @property
     def _file_with_room(self) -> Path | None:
-        """File of the target in its room, see ``file_with_room``."""
+        """File of the target in its room, which belongs to clean speech of Clarity's scenes.
+
+        The clean speech has another level than in the room, and the file beside it has the target
+        at the reference microphone, or else at microphone 1. It is None if there is no such file,
+        or if the clean speech has the right level.
+        """
         last = len(self.microphones) - 1  # a file may have the channels of several microphones
-        return file_with_room(self.clean, self.microphones[min(self.reference_number, last)])
+        noisy = self.microphones[min(self.reference_number, last)]
+        microphone = noisy.stem.rpartition("_")[-1]
+        for ending in CLARITY_REFERENCES[:-1]:
+            scene = self.clean.name.removesuffix(ending)
+            for name in (f"{scene}_target_{microphone}.wav", f"{scene}_target_CH1.wav"):
+                file = self.clean.with_name(name)
+                if self.clean.name.endswith(ending) and file.is_file():
+                    return file
+        return None
 
     def read(self) -> tuple[Tensor, Tensor, int]:
         """Read the signals, with the reference microphone first.
 
         Samples have 1.0 as full scale. Files that differ by up to 0.1 s are cut to the shortest,
         and clean speech with one channel is used for all ears. Anechoic clean speech of Clarity's
-        scenes gets the level of the target in the room if that file exists, see
-        ``file_with_room``.
+        scenes gets the level of the target in the room if that file exists.
 
         Returns:
             The clean speech, (ears, time), the signals of the microphones, (microphones, ears,
@@ -91,7 +103,7 @@ class SceneFiles(NamedTuple):
             ValueError: A file cannot be read, or the files differ in sample rate or by more than
                 0.1 s, or have numbers of channels that do not fit.
         """
-        paths = (self.clean, *self.microphones)
+        paths = (self.clean, *self.files)
         waveforms, rates = zip(*map(read_audio, paths), strict=True)
         lengths = [waveform.shape[-1] for waveform in waveforms]
         time = min(lengths)
@@ -104,8 +116,8 @@ class SceneFiles(NamedTuple):
                 f"{self.clean}: expected the sample rate of its noisy version and its length "
                 f"within {_LARGEST_DIFFERENCE:g} s, got {', '.join(sizes)}; replace the files"
             )
-        clean, *noisy = (waveform[:, :time] for waveform in waveforms)
-        channels = torch.cat(noisy)
+        clean, *recordings = (waveform[:, :time] for waveform in waveforms)
+        channels = torch.cat(recordings[: len(self.microphones)])
         if not self.references and len(channels) > 1:
             raise ValueError(
                 f"{self.microphones[0]}: expected one channel, got {len(channels)}; name the "
@@ -128,34 +140,9 @@ class SceneFiles(NamedTuple):
         microphones = channels.unflatten(0, (-1, ears))
         later = [number for number in range(len(microphones)) if number != first]
         clean = clean.expand(ears, -1)
-        in_room = self._file_with_room
-        if in_room is not None:
-            clean = set_level(clean, level_spl(read_audio(in_room)[0][:, :time]))
+        for in_room in recordings[len(self.microphones) :]:  # at most one
+            clean = set_level(clean, level_spl(in_room))
         return clean, microphones[[first, *later]], rates[0]
-
-
-def file_with_room(clean: Path, noisy: Path | None = None) -> Path | None:
-    """Return the file of the target in its room that belongs to clean speech of Clarity's scenes.
-
-    The clean speech has another level than in the room, and the file beside it has the target at
-    the reference microphone, or else at microphone 1. The result is None if there is no such file,
-    or if the clean speech has the right level.
-
-    Args:
-        clean: File of the clean speech.
-        noisy: File of the reference microphone, by default microphone 1.
-
-    >>> file_with_room(Path("S00001_reference.wav")) is None
-    True
-    """
-    microphone = "CH1" if noisy is None else noisy.stem.rpartition("_")[-1]
-    for ending in CLARITY_REFERENCES[:-1]:
-        scene = clean.name.removesuffix(ending)
-        for name in (f"{scene}_target_{microphone}.wav", f"{scene}_target_CH1.wav"):
-            file = clean.with_name(name)
-            if clean.name.endswith(ending) and file.is_file():
-                return file
-    return None
 
 
 class SceneClips(Clips):

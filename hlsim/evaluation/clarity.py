@@ -23,7 +23,7 @@ from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import level_spl, set_level
 from hlsim.checks import check_number
 from hlsim.data.layouts import CLARITY_REFERENCES
-from hlsim.data.recorded_scenes import file_with_room
+from hlsim.data.recorded_scenes import SceneFiles
 from hlsim.evaluation.aid_properties import measure_look_ahead
 from hlsim.evaluation.conditions import (
     NAL_R,
@@ -47,7 +47,6 @@ from hlsim.evaluation.running.parallel import (
 )
 from hlsim.evaluation.study import Condition, cut_output
 from hlsim.files import read_json
-from hlsim.metrics.pair import common_length
 from hlsim.progress import track
 from hlsim.torchtools import one_thread
 
@@ -449,7 +448,8 @@ def _measure_look_ahead(
     """
     if condition.process is None:
         return None
-    scene = _input_of(condition, _read_microphones(pair, rate, microphones))
+    signals, _ = _read_scene(pair, rate, microphones)
+    scene = _input_of(condition, signals)
     scene = scene[..., : int(_LOOK_AHEAD_SECONDS * rate)]
     noise = torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
     other = set_level(noise, level_spl(scene.flatten()))
@@ -512,7 +512,7 @@ def _write_signals(
         path = outputs[condition.name] = folder / pair.output_name
         try:
             if condition.process is None:
-                _read_channels(path, rate, [2])
+                _check_output(path, rate)
                 continue
             output = condition.process(_input_of(condition, signals), pair.listener)
             write_audio(path, cut_output(output, signals[0], rate), rate)
@@ -527,67 +527,38 @@ def _reference_file(out: Path, pair: _Pair) -> Path:
     return out / "reference" / f"{pair.scene}.wav"
 
 
-def _read_microphones(pair: _Pair, rate: int, numbers: Sequence[int]) -> Tensor:
-    """Return the signals of the microphones of a scene. Shape: (microphones, 2, time).
+def _read_scene(pair: _Pair, rate: int, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Read the microphones' signals, and the reference at the level of the target in the room.
 
     Args:
         pair: Files of the scene.
         rate: Sample rate in Hz that the files must have.
         numbers: Numbers of the microphones, of which 1 is the front one.
 
-    Raises:
-        ValueError: A file is broken, has another rate or not two channels, or the lengths of the
-            microphones differ.
-    """
-    signals = [_read_channels(pair.microphone(number), rate, [2]) for number in numbers]
-    lengths = {signal.shape[-1] for signal in signals}
-    if len(lengths) > 1:
-        raise ValueError(
-            f"{pair.mix}: expected the same length of all microphones, got {sorted(lengths)} "
-            "samples; replace the files"
-        )
-    return torch.stack(signals)
-
-
-def _read_scene(pair: _Pair, rate: int, microphones: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Read the microphones' signals, and the reference at the level of the target in the room.
-
     Returns:
-        Signals for the left and the right ear: of the microphones, with shape (microphones, 2,
-        time), and of the reference, with shape (2, time).
+        Signals for the left and the right ear, cut to the shortest file: of the microphones, with
+        shape (microphones, 2, time), and of the reference, with shape (2, time).
 
     Raises:
-        ValueError: A file is broken, or has another rate or length.
+        ValueError: A file is broken or has another rate, the lengths differ by more than 0.1 s, or
+            a microphone has not two channels.
     """
-    signals = _read_microphones(pair, rate, microphones)
-    reference = _read_channels(pair.reference, rate)
-    in_room_file = file_with_room(pair.reference)
-    if in_room_file is None:
-        return signals, reference
-    in_room = _read_channels(in_room_file, rate)
-    names = str(pair.reference), str(in_room_file)
-    samples = common_length((reference.shape[-1], in_room.shape[-1]), rate, names)
-    reference, in_room = reference[:, :samples].double(), in_room[:, :samples].double()
-    return signals, set_level(reference, level_spl(in_room))
-
-
-def _read_channels(path: Path, rate: int, numbers: Sequence[int] = (1, 2)) -> Tensor:
-    """Read the channels for the left and the right ear. Shape: (2, time).
-
-    If the file has one channel, both ears get it.
-
-    Args:
-        path: Audio file.
-        rate: Expected sample rate in Hz.
-        numbers: Accepted numbers of channels.
-
-    Raises:
-        ValueError: The file cannot be read, or has another sample rate or number of channels.
-    """
-    waveform, file_rate = read_audio(path)
-    if file_rate != rate or len(waveform) not in numbers:
+    files = SceneFiles(pair.reference, tuple(map(pair.microphone, numbers)), references=(1, 2))
+    reference, signals, scene_rate = files.read()
+    if scene_rate != rate or len(signals) != len(numbers):
         raise ValueError(
-            f"{path}: expected {' or '.join(map(str, numbers))} channels at the rate of the first "
-            f"scene, {rate} Hz, got {len(waveform)} at {file_rate} Hz; replace the file"
+            f"{pair.mix}: expected two channels for each microphone at the rate of the first "
+            f"scene, {rate} Hz, got {2 * len(signals)} channels for {len(numbers)} microphones at "
+            f"{scene_rate} Hz; replace the files"
         )
-    return waveform.expand(2, -1)
+    return signals, reference
+
+
+def _check_output(path: Path, rate: int) -> None:
+    """Raise ValueError unless an existing output has two channels at a rate in Hz."""
+    waveform, file_rate = read_audio(path)
+    if file_rate != rate or len(waveform) != 2:
+        raise ValueError(
+            f"{path}: expected 2 channels at the rate of the first scene, {rate} Hz, got "
+            f"{len(waveform)} at {file_rate} Hz; replace the file"
+        )

@@ -75,6 +75,9 @@ def test_clean_speech_of_clarity_has_its_level_in_the_room(tmp_path: Path) -> No
     both = (tmp_path / "S1_mix_CH3.wav", *microphones)
     clean, _, _ = SceneFiles(tmp_path / "S1_target_anechoic_CH1.wav", both, (1, 2)).read()
     torch.testing.assert_close(clean, 0.2 * channels, atol=1e-4, rtol=0.0)
+    write_audio(tmp_path / "S1_target_CH3.wav", channels[:, : RATE // 2], RATE)
+    with pytest.raises(ValueError, match=r"target_CH3\.wav with 16000 Hz and 8000 samples"):
+        SceneFiles(tmp_path / "S1_target_anechoic_CH1.wav", both, (1, 2)).read()
 
 
 def test_clips_of_scenes_have_clean_speech(tmp_path: Path, row: Utterance) -> None:

@@ -272,7 +272,7 @@ def test_lengths_may_differ_by_a_tenth_of_a_second(clarity: Path, tmp_path: Path
     output = soundfile.info(tmp_path / "signals" / "mine" / "S06001_L0001_HA-output.wav")
     assert study.failures.empty and output.frames == LOW_RATE
     change_length("target", -8000)
-    with pytest.raises(ValueError, match=r"target_CH1\.wav 8000"):
+    with pytest.raises(ValueError, match=r"target_CH1\.wav with 16000 Hz and 8000"):
         evaluate_scenes({}, **settings)
 
 
@@ -336,6 +336,13 @@ def test_three_microphones_are_averaged_or_handed_to_an_aid(clarity: Path, tmp_p
         assert np.allclose(written, expected, atol=1e-6), name
     written, _ = soundfile.read(tmp_path / "signals" / "trained" / "S06001_L0001_HA-output.wav")
     assert written.shape == mix.shape and written.any()
+    write(scenes / "S06002_mix_CH3.wav", np.concatenate((mix, mix), 1))
+    with pytest.raises(ValueError, match="got 8 channels for 3 microphones at 16000 Hz"):
+        evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
+    for path in scenes.glob("S06002_*.wav"):
+        write(path, soundfile.read(path)[0], 2 * LOW_RATE)
+    with pytest.raises(ValueError, match=r"first scene, 16000 Hz, .* at 32000 Hz"):
+        evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
     (scenes / "S06002_mix_CH3.wav").unlink()
     with pytest.raises(ValueError, match=r"S06002_mix_CH3\.wav: there is no such audio file"):
         evaluate_scenes(aids, microphones=[1, 2, 3], **settings)
