@@ -380,6 +380,29 @@ def pair_items(
     return batch, flatten_items(waveform, batch, dtype), flatten_items(ears, batch, dtype)
 
 
+class DifferentiableFunction(torch.autograd.Function):
+    """Base class of functions with a hand-written backward pass, whose ``forward`` has no context.
+
+    torch's ``apply`` prepares for a backward pass even where gradients are disabled, which takes
+    0.1 ms, as long as a Fourier transform of some thousand samples. Then only ``forward`` is called
+    here.
+
+    >>> class Double(DifferentiableFunction):
+    ...     @staticmethod
+    ...     def forward(values):
+    ...         return 2.0 * values
+    >>> with torch.no_grad():
+    ...     Double.apply(torch.ones(2))
+    tensor([2., 2.])
+    """
+
+    @classmethod
+    def apply(cls, *arguments: Any) -> Any:
+        if torch.is_grad_enabled():
+            return super().apply(*arguments)
+        return cls.forward(*arguments)
+
+
 def differentiable_once(gradient: Tensor, message: str) -> Tensor:
     """Return a gradient that raises an error if it is itself differentiated.
 

@@ -111,3 +111,34 @@ def test_constants_of_inference_mode_or_a_transform_serve_gradients_later(
 
 def test_no_arguments_have_no_results() -> None:
     assert torchtools.map_on_cores(abs, [], torch.zeros(1)) == []
+
+
+class Double(torchtools.DifferentiableFunction):
+    """Multiplies by 2, and counts how often torch prepares a backward pass."""
+
+    preparations = 0
+
+    @staticmethod
+    def forward(values: Tensor) -> Tensor:
+        return 2.0 * values
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        Double.preparations += 1
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return 2.0 * gradient
+
+
+def test_functions_prepare_a_backward_pass_only_where_gradients_are_enabled() -> None:
+    leaf = torch.ones(2, requires_grad=True)
+    with torch.no_grad():
+        assert Double.apply(leaf).tolist() == [2.0, 2.0]
+    with torch.inference_mode():
+        assert Double.apply(leaf).tolist() == [2.0, 2.0]
+    assert Double.preparations == 0
+    Double.apply(leaf).sum().backward()
+    assert Double.preparations == 1
+    assert leaf.grad is not None and leaf.grad.tolist() == [2.0, 2.0]
+    assert grad(lambda values: Double.apply(values).sum())(torch.ones(2)).tolist() == [2.0, 2.0]

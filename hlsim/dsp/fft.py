@@ -8,6 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.torchtools import DifferentiableFunction
+
 FADE_HZ = 80.0
 """Width in Hz of the fade-out at the end of a spectrum that is cut off."""
 
@@ -43,7 +45,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
     return _RFFT.apply(signals[..., :points], points)
 
 
-class _RFFT(torch.autograd.Function):
+class _RFFT(DifferentiableFunction):
     """Real Fourier transform with a hand-written backward pass, which is also a real transform.
 
     Autograd's backward pass of ``torch.fft.rfft`` is a complex transform, which takes about twice
@@ -136,7 +138,7 @@ def power(spectrum: Tensor) -> Tensor:
     return _Power.apply(spectrum)
 
 
-class _Power(torch.autograd.Function):
+class _Power(DifferentiableFunction):
     """Squared modulus of complex numbers, with a hand-written backward pass.
 
     The gradient with respect to x is 2 x times that of the result. Autograd's pass takes more

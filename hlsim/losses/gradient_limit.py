@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.torchtools import differentiable_once, silence_after
+from hlsim.torchtools import DifferentiableFunction, differentiable_once, silence_after
 
 MAX_GRADIENT_RATIO = 6.0
 """Largest gradient of a block, as a multiple of the usual magnitude of the item's gradients.
@@ -58,7 +58,7 @@ def limit_gradient_spikes(
     return _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
 
 
-class _GradientLimiter(torch.autograd.Function):
+class _GradientLimiter(DifferentiableFunction):
     """Identity whose gradient is limited, as ``limit_gradient_spikes`` describes."""
 
     @staticmethod

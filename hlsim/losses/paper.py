@@ -24,6 +24,7 @@ from torch import Tensor
 
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
+from hlsim.torchtools import DifferentiableFunction
 
 PAPER_STFT = STFT(400, 400, 100)
 """The paper's short-time Fourier transform at 16 kHz: 201 frequencies, every 100 samples."""
@@ -118,7 +119,7 @@ def _magnitude(spectrum: Tensor) -> Tensor:
     return (power(spectrum) + POWER_FLOOR).sqrt()
 
 
-class _FadedPhaseDifference(torch.autograd.Function):
+class _FadedPhaseDifference(DifferentiableFunction):
     """Phase of the target minus that of the estimate, as the angle of one complex product.
 
     The gradient of the angle of z is i z / |z|^2. Here it is faded out near silence: multiplied by

@@ -23,7 +23,7 @@ from hlsim.dsp.fft import power, rfft
 from hlsim.dsp.iir import ELLIPTIC, coefficients, digital_filter
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filter_bank import FilterBank
-from hlsim.torchtools import constant
+from hlsim.torchtools import DifferentiableFunction, constant
 
 STEP = 24
 """Number of samples at 44.1 kHz from one value of an envelope, and of a gain, to the next."""
@@ -85,7 +85,7 @@ def _modulus_with_harmonics(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return modulus * shape, modulus, squared_cosine
 
 
-class _ModulusWithHarmonics(torch.autograd.Function):
+class _ModulusWithHarmonics(DifferentiableFunction):
     """``_modulus_with_harmonics`` with a hand-written backward pass, in half of autograd's time.
 
     Let r be the modulus of the signal x + i y, c = x^2 / r^2 the squared cosine of its phase, and

@@ -19,7 +19,7 @@ from torch.nn import functional
 from hlsim.dsp.erb import ERB_AT_0_HZ, erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.torchtools import constant
+from hlsim.torchtools import DifferentiableFunction, constant
 
 FRAME = 256
 """Length of a frame in samples at 44.1 kHz."""
@@ -203,16 +203,16 @@ def _smear_spectrum(
     """
     spectrum_power = power(spectrum)
     smeared_power = (spectrum_power @ matrix.mT).add_(_POWER_FLOOR)
-    spectrum_power = spectrum_power + _POWER_FLOOR
+    spectrum_power.add_(_POWER_FLOOR)
     ratio = smeared_power / spectrum_power
     # The square root of a negative ratio is imaginary.
     real = ratio.clamp(_MIN_POWER_RATIO, _MAX_POWER_RATIO).sqrt_()
     imaginary = ratio.neg().clamp_(_MIN_POWER_RATIO, _MAX_POWER_RATIO).sqrt_()
-    factor = torch.complex(real, imaginary)
-    return spectrum * factor, smeared_power, real, imaginary, spectrum_power
+    smeared_spectrum = torch.complex(real, imaginary).mul_(spectrum)
+    return smeared_spectrum, smeared_power, real, imaginary, spectrum_power
 
 
-class _SmearSpectrum(torch.autograd.Function):
+class _SmearSpectrum(DifferentiableFunction):
     """``_smear_spectrum`` with a hand-written backward pass, in two thirds of autograd's time.
 
     Let x be the spectrum, p = |x|^2 its power, A the matrix, s = A p the smeared power, f the

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.neuro.encoder import DenseBlock
+from hlsim.torchtools import DifferentiableFunction
 
 EPS_SQUARE = 1e-8
 """Smallest squared modulus by which ``phase_factor`` divides."""
@@ -81,7 +82,7 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
     return _PhaseFactor.apply(log_gain, *maps.to(log_gain.dtype).unbind(1))
 
 
-class _PhaseFactor(torch.autograd.Function):
+class _PhaseFactor(DifferentiableFunction):
     """The function exp(a) z / |z| of z = 1 + x + j y, with a hand-written backward pass.
 
     The backward pass takes half of autograd's time. Let f be the result, g the gradient with

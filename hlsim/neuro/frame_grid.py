@@ -24,7 +24,7 @@ from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filter_bank import BANKS, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.msbg.response import half_length, impulse_responses
-from hlsim.torchtools import constant
+from hlsim.torchtools import DifferentiableFunction, constant
 
 FRAME_RATE = MSBG_RATE * 3 / 8
 """Sample rate in Hz of signals that are cut into MSBG's frames, 16537.5 Hz."""
@@ -167,7 +167,7 @@ def synthesise_frames(real: Tensor, imaginary: Tensor, length: int) -> Tensor:
     return _Synthesis.apply(real, imaginary, _synthesis_matrices(like=real), length)
 
 
-class _Analysis(torch.autograd.Function):
+class _Analysis(DifferentiableFunction):
     """Spectra of frames by products with matrices, and their gradient by ``_Synthesis``.
 
     The samples of a frame lie symmetrically about its middle, so that its even part has a real
@@ -203,7 +203,7 @@ class _Analysis(torch.autograd.Function):
         return _Synthesis.apply(real, imaginary, matrices.mT, ctx.time), None
 
 
-class _Synthesis(torch.autograd.Function):
+class _Synthesis(DifferentiableFunction):
     """Signals from the spectra of their frames, by products with matrices, and their gradient.
 
     The matrices give the even and the odd part of each frame, and overlapping frames are added up.

@@ -16,6 +16,8 @@ from torch import Tensor
 from torch.linalg import vecdot
 from torch.nn import functional
 
+from hlsim.torchtools import DifferentiableFunction
+
 _STATES_AT_ONCE_CPU = 2**18
 """Number of states computed at once on a CPU, few enough for the cache of a core."""
 
@@ -111,7 +113,7 @@ def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Ten
     return decay, drive, states
 
 
-class _SelectiveScan(torch.autograd.Function):
+class _SelectiveScan(DifferentiableFunction):
     """The product C[t] h[t] of ``selective_scan``, whose gradient computes the states h again.
 
     The step sizes ``delta`` are those after the softplus. Channels are the last dimension, so that
@@ -138,7 +140,7 @@ class _SelectiveScan(torch.autograd.Function):
         return _ScanGradient.apply(gradient, *ctx.saved_tensors)
 
 
-class _ScanGradient(torch.autograd.Function):
+class _ScanGradient(DifferentiableFunction):
     """Gradients of the selective scan, which raise an error if they are differentiated.
 
     With ``once_differentiable`` instead, ``torch.autograd.grad`` for a subset of the inputs would
