@@ -185,8 +185,8 @@ def draw_scenes(
 
     Raises:
         MissingExtraError: There are rooms, and pyroomacoustics is not installed.
-        ValueError: There is only one item, which would be its own masker, the reverberation time is
-            out of range, or ``make_scene`` rejects a signal.
+        ValueError: There is only one item, which would be its own masker, the shapes do not fit
+            together, a number is out of range, or ``make_scene`` rejects a signal.
 
     >>> voices = torch.randn(2, 8000)
     >>> scenes = draw_scenes(voices, voices, None, torch.zeros(2), torch.Generator())
@@ -199,7 +199,14 @@ def draw_scenes(
 
     if reverberation_time != 0.0:
         check_number("reverberation_time", reverberation_time, *REVERBERATION_TIMES)
+    check_number("mismatch", mismatch, 0.0)
     count = len(targets)
+    shapes = [tuple(signals.shape) for signals in (targets, voices, noise) if signals is not None]
+    if len({*shapes}) > 1 or snr.shape != (count,):
+        raise ValueError(
+            "expected targets, voices and noise of one shape (items, time), and one SNR per item, "
+            f"got the shapes {', '.join(map(str, shapes))} and {tuple(snr.shape)}"
+        )
     if count < 2:
         raise ValueError(
             f"expected two or more items, because each voice masks that of another, got {count}"

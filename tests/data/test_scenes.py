@@ -119,6 +119,15 @@ def test_wrong_arguments_raise_errors(speech: Tensor, noise: Tensor) -> None:
         make_scene(speech, diffuse=noise, snr=float("nan"))
 
 
+def test_wrong_arguments_of_random_scenes_raise_errors() -> None:
+    voices = torch.randn(2, 8000)
+    for other, ratios in ((voices[:1], torch.zeros(2)), (voices, torch.zeros(1))):
+        with pytest.raises(ValueError, match="one SNR per item, got the shapes"):
+            draw_scenes(voices, other, None, ratios, torch.Generator())
+    with pytest.raises(ValueError, match="mismatch"):
+        draw_scenes(voices, voices, None, torch.zeros(2), torch.Generator(), mismatch=float("nan"))
+
+
 def test_a_scene_needs_another_voice() -> None:
     voices = torch.randn(1, 8000)
     with pytest.raises(ValueError, match="expected two or more items"):

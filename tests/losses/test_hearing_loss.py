@@ -413,6 +413,20 @@ def test_simulator_has_a_normal_ear(clean: Tensor) -> None:
     assert float(loss(clean, clean)) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_normal_ear_that_changes_its_argument_leaves_clean_speech_as_it_is(clean: Tensor) -> None:
+    speech = clean.clone()
+    values = [
+        HearingLossLoss(
+            N3,
+            simulator="attenuation",
+            normal=normal,
+            criterion={"coherent-bands": 1.0, "bands": 1.0},
+        )(2.0 * clean, speech)
+        for normal in (lambda waveform: 0.5 * waveform, lambda waveform: waveform.mul_(0.5))
+    ]
+    assert torch.equal(*values) and torch.equal(speech, clean)
+
+
 # Orders of degradations
 
 
