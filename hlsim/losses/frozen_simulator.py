@@ -165,7 +165,7 @@ class FrozenSimulator:
         is_normal = (self.choice if is_chosen else reference.signal) == "normal-hearing"
         target = self._limit_band(clean)
         if is_normal and self.normal is not None:
-            # A function that changes its argument in place must not change the speech of the caller.
+            # A function that changes its argument in place must not change the caller's speech.
             target = check_shape(self.normal(target.clone()), "normal ear", target.shape)
         elif is_normal and self._has_bank_phase and reference.normal_ear == "filter":
             return simulate_normal_ear(target, thresholds, self.sample_rate).expand(shape)
