@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -133,7 +134,7 @@ def _process(
                 if source == options.input:
                     raise
                 text = f"{source}: not processed: {error}"
-                if target.exists():
+                if os.path.exists(target):  # False also for a name that is too long
                     text += f"; {target} is the output of an earlier run"
                 progress.print(f"hlsim: warning: {text}", sys.stderr)
                 failures += 1

@@ -402,6 +402,18 @@ def test_every_command_warns_of_a_compensator_for_another_ear(
     assert capsys.readouterr().err.count("was trained for one ear") == 1
 
 
+def test_a_name_that_is_too_long_with_that_of_its_ear_is_a_warning(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    for stem in ("a", "x" * 250):
+        (tmp_path / "in" / f"{stem}.wav").write_bytes(utterance.read_bytes())
+    ears = ("--audiogram", "N2", "--audiogram", "500:40")
+    call = ("compensate", tmp_path / "in", tmp_path / "out", *ears, "--compensator", "nalr")
+    assert run(*call) == 2
+    assert "2 of 4 outputs failed" in capsys.readouterr().err
+
+
 def test_folders_keep_their_tree_and_bad_files_are_reported(
     tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
