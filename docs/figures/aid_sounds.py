@@ -3,7 +3,8 @@
     python docs/figures/aid_sounds.py [--loudness -10]
 
 - Steady tones of 0.25 to 4 kHz at 50, 65 and 80 dB SPL: the level that the ear perceives, minus
-  that which a normal ear perceives.
+  that which a normal ear perceives. In parentheses, the same as a difference of the output in dB:
+  in an ear with recruitment, the perceived level changes by several dB for one dB of output.
 - Ten everyday sounds and music at natural levels, all of them synthetic: in how many of its main
   third octaves the ear hears the sound. They are those within 20 dB of the loudest that a normal
   ear hears, and in which the loss is below 80 dB HL. A third octave is heard if its level, the 95th
@@ -33,6 +34,8 @@ LEVELS = (50.0, 65.0, 80.0)
 HIGHEST_LOSS = 80.0
 MAIN_DB = 20.0
 PERCENTILE = 0.95
+LOUDER_DB = 0.5
+LOUDER = 10.0 ** (LOUDER_DB / 20.0)
 BANDS = SII_BANDS[:-1]  # the last one ends above 8 kHz
 
 
@@ -103,9 +106,15 @@ def main() -> None:
     for name in EARS:
         ear = Audiogram.standard(name)
         tones = measure_steady_tones(aid, ear, LEVELS)
+        louder = measure_steady_tones(lambda x, ear: LOUDER * aid(x, ear), ear, LEVELS)
         print(f"{name}: tones of {tones['frequencies']} Hz")
-        for level, errors in zip(LEVELS, tones["loudness_error_db"], strict=True):
-            print(f"  {level:g} dB SPL: {', '.join(f'{error:+.1f}' for error in errors)}")
+        rows = zip(LEVELS, tones["loudness_error_db"], louder["loudness_error_db"], strict=True)
+        for level, errors, louder_errors in rows:
+            cells = [
+                f"{error:+.1f} ({error * LOUDER_DB / (louder_error - error):+.1f})"
+                for error, louder_error in zip(errors, louder_errors, strict=True)
+            ]
+            print(f"  {level:g} dB SPL: {', '.join(cells)}")
         threshold = compute_threshold(ear)
         for sound_name, sound in sounds.items():
             levels = measure_levels(sound)
