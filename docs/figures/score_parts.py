@@ -131,9 +131,8 @@ def main(rounds: str = "10") -> None:
     scores = profile_pairs(int(rounds))
     for name, part in PAIR_PARTS.items():
         print("|", part, "|", " | ".join(f"{100.0 * shares[name]:.0f}" for shares in scores), "|")
-    print(
-        "\n| times pyclarity's speed | 1.5 s | 3 s | 3 s, if noise took no time |\n|---|---|---|---|"
-    )
+    print("\n| times pyclarity's speed | 1.5 s | 3 s | 3 s, if noise took no time |")
+    print("|---|---|---|---|")
     for name, shares in zip(SCORES, scores, strict=True):
         columns = []
         for seconds in PAIR_SECONDS:
