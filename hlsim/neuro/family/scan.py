@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 from torch.nn import functional
 
-from hlsim.torchtools import DifferentiableFunction
+from hlsim.torchtools import DifferentiableFunction, differentiable_once
 
 _STATES_AT_ONCE_CPU = 2**18
 """Number of states computed at once on a CPU, few enough for the cache of a core."""
@@ -137,20 +137,7 @@ class _SelectiveScan(DifferentiableFunction):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        return _ScanGradient.apply(gradient, *ctx.saved_tensors)
-
-
-class _ScanGradient(DifferentiableFunction):
-    """Gradients of the selective scan, which raise an error if they are differentiated.
-
-    With ``once_differentiable`` instead, ``torch.autograd.grad`` for a subset of the inputs would
-    ignore the second derivative without an error. Shapes are those of ``_SelectiveScan``.
-    """
-
-    @staticmethod
-    def forward(
-        gradient: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
-    ) -> tuple[Tensor, ...]:
+        delta, u, B, C, A = ctx.saved_tensors
         grad_A = torch.zeros_like(A)
         gradients = []
         # The backward pass may run in a region of autocast.
@@ -175,17 +162,12 @@ class _ScanGradient(DifferentiableFunction):
                 # One sum over both dimensions of a slice takes 20 times as long as two sums.
                 grad_A += (grad_exponent * part_delta[:, 1:].unsqueeze(-2)).sum(1).sum(0)
                 gradients.append((grad_delta, grad_drive * part_delta, grad_B, grad_C))
-        return *(torch.cat(parts) for parts in zip(*gradients, strict=True)), grad_A
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
-        raise RuntimeError(
+        whole = [torch.cat(parts) for parts in zip(*gradients, strict=True)]
+        # The states are computed in place, which autograd could not differentiate.
+        message = (
             "the selective scan of mamba blocks has no second derivative; use cnn or lstm blocks"
         )
+        return tuple(differentiable_once(values, message) for values in (*whole, grad_A))
 
 
 def _parts(A: Tensor, *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
