@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from compensators import NALR
-from compensators.long_signals import process_blocks
-from compensators.wearable import Wearable
+from compensators.filter_bank import HOP, RATE
+from compensators.wearable import State, Wearable
 from hlsim.audio import AudioInfo, read_parts
 from hlsim.audiogram.listener import Listener
 from hlsim.audiogram.thresholds import check_two_channels
@@ -24,6 +24,12 @@ from hlsim.simulators import Attenuation
 
 _BLOCK_SECONDS = 8.0
 """Duration in seconds of the output of a block, and of the parts that ``read_all`` yields."""
+
+_MARGIN_SECONDS = 0.01
+"""Duration in seconds of one part of the context of a wearable aid's block, with two on each side.
+
+It covers the kernels of resampling (4.3 ms) and the delay of an aid (4 ms).
+"""
 
 
 class Meter:
@@ -102,7 +108,7 @@ def process_recording(
         return (part * gain for part in read_parts(recording, bounds))
 
     if isinstance(model, Wearable):
-        outputs = process_blocks(model, read, recording.samples, ears, **sliders)
+        outputs = _process_with_state(model, read, recording.samples, ears, sliders)
     else:
         blocks = divide_recording(model, recording.samples, recording.sample_rate)
         takes_microphones = getattr(model, "takes_microphones", False)
@@ -112,6 +118,49 @@ def process_recording(
             for block, part in zip(blocks, read(blocks), strict=True)
         )
     return (output / gain for output in outputs)
+
+
+def _process_with_state(
+    aid: Wearable,
+    read: Callable[[Sequence[Block]], Iterable[Tensor]],
+    samples: int,
+    ears: Any,
+    sliders: dict[str, float],
+) -> Iterator[Tensor]:
+    """Yield the output of a wearable aid, whose blocks continue with the state of those before.
+
+    Args:
+        aid: Hearing aid at the sample rate of the recording.
+        read: Function from a list of blocks to an iterable of their inputs, (channels, time).
+        samples: Length of the recording in samples.
+        ears: Audiogram, or listener for a stereo recording.
+        sliders: Value from 0 to 1 under each slider's name.
+
+    Yields:
+        Consecutive parts of the output, (channels, time).
+    """
+    rate = aid.sample_rate
+    # the smallest number of samples that lasts a whole number of hops and of samples at 16 kHz
+    unit = math.lcm(HOP, RATE // math.gcd(rate, RATE)) * rate // RATE
+    margin = math.ceil(_MARGIN_SECONDS * rate / unit) * unit
+    blocks = split_into_blocks(samples, round(_BLOCK_SECONDS * rate), 2 * margin, 2 * margin, unit)
+    state: State | None = None
+    # Where a block is cut, resampling lacks context. The aid starts one margin later, with the
+    # state that the block before had reached there.
+    starts = [0, *(block.input_start + margin for block in blocks[1:])]
+    for block, part, start, next_start in zip(
+        blocks, read(blocks), starts, [*starts[1:], None], strict=True
+    ):
+        output, state = aid.process_block(
+            part,
+            ears,
+            sliders,
+            state,
+            lead=start - block.input_start,
+            lag=margin if next_start else 0,
+            state_time=(next_start - start) * RATE // (rate * HOP) * HOP if next_start else None,
+        )
+        yield output[..., block.output_start - start : block.output_stop - start]
 
 
 def _process_microphones(

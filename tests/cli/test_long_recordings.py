@@ -16,7 +16,7 @@ from hlsim.cli.long_recordings import divide_recording, process_recording
 from hlsim.dsp.resample import resample
 from hlsim.simulators import load_simulator
 
-BLOCKS = ("hlsim.cli.long_recordings", "compensators.long_signals", "hlsim.msbg.overlapping_blocks")
+BLOCKS = ("hlsim.cli.long_recordings", "hlsim.msbg.overlapping_blocks")
 """Modules that define the duration of their blocks."""
 
 
