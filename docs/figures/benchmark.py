@@ -4,6 +4,7 @@
     python docs/figures/benchmark.py --what simulators --simulators neuro-msbg runs/mine/checkpoint
     OMP_NUM_THREADS=1 python docs/figures/benchmark.py --what loss step --seconds 2 --batch 8
     OMP_NUM_THREADS=1 python docs/figures/benchmark.py --processor-time  # on a busy machine
+    OMP_NUM_THREADS=1 python docs/figures/benchmark.py --what parts  # of the exact MSBG
 
 Every round times all rows of a table in turn, so that a ratio compares calls within seconds of each
 other. The first round is not counted. Tables show the median (minimum to maximum) of the other
@@ -11,7 +12,9 @@ rounds.
 """
 
 import argparse
+import cProfile
 import logging
+import pstats
 import statistics
 import time
 from collections.abc import Callable
@@ -30,6 +33,7 @@ EAR = Audiogram.standard("N2")
 FULL_SCALE_SPL = 94.0
 SHIPPED = [name for name in list_pretrained() if name.startswith("neuro-")]
 LOSS_SIMULATORS = ("neuro-msbg", "msbg")
+SHORT_SECONDS = 0.02  # so short that only the cost of calling torch's operations remains
 PYCLARITY_RATE = 44100  # Hz, the only rate of pyclarity's MSBG
 
 
@@ -169,6 +173,49 @@ TABLES = {
 }
 
 
+def print_parts(options: argparse.Namespace) -> None:
+    """Print which parts of the exact MSBG's processor time do not depend on how it is written.
+
+    They are the Fourier transforms, and the cost of calling all operations, which is the time for a
+    very short signal. The last column has the ratio to pyclarity's time if nothing else took time.
+    """
+    calls: dict[str, Callable[[], Tensor]] = {}
+    for rate in (PYCLARITY_RATE, 16000):
+        model = MSBG(EAR, sample_rate=rate)
+        signal = noise_like_speech(rate, options.seconds, options.batch)
+        short = noise_like_speech(rate, SHORT_SECONDS, 1)
+        calls[f"{rate} Hz"] = lambda m=model, x=signal: m(x)
+        calls[f"{rate} Hz, short"] = lambda m=model, x=short: m(x)
+        if rate == PYCLARITY_RATE:
+            calls["Ear"] = pyclarity_simulator_rows(signal, "", "cpu")[0].call
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    transforms: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(options.repeats + 1):
+        for name, call in calls.items():
+            times[name].append(time_call(Row(name, call, ""), False, "cpu", time.process_time))
+            run = cProfile.Profile(time.process_time)
+            with torch.inference_mode():
+                run.runcall(call)
+            seconds = [
+                own_time
+                for (_, _, function), (_, _, own_time, _, _) in pstats.Stats(run).stats.items()
+                if "torch._C._fft" in function
+            ]
+            transforms[name].append(1000.0 * sum(seconds))
+    median = {name: statistics.median(values[1:]) for name, values in times.items()}
+    print(
+        "\n| exact MSBG, processor time | all (ms) | transforms (ms) | short signal (ms) |", end=""
+    )
+    print(" times Ear's speed | if nothing else took time |\n|---|---|---|---|---|---|")
+    for name in (f"{PYCLARITY_RATE} Hz", "16000 Hz"):
+        transform = statistics.median(transforms[name][1:])
+        short_call = median[f"{name}, short"]
+        bound = transform + short_call - statistics.median(transforms[f"{name}, short"][1:])
+        columns = [median[name], transform, short_call]
+        columns += [median["Ear"] / duration for duration in (median[name], bound)]
+        print(f"| {name} | {' | '.join(f'{value:.1f}' for value in columns)} |")
+
+
 def time_call(row: Row, backward: bool, device: str, clock: Callable[[], float]) -> float:
     """Measure the milliseconds of a call, forward alone or with the backward pass."""
     start = clock()
@@ -218,7 +265,11 @@ def summarise(values: list[float]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
-        "--what", nargs="+", choices=TABLES, default=[*TABLES], help="tables to print"
+        "--what",
+        nargs="+",
+        choices=(*TABLES, "parts"),
+        default=[*TABLES],
+        help="tables to print",
     )
     parser.add_argument(
         "--simulators", nargs="+", metavar="NAME", help="checkpoints by name or folder"
@@ -241,6 +292,9 @@ def main(arguments: list[str] | None = None) -> None:
         f"{options.repeats} rounds"
     )
     for name in options.what:
+        if name == "parts":
+            print_parts(options)
+            continue
         print_table(name, TABLES[name](options), options.repeats, options.device, clock)
 
 
