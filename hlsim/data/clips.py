@@ -140,7 +140,7 @@ class Clips:
         recording = self.read_recording(index)
         time = recording.shape[-1]
         if self.repeat and time < self.samples:
-            recording = torch.cat([recording] * math.ceil(self.samples / time), -1)
+            recording = recording.tile(math.ceil(self.samples / time))  # along the last dimension
         start = int(position * max(0, recording.shape[-1] - self.samples))
         clip = recording[..., start : start + self.samples]
         return torch.nn.functional.pad(clip, (0, self.samples - clip.shape[-1]))
