@@ -74,6 +74,9 @@ class _RFFT(DifferentiableFunction):
         return slope[..., : ctx.time], None
 
 
+_ODD_FACTORS = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(2)]
+
+
 @lru_cache(maxsize=256)
 def fft_length(minimum: int, multiple: int = 1) -> int:
     """Return the smallest length from ``minimum`` on for which Fourier transforms are fast.
@@ -89,13 +92,13 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
     1008
     """
     twos_in_multiple = multiple & -multiple
-    odd_factors = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(2)]
     lengths = []
-    for odd in odd_factors:
-        for exponent in range(9):
-            if exponent == 0 or twos_in_multiple << exponent <= MAX_POWER_OF_TWO:
-                lengths.append(multiple * odd * 2**exponent)
-    return min(length for length in lengths if length >= minimum)
+    for odd in _ODD_FACTORS:
+        quotient = max(1, -(-minimum // (multiple * odd)))  # rounded up
+        exponent = (quotient - 1).bit_length()  # of the smallest power of two from quotient on
+        if exponent == 0 or (exponent < 9 and twos_in_multiple << exponent <= MAX_POWER_OF_TWO):
+            lengths.append(multiple * odd << exponent)
+    return min(lengths)
 
 
 def correlate(output: Tensor, reference: Tensor) -> tuple[int, float]:

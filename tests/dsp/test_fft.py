@@ -6,7 +6,7 @@ import torch
 from scipy import signal
 from torch import Tensor
 
-from hlsim.dsp.fft import correlate, power, rfft
+from hlsim.dsp.fft import MAX_POWER_OF_TWO, correlate, fft_length, power, rfft
 
 
 def assert_equal_gradients(ours: Tensor, theirs: Tensor, source: Tensor) -> None:
@@ -21,6 +21,15 @@ def assert_equal_gradients(ours: Tensor, theirs: Tensor, source: Tensor) -> None
 def test_rfft_and_its_gradient_equal_those_of_torch(points: int, excess: int) -> None:
     wave = torch.randn(3, max(1, points + excess), dtype=torch.float64, requires_grad=True)
     assert_equal_gradients(rfft(wave, points), torch.fft.rfft(wave, points), wave)
+
+
+@pytest.mark.parametrize("multiple", [1, 6, 256])
+def test_the_fast_length_is_the_smallest_of_all_from_a_minimum_on(multiple: int) -> None:
+    odd = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(2)]
+    twos = [2**a for a in range(9) if a == 0 or (multiple & -multiple) * 2**a <= MAX_POWER_OF_TWO]
+    lengths = np.unique(multiple * np.outer(odd, twos))
+    for minimum in (1, multiple + 1, 1001, 3100 * multiple, 1_000_003):
+        assert fft_length(minimum, multiple) == lengths[lengths >= minimum][0]
 
 
 def test_power_and_its_gradient_equal_the_squared_modulus() -> None:
