@@ -2,7 +2,7 @@
 
 Trainings take two steps, and studies two items of one second. The bundled speech is two seconds of
 four utterances, the properties of aids are measured with one of them, one tone and one position,
-and evaluations have quick scores.
+and evaluations have quick scores and no pictures.
 """
 
 import csv
@@ -207,6 +207,8 @@ def test_commands_and_programs_of_a_page_run(
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.syspath_prepend(ROOT)
     measure_aids_briefly(monkeypatch)
+    # tests/report and those of the commands draw pictures
+    monkeypatch.setattr("hlsim.report.plots._draw_svg", lambda *_: b"<svg></svg>")
     _write_corpus(tmp_path)
     names: dict[str, object] = {}  # each program goes on from the one before it
     for kind, text in _read_steps(page):
