@@ -62,7 +62,7 @@ def audible_share(gains: NDArray[np.float64], loss: NDArray[np.float64]) -> NDAr
     """
     # An ear that attenuates by the loss is a normal ear with softer sounds.
     perceived = speech_spectrum() + gains - loss
-    quiet = np.full(len(heard), SILENCE)
+    quiet = np.full(len(perceived), SILENCE)
     return np.array([sii(perceived, quiet if snr is None else perceived - snr) for snr in SNRS])
 
 
