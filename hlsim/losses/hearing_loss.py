@@ -216,7 +216,8 @@ class HearingLossLoss(StoredEars, nn.Module):
                 accepted, too. A ``Listener`` goes with (..., 2, time), left first.
             lengths: Number of samples of each item of a padded batch, (...). Samples after the end
                 of an item are ignored, so that its value is the one that it has alone (within 1e-4
-                for the exact MSBG, which simulates the padded batch at once).
+                for the exact MSBG, which simulates the padded batch at once, and within 1e-2 for
+                ``"paper"``, whose phase counts faint frequencies with their rounding errors).
 
         Shape: (..., time) twice -> (), or with ``reduction="none"`` the leading dimensions. With
             ``ears="better"`` the result has no dimension of ears.
