@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from compensators import NALR
@@ -12,7 +12,6 @@ from compensators.filter_bank import HOP, RATE
 from compensators.wearable import State, Wearable
 from hlsim.audio import AudioInfo, read_parts
 from hlsim.audiogram.listener import Listener
-from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.calibration import NEURO_RATE
 from hlsim.dsp.overlap import Block, split_into_blocks
 from hlsim.dsp.resample import ROLLOFF, ZERO_CROSSINGS
@@ -111,10 +110,11 @@ def process_recording(
         outputs = _process_with_state(model, read, recording.samples, ears, sliders)
     else:
         blocks = divide_recording(model, recording.samples, recording.sample_rate)
-        takes_microphones = getattr(model, "takes_microphones", False)
-        process = _process_microphones if takes_microphones else _process_channels
+        process: Callable[..., Tensor] = model
+        if getattr(model, "takes_microphones", False):
+            process = partial(_process_microphones, model)
         outputs = (
-            block.cut_output(process(model, part, ears, sliders))
+            block.cut_output(process(part, ears, **sliders))
             for block, part in zip(blocks, read(blocks), strict=True)
         )
     return (output / gain for output in outputs)
@@ -163,9 +163,7 @@ def _process_with_state(
         yield output[..., block.output_start - start : block.output_stop - start]
 
 
-def _process_microphones(
-    model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]
-) -> Tensor:
+def _process_microphones(aid: Any, part: Tensor, ears: Any, **sliders: float) -> Tensor:
     """Return the output of a model whose microphones are the channels of a recording.
 
     For an aid of two ears, the channels are left and right in turn, from front to rear; for an aid
@@ -177,7 +175,6 @@ def _process_microphones(
         ValueError: The number of channels is not that of the aid's microphones, or an aid of one
             ear gets a listener.
     """
-    aid: Any = model
     if aid.ears == 1 and isinstance(ears, Listener):
         raise ValueError(
             "the aid has microphones at one ear, got a listener with two ears (--listener); pass "
@@ -186,28 +183,6 @@ def _process_microphones(
     signals = part if aid.ears == 1 or len(part) % 2 else part.unflatten(0, (-1, 2))
     output: Tensor = aid(signals, ears, **sliders)
     return output.reshape(aid.ears, -1)
-
-
-def _process_channels(
-    model: nn.Module, part: Tensor, ears: Any, sliders: dict[str, float]
-) -> Tensor:
-    """Return the output of a model, channel by channel, as a model itself processes long signals.
-
-    A listener's left ear gets the first of two channels, and the right ear the second one.
-
-    Shape: (channels, time) -> (channels, time).
-
-    Raises:
-        ValueError: There is a listener, and the number of channels is not 2.
-    """
-    ears_of_channels = [ears] * len(part)
-    if isinstance(ears, Listener):
-        check_two_channels(part)
-        ears_of_channels = [*ears.ears().values()]
-    outputs = [
-        model(channel, ear, **sliders) for channel, ear in zip(part, ears_of_channels, strict=True)
-    ]
-    return torch.stack(outputs)
 
 
 def read_all(recording: AudioInfo) -> Iterator[Tensor]:
