@@ -1,10 +1,13 @@
 """Noisy speech at a signal-to-noise ratio."""
 
+import math
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from hlsim.calibration import HIGHEST_SPL, NEURO_RATE, dbfs, set_level
-from hlsim.checks import check_finite, check_rate, check_waveform
+from hlsim.checks import check_finite, check_number, check_rate, check_waveform
 from hlsim.dsp.active_level import active_level_db
 from hlsim.torchtools import Audio, Samples, as_samples, as_type_of
 
@@ -40,7 +43,8 @@ def mix(
     Raises:
         ValueError: The shapes, or that of the SNR, do not fit; a signal is not floating-point with
             time last; the noise is silent or shorter than the speech, samples are NaN or infinite,
-            the SNR is NaN or too low for any level of noise, or the sample rate is out of range.
+            the SNR is no number, or too low for any level of noise, or the sample rate is out of
+            range.
 
     Example:
         >>> import hlsim
@@ -51,6 +55,8 @@ def mix(
     """
     signal = check_waveform(as_samples(speech), "speech")
     masker = check_waveform(as_samples(noise), "noise")[..., : signal.shape[-1]].to(signal)
+    if not isinstance(snr, Tensor | np.ndarray | list) and snr != math.inf:
+        check_number("snr", snr, -math.inf)
     ratio = torch.as_tensor(snr, device=signal.device)
     if signal.ndim < 1 + channels:
         raise ValueError(
