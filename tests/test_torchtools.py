@@ -134,11 +134,11 @@ class Double(torchtools.DifferentiableFunction):
 def test_functions_prepare_a_backward_pass_only_where_gradients_are_enabled() -> None:
     leaf = torch.ones(2, requires_grad=True)
     with torch.no_grad():
-        assert Double.apply(leaf).tolist() == [2.0, 2.0]
+        assert Double.call(leaf).tolist() == [2.0, 2.0]
     with torch.inference_mode():
-        assert Double.apply(leaf).tolist() == [2.0, 2.0]
+        assert Double.call(leaf).tolist() == [2.0, 2.0]
     assert Double.preparations == 0
-    Double.apply(leaf).sum().backward()
+    Double.call(leaf).sum().backward()
     assert Double.preparations == 1
     assert leaf.grad is not None and leaf.grad.tolist() == [2.0, 2.0]
-    assert grad(lambda values: Double.apply(values).sum())(torch.ones(2)).tolist() == [2.0, 2.0]
+    assert grad(lambda values: Double.call(values).sum())(torch.ones(2)).tolist() == [2.0, 2.0]

@@ -42,7 +42,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
             ".float() and, for speed, use torch.autocast"
         )
     points = signals.shape[-1] if points is None else points
-    return _RFFT.apply(signals[..., :points], points)
+    return _RFFT.call(signals[..., :points], points)
 
 
 class _RFFT(DifferentiableFunction):
@@ -138,7 +138,7 @@ def power(spectrum: Tensor) -> Tensor:
     >>> power(torch.tensor([3.0 + 4.0j]))
     tensor([25.])
     """
-    return _Power.apply(spectrum)
+    return _Power.call(spectrum)
 
 
 class _Power(DifferentiableFunction):

@@ -55,7 +55,7 @@ def limit_gradient_spikes(
     >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
     True
     """
-    return _GradientLimiter.apply(output, round(LIMITER_SECONDS * sample_rate), lengths)
+    return _GradientLimiter.call(output, round(LIMITER_SECONDS * sample_rate), lengths)
 
 
 class _GradientLimiter(DifferentiableFunction):

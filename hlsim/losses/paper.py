@@ -62,7 +62,7 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
     >>> phase_loss(1j * spectrum, spectrum)  # a quarter of a turn
     tensor([1.5708])
     """
-    difference: Tensor = _FadedPhaseDifference.apply(estimate, target)
+    difference: Tensor = _FadedPhaseDifference.call(estimate, target)
     instantaneous = anti_wrap(difference).mean((-2, -1))
     group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
     total = instantaneous + group_delay

@@ -64,7 +64,7 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
     tensor([5.])
     """
     if harmonics:
-        return _ModulusWithHarmonics.apply(signals)[0]
+        return _ModulusWithHarmonics.call(signals)[0]
     # torch's modulus of complex numbers takes four times as long.
     return power(signals).add_(POWER_FLOOR).sqrt_()
 

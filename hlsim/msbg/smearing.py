@@ -177,7 +177,7 @@ def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
     count = math.ceil(waveform.shape[-1] / hop)
     window = _window(rate_divisor, like=waveform)
     frames = _cut_frames(waveform, count, hop, window)
-    spectrum, *_ = _SmearSpectrum.apply(rfft(frames)[..., : len(matrix)], matrix)
+    spectrum, *_ = _SmearSpectrum.call(rfft(frames)[..., : len(matrix)], matrix)
     half = len(window) // 2
     smeared_frames = torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
     return _overlap_add(smeared_frames, hop)

@@ -79,7 +79,7 @@ def phase_factor(maps: Tensor, log_gain: Tensor) -> Tensor:
     tensor(1.+0.j)
     """
     # Autocast may return maps of lower precision.
-    return _PhaseFactor.apply(log_gain, *maps.to(log_gain.dtype).unbind(1))
+    return _PhaseFactor.call(log_gain, *maps.to(log_gain.dtype).unbind(1))
 
 
 class _PhaseFactor(DifferentiableFunction):

@@ -147,7 +147,7 @@ def analyse_frames(waveform: Tensor) -> tuple[Tensor, Tensor]:
     >>> real.shape
     torch.Size([1, 13, 97])
     """
-    return _Analysis.apply(waveform, _analysis_matrices(like=waveform))
+    return _Analysis.call(waveform, _analysis_matrices(like=waveform))
 
 
 def synthesise_frames(real: Tensor, imaginary: Tensor, length: int) -> Tensor:
@@ -164,7 +164,7 @@ def synthesise_frames(real: Tensor, imaginary: Tensor, length: int) -> Tensor:
     >>> bool(torch.allclose(synthesise_frames(*analyse_frames(waveform), 240), waveform, atol=1e-5))
     True
     """
-    return _Synthesis.apply(real, imaginary, _synthesis_matrices(like=real), length)
+    return _Synthesis.call(real, imaginary, _synthesis_matrices(like=real), length)
 
 
 class _Analysis(DifferentiableFunction):
@@ -200,7 +200,7 @@ class _Analysis(DifferentiableFunction):
     @staticmethod
     def backward(ctx: Any, real: Tensor, imaginary: Tensor) -> tuple[Tensor, None]:
         (matrices,) = ctx.saved_tensors
-        return _Synthesis.apply(real, imaginary, matrices.mT, ctx.time), None
+        return _Synthesis.call(real, imaginary, matrices.mT, ctx.time), None
 
 
 class _Synthesis(DifferentiableFunction):
@@ -229,7 +229,7 @@ class _Synthesis(DifferentiableFunction):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:
         (matrices,) = ctx.saved_tensors
-        return *_Analysis.apply(gradient, matrices.mT), None, None
+        return *_Analysis.call(gradient, matrices.mT), None, None
 
 
 def _transform_units(time: int) -> int:

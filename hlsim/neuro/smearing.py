@@ -48,7 +48,7 @@ def power(real: Tensor, imaginary: Tensor) -> Tensor:
     >>> power(torch.tensor([3.0]), torch.tensor([4.0]))
     tensor([25.])
     """
-    return _Power.apply(real, imaginary)
+    return _Power.call(real, imaginary)
 
 
 class _Power(DifferentiableFunction):
@@ -101,7 +101,7 @@ def smear_and_amplify(
     inputs = (*spectrum, smeared_power, gains, *matrices)
     if torch.compiler.is_exporting():
         return _smear_differentiably(*inputs, step=step)
-    return _SmearAndAmplify.apply(*inputs, step)
+    return _SmearAndAmplify.call(*inputs, step)
 
 
 class _SmearAndAmplify(DifferentiableFunction):
