@@ -1,6 +1,7 @@
 """Loading of all simulators: MSBG, trained networks, a linear ear, and simulators of your own."""
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -42,6 +43,9 @@ _HALF_LENGTH_SECONDS = 0.064
 
 _MAX_DELAY_SECONDS = 2e-3
 """Largest delay in seconds of a plug-in that must be time-aligned."""
+
+_LARGEST_CHANGE = 0.01
+"""Change of a plug-in's output, relative to its RMS, from one call to an equal one."""
 
 _LOWEST_PLUGIN_RATE = 1000
 """Lowest sample rate of a plug-in in Hz."""
@@ -215,7 +219,8 @@ def check_aligned(
 ) -> None:
     """Call a plug-in, and reject an output that is delayed or advanced by more than 2 ms.
 
-    The delay is that at which the first channels of input and output correlate most.
+    The delay is that at which the first channels of input and output correlate most. A plug-in
+    whose second output for the same input differs by more than 1 % (-40 dB) causes a warning.
 
     Args:
         plugin: Simulator or enhancer.
@@ -240,6 +245,14 @@ def check_aligned(
         raise ValueError(
             f"{plugin.kind} {plugin.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
             "an output that is time-aligned with the input; shift the output in your code"
+        )
+    change = plugin(waveform, *arguments) - output
+    if float(change.norm()) > _LARGEST_CHANGE * float(output.norm()):
+        warnings.warn(
+            f"{plugin.kind} {plugin.name} returns another output if it is called again with the "
+            "same input, so that results depend on the order of the items and on the number of "
+            "processes; reset its state in each call, or seed its random numbers",
+            stacklevel=2,
         )
 
 

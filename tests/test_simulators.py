@@ -35,6 +35,12 @@ class Scaled:
 class Rateless(Scaled):
     full_scale_spl = 94.0
     sample_rate = None
+
+class Adapting:
+    calls = 0
+    def __call__(self, waveform, audiogram):
+        self.calls += 1
+        return waveform / self.calls
 """
 
 
@@ -93,6 +99,11 @@ def test_a_plug_in_is_the_ear_of_simulate(plugin: str) -> None:
 def test_invalid_plug_ins_are_rejected(plugin: str, name: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         load_simulator(f"{plugin}:{name}")
+
+
+def test_a_plug_in_that_keeps_a_state_causes_a_warning(plugin: str) -> None:
+    with pytest.warns(UserWarning, match=r"plugin\.py:Adapting returns another output"):
+        load_simulator(f"{plugin}:Adapting")
 
 
 @pytest.mark.parametrize("rate", [16000, 44100])
