@@ -92,8 +92,8 @@ class SceneFiles(NamedTuple):
         """Read the signals, with the reference microphone first.
 
         Samples have 1.0 as full scale. Files that differ by up to 0.1 s are cut to the shortest,
-        and clean speech with one channel is used for all ears. Anechoic clean speech of Clarity's
-        scenes gets the level of the target in the room if that file exists.
+        with a warning, and clean speech with one channel is used for all ears. Anechoic clean
+        speech of Clarity's scenes gets the level of the target in the room if that file exists.
 
         Returns:
             The clean speech, (ears, time), the signals of the microphones, (microphones, ears,
@@ -115,6 +115,12 @@ class SceneFiles(NamedTuple):
             raise ValueError(
                 f"{self.clean}: expected the sample rate of its noisy version and its length "
                 f"within {_LARGEST_DIFFERENCE:g} s, got {', '.join(sizes)}; replace the files"
+            )
+        if max(lengths) > time:
+            warnings.warn(
+                f"{self.clean}: the files of this scene have {time} to {max(lengths)} samples; "
+                "all are cut to the shortest",
+                stacklevel=2,
             )
         clean, *recordings = (waveform[:, :time] for waveform in waveforms)
         channels = torch.cat(recordings[: len(self.microphones)])
