@@ -71,12 +71,12 @@ class AdaptiveBeamformer(FilterAndSum):
         config: Sizes and choices, by default ``BeamformerConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Whole signals at other
             rates than 16000 are resampled, which adds up to 8.5 ms of look-ahead; streams need
-            16000.
-            Outputs contain the frequencies below 8 kHz only.
+            16000. Outputs contain the frequencies below 8 kHz only.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
-        ValueError: The rate or the level is out of range.
+        ValueError: The rate or the level is out of range, or ``config`` is not a
+            ``BeamformerConfig``.
 
     >>> AdaptiveBeamformer()(torch.zeros(2, 2, 16000)).shape
     torch.Size([2, 16000])
@@ -206,8 +206,8 @@ class BeamformingAid(DirectionalAid, HubModel):
         highest_frequency: Highest frequency of outputs in Hz.
 
     Raises:
-        ValueError: The rate, the level or a setting in ``config.aid`` is out of range, or an ear is
-            not valid.
+        ValueError: The rate, the level or a setting in ``config.aid`` is out of range, an ear is
+            not valid, or ``config`` is not a ``BeamformerConfig``.
 
     >>> BeamformingAid()(torch.zeros(2, 2, 16000), ["N2", "N4"]).shape
     torch.Size([2, 16000])

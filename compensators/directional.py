@@ -585,8 +585,9 @@ def beam_and_blocking_taps(loading: float, spacing: float, before: int) -> NDArr
     """Design filters at 16 kHz of beams to the front, and of signals without sound from the front.
 
     The beams are those of ``mvdr_taps``. The two other signals are, at each side, a cardioid to the
-    rear, and the difference of the beam and a cardioid to the front. Of sound in front of a sphere,
-    they have -40 dB or less up to 4 kHz, relative to the front microphone, and -24 dB at 8 kHz.
+    rear, and the difference between the beam and a cardioid to the front, where the beam is
+    filtered as the cardioid filters sound from the front. Of sound in front of a sphere, they have
+    -40 dB or less up to 4 kHz, relative to the front microphone, and -24 dB at 8 kHz.
 
     Args:
         loading: Power of each microphone's own noise, see ``mvdr_taps``.

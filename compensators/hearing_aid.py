@@ -85,7 +85,7 @@ class HearingAid(Wearable, HubModel):
 
     Raises:
         ValueError: A rate or level is out of range, ``linked`` or ``limit_to_ear`` is neither True
-            nor False, or an ear is not valid.
+            nor False, an ear is not valid, or ``config`` is not a ``HearingAidConfig``.
 
     >>> import hlsim
     >>> aid = HearingAid().eval()

@@ -69,7 +69,8 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         ears: Number of ears with several microphones.
 
     Raises:
-        ValueError: A rate or level is out of range, or an ear is not valid.
+        ValueError: A rate or level is out of range, an ear is not valid, or ``config`` is not a
+            ``MappingConfig``.
 
     >>> import hlsim
     >>> model = MappingCompensator("N3", MappingConfig(channels=8, blocks=1))
@@ -134,10 +135,13 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         return EarNetwork.forward(self, waveform, ears)
 
     def _arrange_microphones(self, waveform: Tensor) -> Tensor:
-        """Return the signals with the microphones next to time, (..., [2,] microphones, time).
+        """Validate the signals of several microphones, and move the microphones next to time.
+
+        Shape: (..., microphones, time) -> the same; for two ears (..., microphones, 2, time) ->
+            (..., 2, microphones, time).
 
         Raises:
-            ValueError: There is another number of microphones or ears.
+            ValueError: See ``check_waveform``; or there is another number of microphones or ears.
         """
         check_waveform(waveform)
         expected = (self.microphones, 2)[: self.config.ears]
@@ -231,7 +235,10 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 
 
 def _relative_features(reference: Tensor, signals: Tensor) -> Tensor:
-    """Return the log level ratio, and cosine and sine of the phase, of signals to the reference.
+    """Return features of signals relative to the reference: ratios, then cosines and sines.
+
+    A ratio is half the natural logarithm of the ratio of magnitudes (``log_magnitude``). Cosines
+    and sines are those of the difference in phase, and fade to 0 in silence.
 
     Shape: complex (items, frames, frequencies), complex (items, signals, frames, frequencies)
         -> (items, 3 * signals, frames, frequencies).

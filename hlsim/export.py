@@ -288,7 +288,10 @@ def _check_export(aid: Any, items: int) -> None:
 
 
 class _Call(nn.Module):
-    """Module that calls a function of a model and named tensors, as ``torch.export`` needs it."""
+    """Module that calls a function of a model and named tensors, as ``torch.export`` needs it.
+
+    The function returns tensors by name.
+    """
 
     def __init__(self, model: nn.Module, function: Callable[..., dict[str, Tensor]]) -> None:
         super().__init__()

@@ -270,7 +270,8 @@ def read_table(
 
     Returns:
         One pair per row: its place for messages, and its texts by column, without surrounding
-        blanks. Missing values are empty. Rows without any value are left out.
+        blanks. Missing values are empty. Rows without any value, and columns without a name, are
+        left out.
 
     Raises:
         ValueError: The file cannot be read, the value is neither a file nor a data frame, there

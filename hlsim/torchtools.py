@@ -526,6 +526,9 @@ def on_host(values: Tensor) -> Tensor:
 def known_on_host(values: Tensor) -> Tensor | None:
     """Return a tensor without a gradient on the CPU if its values are known there, else None.
 
+    They are known if the tensor is on the CPU, or if ``on_device`` or ``on_host`` copied it and it
+    has not changed since. So this never waits for a GPU.
+
     Args:
         values: Tensor of any shape on any device.
 

@@ -129,6 +129,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
 def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     """Write a manifest atomically, in place of an older manifest of this name.
 
+    The file has the column ``reference`` only if an utterance has a reference.
+
     Args:
         path: CSV file to write.
         utterances: Rows of the manifest.

@@ -222,7 +222,7 @@ def _mean_correlation(features: Tensor, counts: list[int]) -> Tensor:
 
     Args:
         features: Output of ``_band_features``. Shape: (frames of all items, bands, 8).
-        counts: Number of frames of each item.
+        counts: Number of frames of each item, more than ``SEGMENT``.
 
     Returns:
         Means. Shape: (items,).
@@ -254,7 +254,8 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
 
     The correlation is a mean over bands. The envelopes are those after equalisation and
     cancellation with the best delay and level, or those of one ear where its ratio of modulation is
-    larger.
+    larger. A band in which clean speech has no modulation at either ear has the correlation -1. If
+    only the output has none, it is 0, or -1 if one ear alone may not be used.
 
     Args:
         windows: Segments of the output of ``_band_features``. Shape: (segments, bands, 8, frames).

@@ -248,10 +248,10 @@ class Reference(ABC):
 
 
 def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
-    """Amplify signals by NAL-R for ears with thresholds in dB HL.
+    """Amplify signals at 24 kHz by NAL-R for ears with thresholds in dB HL.
 
     As in pyclarity, the first 140 samples of the filter's output are left out, so that the result
-    is 70 samples earlier than the signal.
+    is 70 samples earlier than the signal. It is zero after the longest item of ``extent``.
 
     Shape: (items, padded), (items, 8) -> (items, padded).
     """

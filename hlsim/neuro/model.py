@@ -83,7 +83,7 @@ class NeuroMSBG(EarNetwork, HubModel):
         needs_exact_lengths: True, because silence after the end of a signal changes its output.
 
     Raises:
-        ValueError: The rate or the level is out of range.
+        ValueError: The rate or the level is out of range, or ``config`` is not a ``NeuroConfig``.
 
     >>> simulator = NeuroMSBG(NeuroConfig(channels=8, blocks=1))
     >>> simulator(torch.randn(2, 16000), "N3").shape

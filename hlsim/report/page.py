@@ -1,8 +1,8 @@
 """Pages: sections of text, tables, players and pictures, as one HTML file or as Markdown.
 
 The HTML fetches nothing: pictures and sounds are data in the page, and its only script is that of
-the players. It can be read on a phone, where wide tables scroll by themselves, and with a keyboard.
-The templates are in the folder ``templates``.
+the players. It can be read with a keyboard, and on a phone, where each value of a wide table has a
+line of its own. The templates are in the folder ``templates``.
 """
 
 from __future__ import annotations

@@ -59,6 +59,9 @@ class DigitListener(nn.Module, HubModel):
     Args:
         config: Sizes of the network; by default ``DigitListenerConfig()``.
 
+    Raises:
+        ValueError: The argument ``config`` is not a ``DigitListenerConfig``.
+
     >>> DigitListener()(torch.randn(2, 48000)).shape
     torch.Size([2, 3, 10])
     """

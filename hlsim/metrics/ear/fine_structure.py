@@ -311,13 +311,16 @@ def _lag_weights() -> NDArray[np.float64]:
 def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor:
     """Compute the mean coherence of all segments and channels in which the clean signal is audible.
 
-    Channels above 3.5 kHz count less, because the nerve no longer follows each vibration. Items
-    with fewer than two audible segments have the value 0.
+    A segment is audible if its mean amplitude over the channels is above ``SILENCE_DB``, and those
+    of its channels count whose own level is, too. Channels above 3.5 kHz count less, because the
+    nerve no longer follows each vibration. Items with fewer than two audible segments have the
+    value 0.
 
     Args:
         coherences: Values by ``coherence``. Shape: (items, 32, segments).
-        mean_square: Mean squares of the clean signal's segments by ``segment_spectra``. Shape:
-            (items, 32, segments).
+        mean_square: Mean squares of the clean signal's segments by ``segment_spectra``, of motion
+            whose envelope is a level: their roots are levels in dB over threshold. Shape: (items,
+            32, segments).
         counts: Number of segments of each item.
 
     Returns:
