@@ -300,7 +300,7 @@ def as_samples(signal: Samples) -> Tensor:
         signal: Tensor, which is returned as it is, or array of floating-point numbers.
 
     Raises:
-        ValueError: The signal is neither a tensor nor such an array.
+        ValueError: The signal is neither a tensor nor such an array, or samples of it are masked.
 
     >>> as_samples(np.ones(2, np.float32)[::-1])
     tensor([1., 1.])
@@ -313,6 +313,8 @@ def as_samples(signal: Samples) -> Tensor:
             f"expected samples, got {kind}; write: speech, rate = hlsim.load_audio(path), and pass "
             "speech and sample_rate=rate"
         )
+    if np.ma.is_masked(signal):
+        raise ValueError("expected samples without a mask; fill masked ones: x.filled(0.0)")
     samples = np.asarray(signal)
     if not np.issubdtype(samples.dtype, np.floating):
         is_integer = np.issubdtype(samples.dtype, np.integer)

@@ -142,3 +142,10 @@ def test_functions_prepare_a_backward_pass_only_where_gradients_are_enabled() ->
     assert Double.preparations == 1
     assert leaf.grad is not None and leaf.grad.tolist() == [2.0, 2.0]
     assert grad(lambda values: Double.call(values).sum())(torch.ones(2)).tolist() == [2.0, 2.0]
+
+
+def test_masked_samples_are_an_error() -> None:
+    samples = np.ma.masked_greater(np.array([0.1, 9.0]), 1.0)
+    with pytest.raises(ValueError, match=r"without a mask; .* x\.filled"):
+        torchtools.as_samples(samples)
+    assert torchtools.as_samples(samples.filled(0.0)).tolist() == [0.1, 0.0]
