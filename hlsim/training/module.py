@@ -189,13 +189,14 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
         simulator: Name, folder or module, see ``load_simulator``.
 
     Returns:
-        Dict with the entry ``role``: the name of the simulator, or its class with its settings. A
-        network, or a module of your own, adds a hash of its weights as ``<role>_sha256``, because a
-        file may contain other weights when the training resumes. Your own code without an attribute
-        ``fingerprint`` adds a hash of its file as ``<role>_code_sha256``.
+        Dict with the entry ``role``: the name of the simulator, or its class with its
+        ``extra_repr``. A network, or any module, adds a hash of its weights as ``<role>_sha256``,
+        because a file may contain other weights when the training resumes. Your own code without an
+        attribute ``fingerprint`` adds a hash of its file as ``<role>_code_sha256``.
 
     Raises:
-        ValueError: There is no such simulator.
+        ValueError: There is no such simulator, or a module was built for another sample rate than
+            16 kHz or for another full scale than pascals.
 
     >>> describe_simulator("teacher", "msbg")
     {'teacher': 'msbg'}
