@@ -31,6 +31,7 @@ SPEECH_DIR = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
 
 
 LONGEST = (
+    "test_a_compiled_network",
     "test_parallel.py::test_a_process_that_ends",
     "test_clarity.py::test_the_baseline",
     "test_gpu_measurement_on_a_cpu",
