@@ -96,8 +96,7 @@ def _write_corpus(folder: Path) -> None:
     for split in ("train", "valid"):
         shutil.copy(ROOT / "examples" / "ears.csv", folder / "audiograms" / f"{split}.csv")
 
-    speech = [hlsim.load_audio(path, sample_rate=16000)[0] for path in bundled.glob("*/*.flac")]
-    clean = [waveform[:32000] for waveform in speech if len(waveform) >= 32000][:4]
+    clean = [hlsim.load_audio(path, sample_rate=16000)[0][:32000] for path in paths]
     generator = torch.Generator().manual_seed(0)
     noise = 0.005 * torch.randn(32000, generator=generator)
     recordings = {
