@@ -110,7 +110,7 @@ class SimulatorTraining(TrainingModule):
         Args:
             values: Ratios of the teacher's output to the network's error in dB, (items,).
         """
-        median = float(values.median())
+        median = float(values.quantile(0.5))  # torch's median is the lower middle value
         worst_tenth = float(values.quantile(0.1))
         return {
             "score": median + 0.5 * worst_tenth,

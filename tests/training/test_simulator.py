@@ -62,6 +62,12 @@ def test_a_training_leaves_the_best_average_with_its_record(
     assert any(not torch.equal(saved[name], current[f"network.{name}"]) for name in saved)
 
 
+def test_the_median_of_an_even_number_of_items_is_the_mean_of_the_middle_two() -> None:
+    summary = SimulatorTraining(SMALL, MSBG()).summarise(torch.tensor([40.0, 10.0, 20.0, 30.0]))
+    assert summary["valid_snr_median"] == pytest.approx(25.0)
+    assert summary["score"] == pytest.approx(25.0 + 0.5 * summary["valid_snr_worst_tenth"])
+
+
 def test_a_start_has_the_same_trained_parameters_as_random_weights_of_a_seed() -> None:
     first, again = (SimulatorTraining(SMALL, MSBG()).network.state_dict() for _ in range(2))
     assert all(torch.equal(first[name], again[name]) for name in first)
