@@ -337,8 +337,8 @@ def read_recordings(
     audiogram: Audiogram | None = None,
     audiograms: str | Path | None = None,
     **settings: Any,
-) -> list[RecordedItem]:
-    """Return the recordings of a manifest, in the order of their first rows.
+) -> tuple[list[RecordedItem], list[str]]:
+    """Return the recordings and the conditions of a manifest, each in the order of the first rows.
 
     Args:
         manifest: CSV file or DataFrame with one row per output and the columns that the top of this
@@ -361,8 +361,9 @@ def read_recordings(
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "m.csv"
     ...     _ = path.write_text("condition,clean,processed,audiogram\\nmine,c/1.wav,p/1.wav,N3\\n")
-    ...     [recording.name for recording in read_recordings(path)]
-    ['c/1']
+    ...     recordings, conditions = read_recordings(path)
+    >>> [recording.name for recording in recordings], conditions
+    (['c/1'], ['mine'])
     """
     is_file = isinstance(manifest, (str, Path))
     rows = read_table(manifest, "the manifest", _COLUMNS)
@@ -392,7 +393,9 @@ def read_recordings(
         if key in recordings:
             recording = convert_at(place, _merge, recordings[key], recording)
         recordings[key] = recording
-    return list(recordings.values())
+    # The first recording may lack a condition, so its outputs do not have the order of the rows.
+    conditions = dict.fromkeys(row["condition"] for _, row in rows)
+    return list(recordings.values()), list(conditions)
 
 
 def _merge(earlier: RecordedItem, recording: RecordedItem) -> RecordedItem:

@@ -139,15 +139,14 @@ def haspi_report(
                 "one of the two"
             )
         ears = read_named_ears(audiograms) if ear is None else [("", "", ear)]
-        recordings = read_folders(clean, outputs, ears, **settings)
+        recordings, names = read_folders(clean, outputs, ears, **settings), list(outputs)
     elif manifest is not None and clean is None and not outputs:
-        recordings = read_recordings(manifest, root, ear, audiograms, **settings)
+        recordings, names = read_recordings(manifest, root, ear, audiograms, **settings)
     else:
         raise ValueError(
             "expected either a manifest, or the folder clean with the folder after (and before) or "
             "with named conditions; pass one of the two"
         )
-    names = list(dict.fromkeys(name for r in recordings for name in r.outputs))
     if baseline is not None:
         if baseline not in names:
             raise ValueError(

@@ -238,7 +238,7 @@ def test_the_ears_of_a_manifest_may_be_in_a_file_of_their_own(corpus: Path) -> N
     unused = LEVELS.replace("80", "NR")  # Only ears that are used are validated.
     manifest = write_manifest(corpus, MANIFEST.replace(",audiogram\n", ",remark\n"))
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,R,{LEVELS}\nL3,left,{unused}\n")
-    assert {r.audiogram for r in read_recordings(manifest, audiograms=ears)} == {N4}
+    assert {r.audiogram for r in read_recordings(manifest, audiograms=ears)[0]} == {N4}
     ears.write_text(f"{HEADER}\nL1,left,{LEVELS}\nL2,left,{LEVELS}\n")
     # The default is for listeners that the table does not have.
     for default in (None, N4):
@@ -334,7 +334,7 @@ def test_a_clean_file_is_one_item_however_its_path_is_written(corpus: Path) -> N
     rows += [f"{number},{path},after/a.b.wav,N4,L1" for number, path in enumerate(paths)]
     (corpus / "study.csv").write_text("\n".join(rows))
     with pytest.warns(UserWarning, match="columns of the manifest that are not used: listner;"):
-        (recording,) = read_recordings(corpus / "study.csv")
+        ((recording,), _) = read_recordings(corpus / "study.csv")
     assert (recording.name, [*recording.outputs]) == ("clean/a.b", ["0", "1", "2"])
 
 
@@ -437,7 +437,7 @@ def test_items_are_not_identified_by_joined_or_rounded_texts(tmp_path: Path) -> 
     path = tmp_path / "study.csv"
     lines = [f"{a},{item},{snr},aid,c.wav,p.wav,N3" for a, item, snr in rows]
     path.write_text("listener,item,snr,condition,clean,processed,audiogram\n" + "\n".join(lines))
-    assert len(read_recordings(path)) == 4
+    assert len(read_recordings(path)[0]) == 4
 
 
 @pytest.mark.parametrize(
@@ -447,7 +447,7 @@ def test_items_are_not_identified_by_joined_or_rounded_texts(tmp_path: Path) -> 
 def test_texts_of_an_snr(tmp_path: Path, text: str, snr: float) -> None:
     path = tmp_path / "study.csv"
     path.write_text(f"condition;clean;processed;snr;audiogram\naid;c.wav;p.wav;{text};N3\n")
-    (recording,) = read_recordings(path)
+    ((recording,), _) = read_recordings(path)
     assert recording.snr == pytest.approx(snr, nan_ok=True)
 
 
@@ -476,7 +476,7 @@ def test_both_channels_of_a_file_have_one_gain(tmp_path: Path) -> None:
 def test_thresholds_of_a_manifest_have_the_names_of_a_table_of_ears(tmp_path: Path) -> None:
     path = tmp_path / "study.csv"
     path.write_text("Condition,CLEAN,Processed,500 Hz,4k\naid,c.wav,p.wav,60,80\n")
-    (recording,) = read_recordings(path, audiogram=N4)
+    ((recording,), _) = read_recordings(path, audiogram=N4)
     assert recording.audiogram == Audiogram([60, 80], [500, 4000])
 
 
@@ -537,19 +537,35 @@ def test_folders_of_many_systems_are_scored_for_all_ears_of_a_table(corpus: Path
         haspi_report(corpus / "clean", conditions=systems, audiograms=ears, **settings)
 
 
+def test_conditions_have_the_order_of_rows_even_if_the_first_item_lacks_one(corpus: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    rows = [
+        {"condition": name, "clean": f"clean/{item}.flac", "processed": f"after/{item}.wav"}
+        for name in ("unaided", "NAL-R", "mine")
+        for item in ("a.b", "p2/c")
+    ]
+    del rows[2]  # NAL-R's output of the first item
+    settings: dict[str, Any] = {"root": corpus, "audiogram": N4, "measures": ["stoi"], "jobs": 1}
+    report = haspi_report(manifest=pandas.DataFrame(rows), **settings)
+    assert report.names == ["unaided", "NAL-R", "mine"]
+    planned = [(c.before, c.after) for c in report.comparisons if c.planned]
+    assert planned == [("unaided", "mine")]
+
+
 def test_a_frame_of_pandas_is_a_manifest(corpus: Path) -> None:
     pandas = pytest.importorskip("pandas")
     path = write_manifest(corpus, MANIFEST)
     frame = pandas.read_csv(path)
     frame["snr"] = [5.0, 5.0, math.nan, math.nan, math.nan]
-    recordings = read_recordings(frame, corpus)
+    recordings, conditions = read_recordings(frame, corpus)
+    assert conditions == ["unaided", "aided", "loud"]
     assert [r.snr for r in recordings] == pytest.approx([5.0, math.nan], nan_ok=True)
     assert [list(r.outputs) for r in recordings] == [
         ["unaided", "aided"],
         ["unaided", "aided", "loud"],
     ]
     frame["listener"] = None
-    assert {r.listener for r in read_recordings(frame, corpus)} == {""}
+    assert {r.listener for r in read_recordings(frame, corpus)[0]} == {""}
     with pytest.raises(ValueError, match="the manifest: expected a table with rows"):
         read_recordings(frame[:0])
     with pytest.raises(ValueError, match="the manifest, row 1: expected a value"):
