@@ -106,8 +106,8 @@ def _words(evaluation: Evaluation, c: ConditionComparison) -> list[str]:
         f"under {c.before} and {after} % under {c.after}, a change of {after - before:+d} points. "
         f"For nine of ten listeners the change lies between {low:+d} and {high:+d} points.",
         "Words are predicted from HASPI by a curve that was fitted to 26 listeners with "
-        "twelve hearing aids (hlsim.metrics.words). HASPI ranks aids well, but says little about "
-        "single listeners.",
+        "twelve hearing aids and to HASPI of their better ear (hlsim.metrics.words): for single "
+        "ears it extrapolates. HASPI ranks aids well, but says little about single listeners.",
     ]
 
 
