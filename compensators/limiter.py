@@ -17,7 +17,7 @@ EXPONENT = 8.0
 """Exponent of the curve. The higher it is, the closer the curve is to clipping."""
 
 LIMITED = 2.0 ** (-1.0 / EXPONENT)
-"""Magnitude of an output, as a ratio to the limit, whose magnitude before was at the limit."""
+"""Output for an input exactly at the limit, as a ratio to the limit."""
 
 HIGHEST_RATIO = 1e4
 """Ratio of a sample to the limit from which all samples have the same output.

@@ -35,7 +35,7 @@ class Meter:
     """Mean square and peak of a signal, measured while its parts pass through ``measure``.
 
     Args:
-        limit: Magnitude for ``share_above``.
+        limit: Magnitude above which samples count in ``share_above``.
 
     Attributes:
         power: Mean square of all samples of all channels.

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 PLAYED_PEAK = 0.9
 """Peak to which ``--no-clipping`` scales an output that exceeds full scale, 1.0."""
 
-_AUDIBLE_SHARE = 0.001
-"""Share of samples above the limit of an aid from which on the printed line says so."""
+_MENTIONED_SHARE = 0.001
+"""Smallest share of distorted samples that the printed line mentions."""
 
 
 def simulate(parser: Parser) -> None:
@@ -190,7 +190,7 @@ def _process_file(
     text = f"input {level + gain_db:.1f} dB SPL"
     output_level, _ = level_and_gain(max(meter.power, POWER_FLOOR), options)
     text += f", output {output_level + gain_db:.1f} dB SPL"
-    if meter.share_above > _AUDIBLE_SHARE:
+    if meter.share_above > _MENTIONED_SHARE:
         text += (
             f"; {100.0 * meter.share_above:.2g} % of the samples exceeded the aid's limit of "
             f"{limit_spl:g} dB SPL and are distorted"

@@ -239,8 +239,8 @@ def _check_related(correlation: float, input_powers: Array, output_powers: Array
     if similarity < SIMILARITY_FLOOR:
         raise ValueError(
             f"input and output are not similar (correlation {similarity:.2f}, expected "
-            f"{SIMILARITY_FLOOR} or more); pass two recordings of the same sound, whose output is "
-            "not distorted by a limit of its peaks"
+            f"{SIMILARITY_FLOOR} or more); pass two recordings of the same sound, with an output "
+            "that no limiter of peaks has distorted"
         )
 
 
