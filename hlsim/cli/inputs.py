@@ -97,8 +97,9 @@ def parse_ears(
         name "listener".
 
     Raises:
-        ValueError: There is no such file or listener, an audiogram is not valid, two have the same
-            name, or the levels of ``--ucl`` are not valid, have no effect, or are not for one ear.
+        ValueError: There is no such file, listener or compensator, an audiogram is not valid, two
+            have the same name, or the levels of ``--ucl`` are not valid, have no effect, or are not
+            for one ear.
     """
     from hlsim.audiogram import as_audiogram
     from hlsim.audiogram.discomfort import read_points
@@ -170,6 +171,9 @@ def warn_of_other_ears(
 
     Returns:
         The warnings.
+
+    Raises:
+        ValueError: There is no such compensator, or its checkpoint cannot be read.
     """
     from compensators import trained_for
 
@@ -186,6 +190,8 @@ def warn_of_other_ears(
 
 def build_simulator(options: argparse.Namespace, sample_rate: int) -> Any:
     """Load the simulator that ``--simulator`` names, at the scale of ``--full-scale-spl``.
+
+    It is a module that is called with a waveform and an ear.
 
     Args:
         options: Options ``simulator`` and ``full_scale_spl``.
@@ -204,9 +210,12 @@ def build_simulator(options: argparse.Namespace, sample_rate: int) -> Any:
 def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
     """Load the compensator that ``--compensator`` names, at the scale of ``--full-scale-spl``.
 
+    It is a module that is called with a waveform and an ear.
+
     Args:
         options: Options ``compensator`` and ``full_scale_spl`` and, where a command has them,
-            ``linked``, ``limit_to_ear``, ``loudness`` and the sliders, which are not set here.
+            ``linked``, ``limit_to_ear``, ``loudness`` and the sliders. Sliders are only validated;
+            they are arguments of each call of the compensator.
         sample_rate: Sample rate in Hz of the signals to process, 16000 to 48000.
 
     Raises:
@@ -234,7 +243,9 @@ def build_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
 
 
 def build_single_microphone_aid(options: argparse.Namespace, sample_rate: int) -> Any:
-    """Load the compensator that ``--compensator`` names, which must take one signal per ear.
+    """Load the compensator that ``--compensator`` names, and reject one for several microphones.
+
+    It is a module that is called with one signal per ear, and an ear.
 
     Args:
         options: See ``build_compensator``.
@@ -256,7 +267,7 @@ def read_sliders(options: argparse.Namespace) -> dict[str, float]:
     """Return the values of the sliders of a hearing aid that a user has set, by name.
 
     Raises:
-        ValueError: A slider or another setting of an aid is set, and there is no aid.
+        ValueError: A slider, ``--loudness`` or ``--limit-to-ear`` is set, and there is no aid.
     """
     values = {name: getattr(options, name, None) for name in ("noise_reduction", "amplification")}
     sliders = {name: value for name, value in values.items() if value is not None}

@@ -37,10 +37,10 @@ _EAR = re.compile(r"NH|[NS]\d|-?[\d.]+([,:]-?[\d.]+)+", re.IGNORECASE)
 class _StoreOnce(argparse.Action):
     """Action that stores the value of an option, and rejects the option if it is repeated.
 
-    Lists of values, of which ``Parser.series`` has one per word, are joined to one list.
-
     argparse would store the last value, so that, for example, the first of two folders of speech
     would be ignored.
+
+    An option of ``Parser.series`` gets one list per word, such as "50,65"; the lists are joined.
     """
 
     namespace: argparse.Namespace | None = None

@@ -72,6 +72,8 @@ def _srt(options: argparse.Namespace) -> None:
 def _format_estimate(test: str, estimate: Any, number: int) -> str:
     """Return a text with the estimate for one of several ears, in dB, and its 95 % interval.
 
+    An infinite threshold is "above 32 dB", and a benefit that is not finite "unknown".
+
     Args:
         test: Name of the estimate: ``"benefit"``, a difference of thresholds, or a threshold.
         estimate: ``Estimate`` with one value per ear.

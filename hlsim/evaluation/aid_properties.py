@@ -117,6 +117,9 @@ def measure_gain_curve(
         ``gain_db``, gains in dB of shape (levels, 24), and its axes ``levels`` (dB SPL) and
         ``frequencies`` (centres of 24 bands of equal width on the ERB scale, in Hz).
 
+    Raises:
+        ValueError: An output of the aid is not valid, see ``cut_output``.
+
     >>> curve = measure_gain_curve(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
     >>> round(curve["gain_db"][0][0])
     20
@@ -156,7 +159,7 @@ def make_tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
         hertz: Frequencies in Hz.
         levels: Levels in dB SPL.
 
-    Returns: The sines; those of the first frequency come first. Shape: (hertz * levels, 32000).
+    Returns: The sines, first those of the first frequency. Shape: (frequencies * levels, 32000).
 
     >>> make_tones([250, 1000], [50.0, 65.0, 80.0]).shape
     torch.Size([6, 32000])
@@ -171,7 +174,7 @@ def _sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     """Compute the power at more than 20 Hz from a tone, relative to the power near it, in dB.
 
     Args:
-        waveform: Outputs for tones, of which the middle second counts. Shape: (items, 32000).
+        waveform: Outputs at 16 kHz for tones; the middle second counts. Shape: (items, 32000).
         hertz: Frequency of each tone in Hz. Shape: (items,).
 
     Returns:
@@ -209,6 +212,9 @@ def measure_steady_tones(
         near it, in dB; both are nested lists of shape (levels, frequencies). ``levels`` (dB SPL)
         and ``frequencies`` (Hz) are the axes.
 
+    Raises:
+        ValueError: An output of the aid is not valid, see ``cut_output``.
+
     >>> measure_steady_tones(lambda x, _: x, NORMAL, [65.0])["loudness_error_db"][0][0]
     0.0
     """
@@ -231,13 +237,16 @@ def measure_wearability(aid: Aid, ear: Audiogram, speech: Tensor) -> dict[str, A
     Args:
         aid: The hearing aid.
         ear: The audiogram.
-        speech: Utterance of 3 s at 16 kHz. Shape: (48000,).
+        speech: Utterance of 3 s at 16 kHz, which is set to 65 dB SPL. Shape: (48000,).
 
     Returns:
         ``look_ahead_ms``, how much later input a sample of the output needs, see
         ``measure_look_ahead``; ``quiet_gain_db``, the gains in dB for white noise at 25 and at 40
         dB SPL (``QUIET_LEVELS``); and ``cpu_ms``, the processor time in ms for one second of sound
         on one thread.
+
+    Raises:
+        ValueError: An output of the aid is not valid, see ``cut_output``.
 
     >>> measure_wearability(lambda x, _: x, NORMAL, torch.randn(48000))["look_ahead_ms"]
     0.0
@@ -336,7 +345,10 @@ def measure_reception_thresholds(
 
 
 def _measure_reception_threshold(aid: Aid, ear: Audiogram, test: DigitTest) -> dict[str, Estimate]:
-    """Measure the speech reception threshold of an ear with an aid: a dict, ``threshold_db``."""
+    """Return ``{"threshold_db": threshold}``, the speech reception threshold of an ear with an aid.
+
+    This is a ``measure`` of ``measure_aids``.
+    """
     thresholds = torch.tensor(ear.thresholds)
     return {
         "threshold_db": test.measure(thresholds, lambda inputs, _: _aid_outputs(aid, inputs, ear))
@@ -363,9 +375,9 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
 
 
 def _band_powers(signal: Tensor) -> Tensor:
-    """Return the mean power in each of 24 bands, where 1.0 is 0 dB SPL.
+    """Return the mean power of speech in each of 24 bands, where 1.0 is 0 dB SPL.
 
-    Shape: (utterances, time) -> (24,).
+    Shape: (utterances, time) in pascals at 16 kHz -> (24,).
     """
     return (10.0 ** (band_levels(signal.double(), NEURO_RATE) / 10.0)).mean((0, 1))
 

@@ -161,16 +161,17 @@ def evaluate_scenes(
             and of all scores.
 
     Returns:
-        The evaluation of all conditions, ``unaided`` first. Its ``notes`` count files of scenes
-        and of ``outputs`` that are not used. The column ``combined`` of its table is the mean of
-        HASPI and HASQI. Its ``details["look_ahead_ms"]`` has the measured look-ahead by condition,
-        and None for ``outputs`` and for an aid that fails on the first pair.
+        The evaluation of all conditions, ``unaided`` first. Its ``notes`` say which microphones and
+        how many files of ``outputs`` are not used. The column ``combined`` of its table is the mean
+        of HASPI and HASQI. Its ``details["look_ahead_ms"]`` has the measured look-ahead by
+        condition, and None for ``outputs`` and for an aid that fails on the first pair.
 
     Raises:
         ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, an
             aid, enhancer or measure does not exist, a number is out of range, two conditions have
             one name, or nothing could be scored.
         MissingExtraError: A package is not installed.
+        OSError: The file of scores cannot be read.
     """
     check_scheduler(running.get("dask"))
     names = ["haspi", "hasqi", *measures]
@@ -237,9 +238,9 @@ def evaluate_scenes(
 def _read_pairs(
     folder: Path, listeners: str | Path, scenes_listeners: str | Path | None
 ) -> list[_Pair]:
-    """Return the pairs of scene and listener, sorted by scene or in the order of the JSON file.
+    """Return the pairs of scene and listener: those of ``scenes_listeners``, or else all, sorted.
 
-    See ``evaluate_scenes`` for the files.
+    See ``evaluate_scenes`` for the arguments.
 
     Raises:
         ValueError: There is no scene, or two files are one scene; a scene lacks its reference; a
@@ -337,11 +338,11 @@ def _describe_unused_microphones(pairs: Sequence[_Pair], numbers: Sequence[int])
 def _describe_unused_outputs(
     label: str, folder: Path, pairs: Sequence[_Pair], all_pairs: Sequence[_Pair]
 ) -> list[str]:
-    """Return a list with a note about audio files of an aid that no pair uses, or an empty list.
+    """Return a list with a note about audio files that belong to no pair, or an empty list.
 
     Args:
         label: Label of the aid.
-        folder: Folder of its outputs.
+        folder: Folder of existing outputs of this aid.
         pairs: Pairs that are evaluated.
         all_pairs: These pairs, and those that a stride leaves out.
 
@@ -411,7 +412,7 @@ def _make_conditions(
 
 
 def _check_existing_outputs(condition: Condition, folders: Mapping[str, Path], out: Path) -> None:
-    """Raise ValueError if the outputs of a condition would replace existing ones.
+    """Raise ValueError if a condition's outputs would be written to a folder of existing ones.
 
     Args:
         condition: Condition of the study.
@@ -428,9 +429,10 @@ def _check_existing_outputs(condition: Condition, folders: Mapping[str, Path], o
 
 
 def _folder_name(condition: Condition) -> str:
-    """Return the name of the folder for a condition's signals: its name with hyphens.
+    """Return the name of the folder for a condition's signals, derived from the condition's name.
 
-    They replace all characters but letters, digits and ``_.+-``.
+    Other characters than letters, digits and ``_.+-`` become hyphens, one for each series of them.
+    Hyphens and dots at both ends are removed.
     """
     return re.sub(r"[^\w.+-]+", "-", condition.name).strip(".-")
 
@@ -442,6 +444,12 @@ def _measure_look_ahead(
     """Measure the look-ahead of a condition in ms, on the first 4 s of a scene.
 
     It is None for existing outputs, and for an aid whose call raises ValueError.
+
+    Args:
+        condition: Condition of the study.
+        pair: The scene and the listener.
+        rate: Sample rate of the scene in Hz.
+        microphones: Numbers of the microphones that are used.
 
     Raises:
         ValueError: A file of the scene is broken, or has another rate or length.
@@ -555,7 +563,7 @@ def _read_scene(pair: _Pair, rate: int, numbers: Sequence[int]) -> tuple[Tensor,
 
 
 def _check_output(path: Path, rate: int) -> None:
-    """Raise ValueError unless an existing output has two channels at a rate in Hz."""
+    """Raise ValueError unless a file can be read, and has two channels and a sample rate in Hz."""
     waveform, file_rate = read_audio(path)
     if file_rate != rate or len(waveform) != 2:
         raise ValueError(

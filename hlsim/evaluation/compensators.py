@@ -155,6 +155,7 @@ def evaluate_compensators(
     Raises:
         ValueError: Data or settings are not valid, or no item has all its scores.
         MissingExtraError: A package is not installed.
+        OSError: The store of scores cannot be read.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> speech, settings = EXAMPLE_FILE.parent, {"items": 1, "seconds": 1.0, "levels": [65.0]}
@@ -287,6 +288,11 @@ def evaluate_compensators(
 def _read_scene_clips(manifest: str | Path, root: str | Path | None, seconds: float) -> SceneClips:
     """Return clips of the scenes in the split test of a manifest, or else in its split valid.
 
+    Args:
+        manifest: File of the manifest.
+        root: Folder to which its paths are relative; None for the folder of the manifest.
+        seconds: Duration of the clips, which have 16 kHz, in seconds.
+
     Raises:
         ValueError: The manifest is not valid or has no scenes in these splits, a scene has no noisy
             recording, its files are not valid, or scenes differ in their number of ears.
@@ -305,7 +311,7 @@ def _read_scene_clips(manifest: str | Path, root: str | Path | None, seconds: fl
 
 
 def _adapt(aid: nn.Module, scenes: SceneClips | None) -> nn.Module:
-    """Return an aid for the items of a study, which has several microphones if it has scenes."""
+    """Return the aid, wrapped by ``OnMicrophones`` if the items of the study come from scenes."""
     return aid if scenes is None else OnMicrophones(aid, (scenes.microphones, scenes.ears))
 
 

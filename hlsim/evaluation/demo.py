@@ -139,7 +139,10 @@ def _read_items(audiogram: Audiogram) -> list[Item]:
 def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
     """Compare the aid with NAL-R at its level by HASPI, over the mean scores of each voice.
 
-    Returns: The planned comparison alone; the list is empty if it is not defined.
+    Args:
+        table: Table of the study, with the column ``voice``.
+
+    Returns: A list of the planned comparison alone, or an empty list if no voice has both scores.
     """
     means = table.groupby(["voice", "condition"], sort=False)[["haspi", "level"]].mean()
     rows = means.reset_index().rename(columns={"voice": "item"})

@@ -215,7 +215,7 @@ def draw_scene_items(
 
 
 def _warn_of_unusable(noun: str, clips: Clips) -> None:
-    """Warn, with their number, of recordings that were drawn and cannot be used."""
+    """Warn if recordings were drawn that cannot be used, called ``noun``, such as "scenes"."""
     if clips.left_out:
         warnings.warn(
             f"{len(clips.left_out)} of {len(clips)} {noun} were drawn and left out, because they "
@@ -225,7 +225,7 @@ def _warn_of_unusable(noun: str, clips: Clips) -> None:
 
 
 def _warn_of_silence(items: Sequence[Item]) -> None:
-    """Warn if silence at the end of items lowers the level of the whole item."""
+    """Warn of items whose clean speech ends in silence for more than a tenth of their length."""
     ends = [item.clean[-int(MAX_SILENT_END * len(item.clean)) - 1 :] for item in items]
     silent = sum(not end.any() for end in ends)
     if silent:
@@ -295,8 +295,8 @@ def apply_treatments(
         second one. Each has the fact ``treatment``, the name of its treatment.
 
     Raises:
-        ValueError: A treatment is unknown, ``"compensated"`` lacks a compensator, or that was built
-            for another sample rate or full scale.
+        ValueError: A treatment is unknown, ``"compensated"`` lacks a compensator, or the
+            compensator was built for another sample rate or full scale.
 
     >>> clean = torch.ones(1600)
     >>> item = Item("item 1", clean, clean, Audiogram.standard("N3"))
@@ -333,10 +333,11 @@ def _draw_clips(
     seconds: float,
     generator: torch.Generator,
 ) -> Iterator[tuple[int, Tensor, Tensor | None]]:
-    """Yield the number, the clean speech and the noise of each item.
+    """Yield the number from 0, the clean speech and the noise of each item.
 
     The noise is None without a folder of noise, and for items with an even number. Speech and noise
-    have the shape (time,), and no calibrated level.
+    have the shape (time,), 16 kHz, and no calibrated level. After the last item, a warning counts
+    the recordings that were drawn and cannot be used.
 
     Raises:
         ValueError: A number is out of range, or a folder has no usable audio.
@@ -364,13 +365,13 @@ def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float,
         turn: Number of earlier items with this ear.
         levels: Levels in dB SPL, -20 to 140.
 
-    Raises:
-        ValueError: There is no level, or one is out of range.
-
     Returns:
         The level in dB SPL; the SNR in dB; and an offset in the cycle of the SNRs, which is already
         part of the SNR. With an even number of levels, the offset rises by 1 per cycle of the
         levels, because some combinations would otherwise never occur. With an odd number, it is 0.
+
+    Raises:
+        ValueError: There is no level, or one is out of range.
     """
     if not levels:
         raise ValueError("expected one or more levels, got none; write levels=[65.0]")

@@ -39,7 +39,6 @@ CORRELATION_FLOOR = 0.2
 NORMAL = Audiogram.standard("NH")
 """The normal ear, whose perception is the goal of an aid."""
 
-
 PRECISIONS = {32: torch.float32, 64: torch.float64}
 """Number types in which HASPI, HASQI and HAAQI can be computed, by their number of bits.
 
@@ -82,6 +81,8 @@ def _prepare(
         sample_rate: Sample rate in Hz.
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
         ear: The ear of the item for HASQI and HAAQI; nothing for HASPI.
+
+    Returns: An object of the class in ``REFERENCES``, whose method ``score`` scores an output.
     """
     settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl, "whole_khz": True}
     return REFERENCES[score](clean.samples, *ear, **settings)

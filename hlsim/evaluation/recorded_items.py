@@ -102,7 +102,7 @@ class RecordedItem:
 
     @property
     def clean_name(self) -> str:
-        """Path of the clean file with the ear; several listeners may share both."""
+        """Path of the clean file and name of the ear as one text, which listeners may share."""
         return f"{self.clean} {self.ear}"
 
     @property
@@ -138,7 +138,7 @@ class RecordedItem:
         return value_hash([files, level, self.ear, self.audiogram.to_dict(), self.seed])
 
     def load(self) -> Item:
-        """Read the clean speech. Outputs are read when they are measured.
+        """Read the clean speech, and return the item, whose outputs are read when they are scored.
 
         Raises:
             ValueError: The file cannot be read, it is not known which channel is that of the ear,

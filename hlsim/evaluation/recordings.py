@@ -110,6 +110,7 @@ def haspi_report(
             other speech at it, there is no such measure, precision or baseline, or nothing could
             be scored.
         MissingExtraError: pandas, joblib or the package of a measure is not installed.
+        OSError: The store of scores cannot be read.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> folder = EXAMPLE_FILE.parent
@@ -204,6 +205,7 @@ def score_recordings(
             ``better_ear`` is set and an utterance lacks an ear or has different speech for both
             ears.
         MissingExtraError: pandas, joblib or the package of a measure is not installed.
+        OSError: The store of scores cannot be read.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.data.bundled import EXAMPLE_FILE

@@ -139,10 +139,10 @@ def _teacher_output(teacher: nn.Module, item: Item) -> Tensor:
 def _fidelity_to(teacher_name: str) -> Measure:
     """Return the measure that compares a simulator's output with that of a teacher.
 
-    Its columns are ``snr`` (dB), ``raw_mse`` and ``band_error`` (dB, over third octaves), and
-    ``stoi_teacher``, ``stoi_simulator``, ``pesq_teacher`` and ``pesq_simulator``: STOI and PESQ of
-    both outputs against the clean speech. STOI and PESQ are left out where they are not defined,
-    and PESQ also if pesq is not installed.
+    Its columns are ``snr`` (dB), ``raw_mse`` and ``band_error`` (dB, over third octaves), see
+    ``hlsim.metrics.fidelity``, and ``stoi_teacher``, ``stoi_simulator``, ``pesq_teacher`` and
+    ``pesq_simulator``: STOI and PESQ of both outputs against the clean speech. STOI and PESQ are
+    left out where they are not defined, and PESQ also if pesq is not installed.
 
     Args:
         teacher_name: Name of the teacher, see ``evaluate_simulators``.

@@ -188,7 +188,7 @@ class Condition:
     def fingerprint(self) -> str | None:
         """Hash of the code and settings of the processing, or None if unknown.
 
-        Scores are stored only if it is known.
+        For recorded outputs it is the text "recorded". Scores are stored only if it is known.
         """
         return "recorded" if self.process is None else fingerprint(self.process)
 
@@ -423,7 +423,7 @@ def run_measures(
 
 
 def _check_different(noun: str, names: Sequence[str]) -> None:
-    """Raise ValueError if there are no names, or if two of them are equal."""
+    """Raise ValueError if there are no names, or two equal ones; ``noun`` is what they name."""
     if not names:
         raise ValueError(f"expected the name of a {noun}, got none; add one")
     for name in names:

@@ -261,7 +261,10 @@ def _format_estimate(estimate: Estimate, spec: str) -> str:
 
 
 def _tone_pictures(evaluation: Evaluation) -> list[Picture]:
-    """Return one picture per ear: loudness errors of tones at the middle level, for each aid."""
+    """Return one picture per ear: loudness errors of tones over frequency, one curve per aid.
+
+    The tones have the middle one of the measured levels.
+    """
     colours = condition_colours(evaluation.conditions)
     curves: dict[str, dict[str, Any]] = {}
     for row in evaluation.details["steady_tones"]:

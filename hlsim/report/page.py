@@ -290,7 +290,7 @@ def _render(template: str, **values: Any) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """Escape the characters of a text that have a meaning in Markdown.
+    """Escape the characters of a text that have a meaning in Markdown, and join its lines.
 
     Closing brackets have a meaning only before a parenthesis, a colon or other brackets.
     """

@@ -39,7 +39,7 @@ def listening_sections(evaluation: Evaluation, about: str = _EXPLANATION) -> lis
         evaluation: Evaluation of the page, whose attribute ``sounds`` is played.
         about: Sentences about the sounds.
 
-    Returns: The section, or an empty list if no item has sounds.
+    Returns: A list with the section, or an empty list if no item has sounds.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation.result import ItemSounds
@@ -81,7 +81,7 @@ def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) ->
     Args:
         groups: Signals in pascals, as a dict from the heading of a group, which may be empty, to a
             dict from the label of a button to a signal. Shape of each signal: (time,) or (channels,
-            time).
+            time); lengths and numbers of channels may differ.
         sample_rate: Sample rate in Hz.
 
     Raises:
@@ -164,7 +164,7 @@ def _describe_black(levels: Tensor) -> str:
 
 
 def _peak(group: Mapping[str, Tensor]) -> float:
-    """Return the largest magnitude of a sample in a group of signals by label.
+    """Return the largest magnitude of a sample, in pascals, in a group of signals by label.
 
     Raises:
         ValueError: All signals are silent.
@@ -209,10 +209,10 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
 
 
 def _spectrogram_png(levels: Tensor) -> bytes:
-    """Return the contents of a PNG file with one pixel per bin and frame, low frequencies below.
+    """Return the contents of a PNG file with one pixel per bin and frame, bin 0 at the bottom.
 
     Args:
-        levels: Levels in dB SPL. Shape: (bins, frames).
+        levels: Levels in dB SPL, drawn from 0 (black) to 90. Shape: (bins, frames).
 
     Raises:
         MissingExtraError: Pillow or matplotlib is not installed.

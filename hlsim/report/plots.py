@@ -98,7 +98,7 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     """Return a colour of matplotlib for each condition, by its name.
 
     A condition that belongs to another one by its attribute ``of``, such as NAL-R at an aid's
-    level, has the colour of that one, but paler.
+    level, has the colour of that one, but paler: a tuple of this colour and an opacity.
 
     >>> condition_colours([Condition("unaided", kind="unaided"), Condition("mine")])
     {'unaided': '#7d828a', 'mine': '#2f7ed8'}
@@ -253,7 +253,7 @@ def means_pictures(evaluation: Evaluation, part: str = "") -> list[Picture]:
         evaluation: Evaluation with the scores.
         part: Name of the part of the items, such as "Clean speech", for the title.
 
-    Returns: The picture, or an empty list if fewer than two conditions have scores.
+    Returns: A list with the picture, or an empty list if fewer than two conditions have scores.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES
@@ -298,7 +298,7 @@ def scores_pictures(evaluation: Evaluation) -> list[Picture]:
     Args:
         evaluation: Evaluation with comparisons.
 
-    Returns: The picture, or an empty list if there is no comparison of two or more items.
+    Returns: A list with the picture, or an empty list without a comparison of two or more items.
 
     >>> import pandas
     >>> from hlsim.evaluation import MEASURES, compare

@@ -212,7 +212,7 @@ def format_number(value: Any, form: str) -> str:
 
 
 def _mean_and_deviation(mean: float, deviation: float | None) -> str:
-    """Format a mean, and its standard deviation unless it is None or NaN."""
+    """Format a mean, and its standard deviation unless it is None or NaN, as 0.500 ± 0.100."""
     text = format_number(mean, ".3f")
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 

@@ -174,10 +174,10 @@ def _describe_tests(c: ConditionComparison) -> str:
 
 
 def _significant_tests(c: ConditionComparison) -> list[bool]:
-    """Return whether the p value of each test is below ``_ALPHA``.
+    """Return a list of whether the p value of the t-test and of Wilcoxon's test is below 0.05.
 
     A test that is not defined is left out. So is Wilcoxon's test if there are so few items that its
-    p value cannot be below ``_ALPHA``.
+    p value cannot be below 0.05.
     """
     decisions = [] if c.p_t is None else [c.p_t < _ALPHA]
     lowest_p = c.family * 2.0 ** (1 - (c.overall.n - c.overall.zeros))

@@ -188,6 +188,8 @@ def _internal_amplitudes() -> Tensor:
 def _interpolate(amplitudes: NDArray[Any], hertz: NDArray[np.float64]) -> Tensor:
     """Interpolate amplitudes at ``hertz`` to the frequencies of a triplet's Fourier transform.
 
+    Beyond the first and the last frequency, they are constant.
+
     Shape: (n,), (n,) -> (TRIPLET_SAMPLES / 2 + 1,).
     """
     grid = np.fft.rfftfreq(TRIPLET_SAMPLES, 1.0 / NEURO_RATE)

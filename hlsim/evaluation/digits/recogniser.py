@@ -109,9 +109,9 @@ class DigitListener(nn.Module, HubModel):
         return scores.reshape(-1, DIGITS_PER_TRIPLET, 10)
 
     def _band_weights(self) -> Tensor:
-        """Compute the weights that turn powers of a spectrum into powers in triangular bands.
+        """Compute the weights that turn the powers of a spectrum into powers in triangular bands.
 
-        Shape: (frequencies, bands).
+        The spectrum has 257 frequencies, 0 to 8 kHz. Shape: (257, bands).
         """
         count = self.config.bands
         lowest, highest = erb_number(np.array([_LOWEST_HZ, _HIGHEST_HZ]))
