@@ -227,8 +227,8 @@ def simulate_proportions(curve: Curve, aids: Sequence[tuple[Array, float]]) -> l
 
     Args:
         curve: Parameters of the model, from ``load_curve``.
-        aids: One pair per aid: the HASPI of each sentence, (items,), and its mean over these
-            sentences.
+        aids: One pair per aid: the HASPI of each sentence, (items,), and the mean HASPI of the aid,
+            which may be a mean over more sentences.
 
     Returns:
         One array per aid, with the proportion of words for each simulated listener. Shape: (4000,)
