@@ -96,7 +96,7 @@ class Aid(StoredEars, nn.Module):
             Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
 
         Raises:
-            ValueError: An ear or the level is not valid.
+            ValueError: There is no ear, or an ear or the level is not valid.
 
         >>> from compensators import WDRC
         >>> WDRC().gains("N3", level=65.0).round()

@@ -67,6 +67,8 @@ class AdaptiveBeamformer(FilterAndSum):
     frame counts in the averages, and how large a power is added to those of the two signals
     (loading), which makes the weights smaller. Before training, all frames count alike.
 
+    Shape: (..., 2 microphones, 2 ears, time) -> (..., 2 ears, time).
+
     Args:
         config: Sizes and choices, by default ``BeamformerConfig()``.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000. Whole signals at other
@@ -160,7 +162,7 @@ class AdaptiveBeamformer(FilterAndSum):
         """Compute the weights at the end of each frame, and the memory of their averages.
 
         Args:
-            frames: Beams and blocked signals in Pa.
+            frames: Beams, then the signals with little sound from the front (blocked), in Pa.
             state: Memory of earlier frames, of which ``levels``, ``covariance`` and, if there is no
                 frame, ``weights`` are used.
 

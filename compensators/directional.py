@@ -277,6 +277,8 @@ class DifferentialMicrophone(FilterAndSum):
     not amplified further. Source: Elko 2004, in Huang and Benesty (editors), Audio Signal
     Processing for Next-Generation Multimedia Communication Systems, chapter 2.
 
+    Shape: (..., 2 microphones, 2 ears, time) -> (..., 2 ears, time).
+
     Args:
         pattern: "cardioid", "supercardioid", "hypercardioid" or "dipole".
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
@@ -316,9 +318,10 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
     A share, 0 to 1, of a cardioid to the rear is subtracted from a cardioid to the front. A larger
     share moves the null from 180 towards 90 degrees. Each side has one share for all frequencies,
     which minimises the power of its output: it is computed from average powers of the recent past.
-    Source: Elko and Nguyen Pong 1995, IEEE
-    ASSP Workshop on Applications of Signal Processing to Audio and Acoustics, who use an LMS
-    algorithm instead of averages.
+    Source: Elko and Nguyen Pong 1995, IEEE ASSP Workshop on Applications of Signal Processing to
+    Audio and Acoustics, who use an LMS algorithm instead of averages.
+
+    Shape: (..., 2 microphones, 2 ears, time) -> (..., 2 ears, time).
 
     Args:
         seconds: Time constant of the averages in seconds, 0.001 to 10.
@@ -369,6 +372,8 @@ class BinauralMVDR(FilterAndSum):
     modelled as a rigid sphere, and the noise as sounds of equal power from all directions. Only
     sounds from the front keep their differences of level and time between the ears: remaining noise
     gets those of the front.
+
+    Shape: (..., 2 microphones, 2 ears, time) -> (..., 2 ears, time).
 
     Args:
         loading: Power of each microphone's own noise, relative to the diffuse noise, for which the
@@ -448,7 +453,7 @@ class DirectionalAid(nn.Module):
         return output[..., -waveform.shape[-1] :]
 
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
-        """Measure the insertion gains of the aid behind the front end, see ``Aid.gains``.
+        """Measure the insertion gains in dB of the aid behind the front end, see ``Aid.gains``.
 
         They do not include the front end, which passes sound from the front nearly unchanged; a
         differential microphone attenuates it below its ``lowest`` frequency.
@@ -491,7 +496,7 @@ def behind_front_end(aid: Any) -> Any:
 
 
 def look_ahead_samples(sample_rate: int) -> int:
-    """Return the look-ahead of the filters in whole samples, at most 1 ms.
+    """Return the look-ahead of front ends' filters in whole samples, at most 1 ms.
 
     >>> look_ahead_samples(16000)
     16
@@ -500,7 +505,7 @@ def look_ahead_samples(sample_rate: int) -> int:
 
 
 def filter_length(sample_rate: int) -> int:
-    """Return the length of the filters in samples, including the look-ahead.
+    """Return the length of front ends' filters in samples, 9 ms including the look-ahead.
 
     >>> filter_length(16000)
     144

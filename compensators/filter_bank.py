@@ -170,7 +170,7 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
         gains: Gain just before the first sample, then that at the last sample of each hop at 16
             kHz.
         rate: Sample rate of the signal in Hz.
-        time: Number of samples of the signal. The last one comes before the last one of the hops.
+        time: Number of samples of the signal, which ends before the hops do.
 
     Shape: (items, hops + 1) -> (items, time).
 
@@ -213,7 +213,9 @@ def level_db(powers: Tensor) -> Tensor:
 
 @constant
 def speech_band_levels(bands: int) -> NDArray[np.float64]:
-    """Return the level in dB SPL of average speech in each band, at 65 dB SPL in total, (bands,).
+    """Return the level in dB SPL of average speech in each band, (bands,), at 65 dB SPL in total.
+
+    The centres of the bands are those of ``filter_centres``.
 
     >>> print(speech_band_levels(4).round())
     [60. 63. 53. 43.]

@@ -57,7 +57,7 @@ def find_highest_levels(limits: Tensor, bands: int) -> Tensor:
     """Compute the level that each band of the output stays below.
 
     Args:
-        limits: Levels of tones in dB HL that bands stay below.
+        limits: Levels of tones in dB HL at ``FREQUENCIES`` that bands stay below.
         bands: Number of bands.
 
     Returns:

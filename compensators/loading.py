@@ -124,7 +124,7 @@ def save_compensator(model: Trained, folder: str | Path, audiogram: EarLike | No
 
 
 def trained_for(name: str | Path) -> Audiogram | None:
-    """Return the ear for which a compensator was trained, or None if it was trained for all ears.
+    """Return the ear for which a compensator was trained; None for all ears or a prescription.
 
     Args:
         name: Name or folder, as in ``load_compensator``.

@@ -53,8 +53,8 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
     With several microphones per ear, the input has the shape (..., microphones, time) for one ear,
     or (..., microphones, 2, time) for two. The first microphone is the reference. A third decoder
     computes a complex weight for each other microphone, time and frequency, with which its signal
-    is added to that of the reference (filter and sum). Its inputs are the levels and phases of
-    these signals relative to the reference. Before training, the weights are 0.
+    is added to that of the reference (filter and sum). The network then also gets the levels and
+    phases of these signals relative to the reference. Before training, the weights are 0.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
@@ -199,7 +199,8 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
         It lies between plus and minus ``config.reach_db`` dB.
 
         Args:
-            features: Features after the last block. Shape: (items, channels, ...).
+            features: Features after the last block, on the coarser grid of the encoder. Shape:
+                (items, channels, times, frequencies).
             size: Number of frames and of frequencies of the spectrum.
 
         Returns:

@@ -327,7 +327,7 @@ class Wearable(Aid):
             lead: Number of samples at the start of the block that have no output. Resampling needs
                 them.
             lag: Number of samples at the end of the block that resampling needs and that have no
-                output; 0 at the end of a signal.
+                output, as the 4 ms before them; 0 at the end of a signal.
             state_time: Time after the lead at which the state is returned, in samples at 16 kHz and
                 whole hops; by default at the end.
 

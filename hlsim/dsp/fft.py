@@ -107,8 +107,8 @@ def correlate(output: Tensor, reference: Tensor) -> tuple[int, float]:
     The mean of each signal is subtracted first.
 
     Args:
-        output: The output. Shape: (time,).
-        reference: Signal with which it is compared. Shape: (other time,).
+        output: The output, on the CPU and without a gradient. Shape: (time,).
+        reference: Signal with which it is compared, likewise. Shape: (other time,).
 
     Returns:
         The number of samples by which the output is later, negative if it is earlier; and the

@@ -135,7 +135,7 @@ def filters_with_gains(
 
 @constant
 def _unit_filters(order: int) -> NDArray[np.float64]:
-    """Design one filter for each of ``order + 1`` evenly spaced frequencies.
+    """Design a filter for each of ``order + 1`` frequencies, evenly spaced from 0 Hz to Nyquist.
 
     The gain of a filter is 1 at its frequency and 0 at the other frequencies. Filters are linear in
     their gains: the sum of these filters times some gains is the filter with these gains.

@@ -60,9 +60,9 @@ def evenly_spread_directions(count: int) -> NDArray[np.float64]:
 def sphere_response(cosines: ArrayLike, frequencies: ArrayLike) -> NDArray[np.complex128]:
     """Compute the sound pressure of plane waves on a rigid head, relative to the free field.
 
-    The head is a sphere of the radius ``HEAD_RADIUS``; the free field is the pressure at its centre
-    without it. This is the limit of Equation 2 of Duda and Martens 1998, Journal of the Acoustical
-    Society of America 104(5), for distant sources. A positive phase is an advance, as in
+    The head is a sphere of the radius ``HEAD_RADIUS``, 8.75 cm; the free field is the pressure at
+    its centre without it. This is the limit of Equation 2 of Duda and Martens 1998, Journal of the
+    Acoustical Society of America 104(5), for distant sources. A positive phase is an advance, as in
     ``numpy.fft``.
 
     Args:

@@ -93,10 +93,12 @@ class STFT:
         return total / total_weight
 
     def _overlap_add(self, frames: Tensor) -> Tensor:
-        """Add frames that begin one hop apart. Shape: (items, frames, window) -> (items, time).
+        """Add frames that begin one hop apart.
 
-        Each frame is cut into parts of one hop. Part p of frame k belongs to hop k + p of the
-        result.
+        Each frame is zero-padded and cut into parts of one hop. Part p of frame k belongs to hop
+        k + p of the result.
+
+        Shape: (items, frames, window) -> (items, (frames - 1 + parts) * hop).
         """
         parts = -(-self.window // self.hop)
         padded = functional.pad(frames, (0, parts * self.hop - self.window))

@@ -84,7 +84,7 @@ class Criterion:
 
     Attributes:
         weights: Default weight of each part by its name.
-        compute: Function that returns the parts by name, (items,) each.
+        compute: Function from a ``Comparison`` to its parts by name, (items,) each.
         reference: Signal with which perceived speech is compared; None for a criterion that
             compares the output of the aid with clean speech.
         limits_gradient: Whether spikes of the gradient with respect to the output are limited.

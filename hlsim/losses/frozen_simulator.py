@@ -108,8 +108,8 @@ class FrozenSimulator:
         Args:
             waveform: Output of an aid, on the scale of ``full_scale_spl``.
             thresholds: Thresholds of the ears in dB HL.
-            lengths: Number of samples of each item of a padded batch, on the CPU. By default, all
-                items are as long as the batch.
+            lengths: Number of samples of each item of a padded batch, (...), on the CPU. By
+                default, all items are as long as the batch.
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
 

@@ -33,12 +33,13 @@ def limit_gradient_spikes(
     In ears that perceive next to nothing, a simulator gives a few samples a gradient a thousand
     times as large as that of all other samples, which then hardly affect the training step. The
     gradient is therefore divided into blocks of 5 ms. The largest magnitude in a block may be six
-    times the usual magnitude of the item: the 90th percentile over its samples outside pauses. In
-    pauses, which are blocks of the waveform whose RMS is more than 30 dB below that of the loudest
-    block, it may be once the usual magnitude. Where it is larger, the whole block is scaled down to
-    the limit. Limiting single samples would give the gradient a non-zero mean, from which a
-    convolutional network learns an inaudible constant pressure. Samples after the end of an item
-    have the gradient 0. NaN in a gradient is passed on. The gradient has no derivative of its own.
+    times the usual magnitude of the item: the 90th percentile over its samples outside pauses, but
+    without those whose gradient is 0. In pauses, which are blocks of the waveform whose RMS is more
+    than 30 dB below that of the loudest block, it may be once the usual magnitude. Where it is
+    larger, the whole block is scaled down to the limit. Limiting single samples would give the
+    gradient a non-zero mean, from which a convolutional network learns an inaudible constant
+    pressure. Samples after the end of an item have the gradient 0. NaN in a gradient is passed on.
+    The gradient has no derivative of its own.
 
     Shape: (..., time) -> (..., time).
 

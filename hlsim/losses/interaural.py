@@ -18,8 +18,8 @@ def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
 
     Gains and delays that are equal in both ears are ignored. The loss of an octave is the error of
     the level difference in bels (10 dB), plus 1 minus the cosine of the error of the phase
-    difference. The result is a mean over octaves, in which octaves where clean speech is soft have
-    less weight.
+    difference. The result is a mean over five octaves around 250 Hz to 4 kHz, in which octaves
+    where clean speech is soft have less weight.
 
     Args:
         output: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).

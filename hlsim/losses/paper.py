@@ -50,9 +50,10 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
     This is the sum of three means: of the distance between the phases, and of the distances between
     their differences from frequency to frequency (group delay) and from frame to frame
-    (instantaneous frequency). All frequencies count alike in the value. The gradient of a phase is
-    1 / magnitude, so that inaudible frequencies would dominate the gradient. Therefore the gradient
-    is faded out where the estimate or the target is fainter than a tone of 20 dB SPL.
+    (instantaneous frequency, left out for a single frame). All frequencies count alike in the
+    value. The gradient of a phase is 1 / magnitude, so that inaudible frequencies would dominate
+    the gradient. Therefore the gradient is faded out where the estimate or the target is fainter
+    than a tone of 20 dB SPL.
 
     The spectra are those of signals in pascals by ``PAPER_STFT``.
 
@@ -124,6 +125,8 @@ class _FadedPhaseDifference(DifferentiableFunction):
 
     The gradient of the angle of z is i z / |z|^2. Here it is faded out near silence: multiplied by
     |z|^2 / (|z|^2 + ``FAINT_POWER``), and by the same factor of the other spectrum.
+
+    Shape: complex (...) twice -> (...) in radians.
     """
 
     @staticmethod

@@ -125,6 +125,8 @@ def haaqi(
 def _split_by_rate(waves: Tensor) -> Tensor:
     """Divide the fluctuations of cepstral coefficients into four bands of modulation, 20 to 125 Hz.
 
+    The coefficients are those of segments, 250 per second.
+
     Shape: (items, 5, time) -> (items, 4 bands, 5, time or more).
     """
     time = waves.shape[-1]
@@ -163,8 +165,9 @@ class HaaqiReference(QualityReference):
             are computed, and the level is validated, for each score.
 
     Raises:
-        ValueError: Clean music that lasts less than 0.7 s, is not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram, length or equalisation out of range.
+        ValueError: Clean music that lasts less than 0.7 s, has less than 16 ms of sound, is not
+            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
+            of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

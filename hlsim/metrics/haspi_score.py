@@ -230,7 +230,8 @@ class HaspiReference(Reference):
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device; clean speech that
-                a normal ear does not hear; an audiogram or seed out of range; an unknown noise.
+                a normal ear does not hear or, with ``keep=False``, that is silent, too soft or too
+                short; an audiogram or seed out of range; an unknown noise.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
         return as_type_of(output, _intelligibility(self._compare_all(output, noise, seed, ears)))

@@ -198,7 +198,7 @@ def _window() -> NDArray[np.float64]:
 
 
 def _band_features(frames: Tensor) -> Tensor:
-    """Compute four features of each band in each frame.
+    """Compute four features of each one-third-octave band in each frame.
 
     The features are the power of the left ear, that of the right ear, and the real and the
     imaginary part of their cross-spectrum.
@@ -218,7 +218,7 @@ def _band_features(frames: Tensor) -> Tensor:
 
 
 def _mean_correlation(features: Tensor, counts: list[int]) -> Tensor:
-    """Compute the mean correlation over all segments of each item.
+    """Compute the mean correlation over all segments of each item that end before its last frame.
 
     Args:
         features: Output of ``_band_features``. Shape: (frames of all items, bands, 8).

@@ -124,15 +124,15 @@ def scores_or_errors(
 
     Args:
         score: Function that computes the score, such as ``haspi``.
-        output: Outputs of an aid. Shape: (items, time).
-        clean: Clean signals. Shape: (items, time).
-        ears: Thresholds of the ear of each item in dB HL. Shape: (items, 8).
+        output: Outputs of an aid. Shape: (items, time) or (items, ears, time).
+        clean: Clean signals of the same shape.
+        ears: Thresholds in dB HL. Shape: (items, 8) or (items, ears, 8).
         ends: Number of samples of each item before padding.
         settings: Further keyword arguments of ``score``.
 
     Returns:
-        For each item, its score, a tensor without dimensions, or its ValueError. A wrong setting or
-        shape causes the same error for every item.
+        For each item, its result of ``score``, or its ValueError. A wrong setting or shape causes
+        the same error for every item.
 
     >>> from hlsim.metrics import haspi
     >>> silence = torch.zeros(1, 16000)

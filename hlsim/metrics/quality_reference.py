@@ -73,8 +73,9 @@ class QualityReference(Reference):
             are computed, and the level is validated, for each score.
 
     Raises:
-        ValueError: Clean signals that last less than 0.7 s, are not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram, length or equalisation out of range.
+        ValueError: Clean signals that last less than 0.7 s, have less than 16 ms of sound, are not
+            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
+            of range.
 
     >>> from hlsim import example_speech
     >>> from hlsim.metrics import HasqiReference
@@ -104,7 +105,8 @@ class QualityReference(Reference):
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device; an unknown noise
-                or a seed out of range.
+                or a seed out of range; with ``keep=False``, a clean signal that is silent, too soft
+                or too short.
         """
         return as_type_of(output, self.parts(output, noise=noise, seed=seed).combined)
 
@@ -123,7 +125,8 @@ class QualityReference(Reference):
 
         Raises:
             ValueError: Outputs of another shape, not finite or on another device; an unknown noise
-                or a seed out of range.
+                or a seed out of range; with ``keep=False``, a clean signal that is silent, too soft
+                or too short.
         """
         return QualityParts(*self._compare_all(output, noise, seed).unbind(-1))
 
@@ -195,9 +198,9 @@ class QualityReference(Reference):
     def _compare(
         self, batch: PreparedBatch, output: Tensor, cells: HairCells, noise: Noise, seed: int
     ) -> Tensor:
-        """Compute the score of each item, its nonlinear part and its linear part.
+        """Compute the score of each item, its nonlinear part and its linear part, (items, 3).
 
-        Shape: -> (items, 3).
+        Arguments are those of ``Reference._compare``.
         """
         extent = batch.clean.audible
         noises = _threshold_noise(noise, seed, extent, output)

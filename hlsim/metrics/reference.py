@@ -78,8 +78,9 @@ class Reference(ABC):
             validated, for each score, which takes less memory.
 
     Raises:
-        ValueError: Clean signals that last less than 0.7 s, are not finite, silent or below 20 dB
-            SPL; a rate, level, audiogram, length or equalisation out of range.
+        ValueError: Clean signals that last less than 0.7 s, have less than 16 ms of sound, are not
+            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
+            of range.
 
     >>> from hlsim.metrics import HaspiReference
     >>> issubclass(HaspiReference, Reference)
@@ -148,7 +149,11 @@ class Reference(ABC):
     @torch.inference_mode(False)  # the features may serve a training later
     @torch.no_grad()
     def _prepare(self, items: slice) -> PreparedBatch:
-        """Validate the clean signals of a range of items, and compute their features."""
+        """Validate the clean signals of a range of items, and compute their features.
+
+        Raises:
+            UnscorableError: A signal is silent, too soft or too short to be scored.
+        """
         with torch.autocast(self._clean.device.type, enabled=False):
             clean = CleanBatch(self._rows, self._ends, items, self._rate, self._full_scale_spl)
             ears, at_ear = self._ears[items], clean.signals

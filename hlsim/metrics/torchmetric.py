@@ -124,7 +124,7 @@ class _MeanScore(_Metric):
         super().merge_state(state)
 
     def _check_signature(self, signature: Any) -> None:
-        """Raise ValueError unless a state has the signature of this metric's settings."""
+        """Raise ValueError unless a state has the signature, a hash, of this metric's settings."""
         if int(signature) != int(self.signature):
             raise ValueError(
                 f"expected the state of {type(self).__name__} with the settings of this metric; "

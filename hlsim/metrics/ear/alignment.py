@@ -49,7 +49,8 @@ def bulk_delays(reference_spectrum: Tensor, output: Tensor, extent: Extent) -> T
     The delay is found by the largest magnitude of the cross-covariance of the whole signals.
 
     Args:
-        reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``.
+        reference_spectrum: Spectra of the clean signals by ``spectrum_for_alignment``. Shape:
+            (items, frequencies).
         output: Outputs at 24 kHz. Shape: (items, time).
         extent: Number of samples of each item, equal for clean signals and outputs.
 
@@ -121,7 +122,8 @@ def align_channels(
         signal: Channels to shift. Shape: (items, channels, padded).
         envelope: Envelope or motion of the same channels, from which the shifts are computed.
             Shape: (items, channels, padded).
-        reference_spectrum: ``lag_spectrum`` of the clean signal's envelope or motion.
+        reference_spectrum: ``lag_spectrum`` of the clean signal's envelope or motion. Shape:
+            (items, channels, blocks, frequencies).
         extent: Number of samples of each item before padding.
 
     Returns:

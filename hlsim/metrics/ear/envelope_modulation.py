@@ -459,9 +459,10 @@ def _noise_energy(frames: int) -> NDArray[np.float64]:
 
 @constant
 def _twice_filtered(points: int) -> NDArray[np.float64]:
-    """Return the weights by which a sum of squared spectra is the energy after filtering twice.
+    """Return weights for squared magnitudes of a spectrum, whose weighted sum is an energy.
 
-    Shape: (10, points // 2 + 1).
+    It is the energy of the signal after it passed each modulation filter twice. Shape: (10,
+    points // 2 + 1).
     """
     sides = np.full(points // 2 + 1, 2.0)
     sides[[0, -1]] = 1.0

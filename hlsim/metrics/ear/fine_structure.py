@@ -286,7 +286,7 @@ _LAGS = (*range(MAX_LAG + 1), *range(-MAX_LAG, 0))
 
 @constant
 def _inverse_transform() -> NDArray[np.float64]:
-    """Return the inverse Fourier transform at some lags, from real and imaginary parts in turn.
+    """Return the inverse Fourier transform at ``_LAGS``, from real and imaginary parts in turn.
 
     Shape: (2 * frequencies, 49).
     """

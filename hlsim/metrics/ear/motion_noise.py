@@ -38,7 +38,7 @@ def draw_motion_noise(seed: int, samples: int, dtype: torch.dtype) -> Tensor:
 
 @lru_cache(maxsize=256)  # the conditions and the ears of an item have the same state
 def state_after_motion_noise(seed: int, samples: int) -> Any:
-    """Return the state of NumPy's generator after the noise, in less time than drawing it.
+    """Return the state of NumPy's generator after ``draw_motion_noise``, without drawing the noise.
 
     NumPy makes two normal numbers of each pair of uniform ones that lies in a circle (Marsaglia's
     polar method), and rejects the other pairs. To find the state, it is enough to count.

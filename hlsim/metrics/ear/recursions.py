@@ -179,14 +179,20 @@ def _recursion(
 
 
 def _gramian(a: Array, b: Array) -> Array:
-    """Return the matrix x with x = a x a^T + b b^T: how strongly an input excites each state."""
+    """Return the matrix x with x = a x a^T + b b^T: how strongly an input excites each state.
+
+    Shape: (states, states), (states, 1) -> (states, states).
+    """
     states = len(a)
     gramian = np.linalg.solve(np.eye(states**2) - np.kron(a, a), (b @ b.T).ravel())
     return np.asarray(gramian.reshape(states, states))
 
 
 def _state_space(numerator: Array, denominator: Array) -> tuple[Array, Array, Array, float]:
-    """Return a, b, c and d of ``StateSpace`` for a filter with the first denominator 1."""
+    """Return a, b, c and d of ``StateSpace`` for the coefficients of a filter, (states + 1,) each.
+
+    The first coefficient of the denominator is 1.
+    """
     order = len(denominator) - 1
     a = np.eye(order, k=-1)
     a[0] = -denominator[1:]
