@@ -164,7 +164,7 @@ def _open_audio(path: str | Path) -> Iterator[soundfile.SoundFile]:
     """Open an audio file for a ``with`` block.
 
     Raises:
-        ValueError: There is no such file, or an exception was raised in the block.
+        ValueError: There is no such file, it is no audio, or the block raised an exception.
     """
     if not Path(path).is_file():
         raise ValueError(f"{path}: there is no such audio file; correct the path")
@@ -218,8 +218,9 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
-        ValueError: The extension is not .wav, the shape or the sample rate is not supported, or
-            samples are NaN, infinite or above 1e9, or the file cannot be written.
+        ValueError: The extension is not .wav, the shape or the sample rate is not supported, the
+            signal has no samples or is too long for a WAV file (4 GB), a sample is NaN, infinite or
+            above 1e9 in magnitude, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -370,6 +371,9 @@ def _visible_files(folder: str | Path) -> Iterator[tuple[Path, str]]:
 
     Args:
         folder: Folder to search.
+
+    Raises:
+        OSError: A folder cannot be read.
     """
     folders, links = [Path(folder)], deque[Path]()
     searched = set()

@@ -117,7 +117,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
         waveform: Samples.
         spl: Level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
             dimensions, from the level of silence (-106 at the default scale) to 140 dB SPL. For
-            a waveform on a GPU, it is not validated, because that would synchronise with the GPU.
+            a waveform on a GPU, levels are not validated, because that would synchronise with it.
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
@@ -152,7 +152,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
 
 
 def check_loudness(loudness: Loudness) -> Loudness:
-    """Validate a target of loudness, and return it with ascending levels.
+    """Validate a target of loudness, and return it in floats, a mapping by ascending levels.
 
     Args:
         loudness: Loudness in dB relative to a normal ear, -40 to 20: a number, or a mapping from
@@ -181,7 +181,7 @@ def loudness_at(loudness: Loudness, levels: Tensor) -> Tensor:
     A curve is linear between its levels, and constant beyond them.
 
     Args:
-        loudness: Loudness in dB relative to a normal ear, see ``check_loudness``.
+        loudness: Loudness in dB relative to a normal ear, as ``check_loudness`` returns it.
         levels: Levels of the inputs in dB SPL. Any shape.
 
     Returns:

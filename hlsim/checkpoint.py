@@ -315,7 +315,7 @@ def _write_card(folder: Path, kind: str, about: Settings, metadata: Settings) ->
 
 
 def _digest(config: Any) -> str:
-    """Compute the SHA-256 of a configuration, which does not depend on the order of settings."""
+    """Compute the SHA-256 of settings in JSON's types, in hexadecimal, whatever their order."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
@@ -328,8 +328,9 @@ class HubModel:
     ``huggingface_hub.PyTorchModelHubMixin``, which is no base class here because hlsim works
     without this package.
 
-    Subclasses define ``kind``, ``config_class`` and ``config``, and may define ``build_options``,
-    arguments with which the class is built when a checkpoint is loaded.
+    Subclasses define ``kind``, that of their checkpoints; ``config_class``, the class of their
+    settings; and ``config``, the settings. They may define ``build_options``, arguments with which
+    the class is built when a checkpoint is loaded.
 
     >>> import hlsim
     >>> with TemporaryDirectory() as folder:

@@ -288,7 +288,7 @@ def _check_export(aid: Any, items: int) -> None:
 
 
 class _Call(nn.Module):
-    """Module that calls a function of a model and named tensors, as ``torch.export`` needs it.
+    """Module that calls ``function(model, **tensors)``, because ``torch.export`` needs a module.
 
     The function returns tensors by name.
     """
@@ -323,8 +323,8 @@ def _process_hops(aid: Wearable, **inputs: Tensor) -> dict[str, Tensor]:
         inputs: Tensors of ``first_inputs``, with any samples and state.
 
     Returns:
-        The output, (items, time), on the scale of the samples, and each tensor of the state after
-        the hops, under its name with the prefix ``next_``.
+        The output, (items, hops * 64), on the scale of the samples, and each tensor of the state
+        after the hops, under its name with the prefix ``next_``.
     """
     gain = gain_to_pascals(aid.full_scale_spl)
     empty = inputs["samples"][:, :0]
@@ -340,7 +340,7 @@ def _process_hops(aid: Wearable, **inputs: Tensor) -> dict[str, Tensor]:
 def _to_program(
     model: nn.Module, function: Callable[..., dict[str, Tensor]], inputs: dict[str, Tensor]
 ) -> torch.export.ExportedProgram:
-    """Export a function of a model for inputs with the names and shapes of ``inputs``."""
+    """Export ``function(model, **inputs)`` for tensors with the names and shapes of ``inputs``."""
     with torch.no_grad(), warnings.catch_warnings():
         # torch.export warns of the list of weights in nn.LSTM, which does no harm.
         warnings.filterwarnings("ignore", r"The tensor attributes .*_flat_weights")

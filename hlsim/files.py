@@ -35,7 +35,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         The temporary path.
 
     Raises:
-        ValueError: The path cannot be written, for example because the disk is full.
+        ValueError: The path cannot be written, for example because the disk is full, or the block
+            raised OSError.
 
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     with atomic_path(f"{folder}/scores.csv") as temporary:
@@ -266,12 +267,13 @@ def read_table(
     Args:
         table: CSV file, whose first line names the columns, or data frame.
         contents: Description of the contents for error messages, such as "the manifest".
-        known_columns: Names in lower case of columns that may have capitals in the table.
+        known_columns: Names in lower case of columns that may have capitals in the table, but have
+            none in the result.
 
     Returns:
-        One pair per row: its place for messages, and its texts by column, without surrounding
-        blanks. Missing values are empty. Rows without any value, and columns without a name, are
-        left out.
+        One pair per row: its place for messages, such as ``ears.csv, line 2``, and its texts by
+        column, without surrounding blanks. Missing values are empty. Rows without any value, and
+        columns without a name, are left out.
 
     Raises:
         ValueError: The file cannot be read, the value is neither a file nor a data frame, there
@@ -353,7 +355,7 @@ def warn_of_unused(columns: Collection[str], contents: str, known_columns: Colle
     """Warn of columns of a table that nothing reads, because their names may be misspelt.
 
     Args:
-        columns: Names of the columns.
+        columns: Names of the columns that nothing reads. If there are none, nothing happens.
         contents: Description of the table for the message.
         known_columns: Names of columns that are read.
 
@@ -368,7 +370,9 @@ def warn_of_unused(columns: Collection[str], contents: str, known_columns: Colle
 
 
 def _read_csv(path: Path, contents: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns of a CSV file, and the number and the texts of each line.
+    """Read the header of a CSV file, and the number and the texts of each line below it.
+
+    Empty lines are left out. A number is that of the line in the file.
 
     Args:
         path: File with commas, semicolons or tabs.
@@ -424,7 +428,11 @@ def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> R
 
 
 def _decode(data: bytes) -> str:
-    """Decode the text of a file: UTF-16 if it begins with its mark, UTF-8, or else cp1252."""
+    """Decode the text of a file: UTF-16 if it begins with its mark, UTF-8, or else cp1252.
+
+    Raises:
+        UnicodeDecodeError: The bytes are in none of these encodings.
+    """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
     try:

@@ -76,7 +76,7 @@ class ProgressLine:
             if is_last:
                 self._stage_start = now
             if is_last or done < total:
-                self._show(self._count(now), now, is_due=is_first or is_last)
+                self._show(self._describe_counts(now), now, is_due=is_first or is_last)
 
     def print(self, text: str, file: TextIO | None = None) -> None:
         """Print a line of results, in a terminal in place of the line of progress.
@@ -94,7 +94,8 @@ class ProgressLine:
     def _watch(self) -> None:
         """Show the line every second, or every 10 without a terminal, until the work has ended.
 
-        While the line of a part of the work is active, this one waits. Runs in a thread of its own.
+        While the line of an inner ``with`` block is active, this one waits. Runs in a thread of
+        its own.
         """
         while not self._ended.wait(_TICK):
             if _active_lines[-1] is not self:
@@ -103,14 +104,18 @@ class ProgressLine:
                 now = time.time()
                 done, total = self._counts
                 if self._first is not None and done < total:
-                    text = self._count(now)
+                    text = self._describe_counts(now)
                 else:
                     stage = self.before if self._first is None else self.after
                     text = f"{stage}, {now - self._stage_start:.0f} s"
                 self._show(text, now)
 
-    def _count(self, now: float) -> str:
-        """Return a text with the number of finished units and the estimated time of the end."""
+    def _describe_counts(self, now: float) -> str:
+        """Return a text with the number of finished units and the estimated time of the end.
+
+        Args:
+            now: Present time in seconds, from ``time.time``.
+        """
         done, total = self._counts
         text = f"{int(done)} of {total:g} {self.unit} ({done / total:.0%})"
         first_done, start = self._first or (done, now)

@@ -65,7 +65,7 @@ class Attenuation(StoredEars, nn.Module):
             on the output, but on the warning about loud signals.
 
     Attributes:
-        reach: Number of samples before and after an output sample that influence it.
+        reach: Number of input samples before and after an output sample that influence it.
         thresholds: Thresholds of the constructor's ears in dB HL, (..., 8), or None.
 
     Raises:

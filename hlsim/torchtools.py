@@ -120,7 +120,8 @@ def without_modes(
         arguments: Positional arguments of the function.
         options: Keyword arguments of the function.
 
-    Returns: Result of the function.
+    Returns:
+        Result of the function.
 
     >>> with torch.inference_mode():
     ...     without_modes(torch.ones, 2).is_inference()
@@ -264,7 +265,7 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def _count_bytes(value: Any) -> int:
-    """Return the bytes of a tensor or an array, or of all in a list, tuple, dict or object."""
+    """Count the bytes of a tensor or an array, or of all those in a list, tuple, dict or object."""
     if isinstance(value, Tensor | np.ndarray):
         return value.nbytes
     if hasattr(value, "__dict__"):
@@ -333,7 +334,7 @@ def as_type_of(signal: Audio, result: Tensor) -> Audio:
 
     Args:
         signal: Signal from which the result was computed.
-        result: Tensor, on the CPU if the signal is an array, which has no gradient.
+        result: Tensor, which must be on the CPU if the signal is an array. A gradient is then lost.
 
     >>> as_type_of(np.ones(2), torch.tensor(0.5))
     np.float32(0.5)
@@ -400,7 +401,10 @@ class DifferentiableFunction(torch.autograd.Function):
 
     @classmethod
     def call(cls, *arguments: Any) -> Any:
-        """Apply the function. torch.compile would fail in a method that replaces ``apply``."""
+        """Apply the function to its arguments, by ``forward`` alone where gradients are disabled.
+
+        This method does not replace ``apply``, because torch.compile would fail in it.
+        """
         if torch.is_grad_enabled():
             return cls.apply(*arguments)
         return cls.forward(*arguments)
@@ -549,7 +553,7 @@ def _find_copy(tensor: Tensor, device: torch.device) -> Tensor | None:
 
 
 def _add_copy(tensor: Tensor, copy: Tensor) -> None:
-    """Remember a copy of a tensor on another device, unless the copy could become outdated."""
+    """Remember a copy of a tensor on another device, unless later changes cannot be detected."""
     if _can_be_remembered(tensor):
         _COPIES.setdefault(tensor, {})[copy.device] = tensor._version, copy
 

@@ -46,7 +46,7 @@ class Listener:
             raise ValueError("expected an audiogram of at least one ear of the listener, got none")
 
     def ears(self) -> dict[EarName, Audiogram]:
-        """Return the audiograms of the known ears, under the keys ``"left"`` and ``"right"``."""
+        """Return the audiograms that are not None, under the keys ``"left"`` and ``"right"``."""
         ears = zip(EARS, (self.left, self.right), strict=True)
         return {name: ear for name, ear in ears if ear is not None}
 

@@ -293,8 +293,8 @@ def check_two_channels(waveform: Tensor) -> None:
 def _check_tensor(levels: Any, highest: float) -> Tensor:
     """Validate a tensor of thresholds in dB HL, (..., 8), and return it as floating-point numbers.
 
-    An ear with a level out of range becomes NaN where the values are not known on the CPU, and in a
-    compiled program.
+    An ear with a level out of range becomes NaN if the values are on a GPU, without a copy on the
+    CPU that ``known_on_host`` returns, and in a compiled program.
 
     Raises:
         ValueError: The value is not such a tensor, or is empty, or a level is NaN or out of range.

@@ -63,7 +63,7 @@ class Utterance:
         """Numbers in ``reference``.
 
         Raises:
-            ValueError: The text is not empty, one number, or two as in ``1 2``.
+            ValueError: The text is neither empty nor one number nor two as in ``1 2``.
         """
         texts = self.reference.split()
         numbers = tuple(int(text) for text in texts if text.isdecimal())

@@ -25,7 +25,7 @@ class SceneFiles(NamedTuple):
     """Files of a recorded scene.
 
     Attributes:
-        clean: Clean speech, with one channel, or one for each ear.
+        clean: File of the clean speech, with one channel, or one for each ear.
         microphones: Files of the noisy speech, whose channels count from the first to the last.
         references: Number of the reference channel, from 1, for one ear or for two. Empty for a
             single microphone, whose file has one channel.

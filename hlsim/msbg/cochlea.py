@@ -178,9 +178,11 @@ def simulate_cochlea(
 
 
 def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tensor]:
-    """Compute the channels of a rate band in Pa, and the sums from which ``smooth`` gets envelopes.
+    """Compute the channels of a rate band, and the sums from which ``smooth`` gets envelopes.
 
-    The three sums per step are parts of three neighbouring envelopes, see ``partial_means``.
+    The channels are not in Pa: their Fourier transforms have the scale of ``spectrum``, at fewer
+    points. The three sums per step, in Pa, are parts of three neighbouring envelopes, see
+    ``partial_means``.
 
     Shape: complex (items, bins) -> (items, channels, time), (items, channels, 3, steps), where time
         is ``band.points``, or twice as many for the detector ``"modulus"``, whose channels are

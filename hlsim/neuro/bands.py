@@ -67,11 +67,11 @@ class BandCorrection(nn.Module):
             frequencies) twice.
 
         Args:
-            spectrum: Real and imaginary parts of the spectra of MSBG's frames, see
+            spectrum: Real and imaginary parts of the spectra of MSBG's frames in Pa, see
                 ``hlsim.neuro.frame_grid``.
             ears: Thresholds in dB HL.
             severity: Degree of loss of each ear, 0 (none) to 3 (severe).
-            prior: Estimate of MSBG's gains.
+            prior: Estimate of MSBG's smearing and gains for these frames.
         """
         smeared_power = prior.smear_powers(power(*spectrum), severity)
         levels = prior.channel_levels(smeared_power, severity)
@@ -119,7 +119,10 @@ class _Block(nn.Module):
     Features are those of the network, not the channels of MSBG's filter bank. The convolution sees
     as much of the future as of the past. Each severity has its own weights.
 
-    Shape: (items, features, steps), (items,) -> (items, features, steps).
+    Shape: (items, features, steps), severities (items,) -> (items, features, steps).
+
+    Args:
+        config: Settings, see ``BandCorrection``.
     """
 
     def __init__(self, config: NeuroConfig) -> None:

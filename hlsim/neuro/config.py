@@ -18,7 +18,7 @@ MAX_SIZE = 1024
 
 
 def number(default: float, lowest: float, highest: float) -> Any:
-    """Declare a setting of a ``ModelConfig`` that is a number in a range.
+    """Return the dataclass field for a setting of a ``ModelConfig``, a number in a range.
 
     Args:
         default: Default value.

@@ -89,7 +89,8 @@ def to_frame_rate(waveform: Tensor) -> Tensor:
     Shape: (items, time) -> (items, time * 1323 / 1280), rounded up.
 
     Args:
-        waveform: Signals at 16 kHz, whose first sample is at a multiple of ``FRAME_PERIOD``.
+        waveform: Signals at 16 kHz. A part of a longer signal must begin at a multiple of
+            ``FRAME_PERIOD``, so that its frames are those of the whole.
 
     >>> to_frame_rate(torch.randn(2, 1280)).shape
     torch.Size([2, 1323])
@@ -233,10 +234,7 @@ class _Synthesis(DifferentiableFunction):
 
 
 def _transform_units(time: int) -> int:
-    """Return the length of Fourier transforms of ``time`` samples at 16 kHz or more, in units.
-
-    A unit has 160 ms (``_UNIT``).
-    """
+    """Choose the length of transforms for ``time`` samples at 16 kHz, in units of 160 ms."""
     return fft_length(math.ceil(time / _UNIT))
 
 
@@ -277,13 +275,13 @@ def _synthesis_matrices() -> NDArray[np.float64]:
 
 @constant
 def _inward_response(units: int) -> NDArray[np.complex128]:
-    """Compute the response of ``to_frame_rate``, which is that of outer and middle ear.
+    """Compute the response of ``to_frame_rate``: outer and middle ear, and a low-pass.
 
     Args:
         units: Length of the Fourier transform in units of 160 ms.
 
     Returns:
-        Response at the frequencies of the transform up to half of the frame rate, (frequencies,).
+        Response at the frequencies up to half of the frame rate, (units * 1323 + 1,).
     """
     response = _fourier_transform(_ear_taps(), units) * _conversion(units, _EAR_HALF_LENGTH)
     return response * (_UNIT_AT_FRAME_RATE / _UNIT)
@@ -296,7 +294,8 @@ def _outward_responses(units: int) -> NDArray[np.complex128]:
     Args:
         units: Length of the Fourier transform in units of 160 ms.
 
-    Returns: Responses up to half of the frame rate, (severities, frequencies).
+    Returns:
+        Responses up to half of the frame rate, (severities, units * 1323 + 1).
     """
     responses = _fourier_transform(_bank_taps(), units)
     conversion = _conversion(units, _BANK_HALF_LENGTH)
@@ -313,10 +312,10 @@ def _fourier_transform(taps: NDArray[np.float64], units: int) -> NDArray[np.comp
 
 
 def _conversion(units: int, advance: int) -> NDArray[np.complex128]:
-    """Compute the response of a low-pass to convert rates, without its delay.
+    """Compute the response, without delay, of the low-pass between 16 kHz and the frame rate.
 
     It ends between 8 kHz and half of the frame rate, where it is so near 0 that the Fourier
-    transforms do not make it ring: an output depends on the declared field only.
+    transforms do not make it ring: an output depends on no samples beyond ``FILTERS_FIELD``.
 
     Args:
         units: Length of the Fourier transform in units of 160 ms.
@@ -340,7 +339,7 @@ def _conversion(units: int, advance: int) -> NDArray[np.complex128]:
 
 @lru_cache(maxsize=1)
 def _ear_taps() -> NDArray[np.float64]:
-    """Compute the impulse response of outer and middle ear, advanced to the grid of the frames.
+    """Compute the impulse response of outer and middle ear, advanced by ``_FRAME_OFFSET``.
 
     Returns:
         Coefficients at 44.1 kHz, (2 * half length,), with time 0 in the middle.
@@ -354,7 +353,7 @@ def _ear_taps() -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def _bank_taps() -> NDArray[np.float64]:
-    """Compute the impulse responses of MSBG's other filters, which undo that advance.
+    """Compute the impulse responses of ``from_frame_rate``, delayed by ``_FRAME_OFFSET``.
 
     Returns:
         Coefficients at 44.1 kHz, (severities, 2 * half length), with time 0 in the middle.
@@ -385,7 +384,7 @@ def _centred_taps(responses: NDArray[np.complex128], advance: float) -> NDArray[
 
 
 def _grid() -> tuple[NDArray[np.float64], int]:
-    """Return frequencies up to 8 kHz in radians per sample at 44.1 kHz, and the FFT length."""
+    """Return frequencies up to 8 kHz in radians per sample, and the FFT length, at 44.1 kHz."""
     points = 10 * _UNIT_AT_MSBG_RATE
     frequencies = np.arange(10 * _UNIT // 2 + 1, dtype=np.float64)
     return np.asarray(2.0 * np.pi / points * frequencies), points

@@ -125,7 +125,11 @@ class NeuroMSBG(EarNetwork, HubModel):
             self._additional_field = self.prior.receptive_field
 
     def _build_prior(self, compute: bool) -> BandGains | None:
-        """Build the estimate of MSBG's gains, with its constants if ``compute`` is True."""
+        """Build the estimate of MSBG's gains, if the settings have a prior.
+
+        Args:
+            compute: Compute its constants. With False, they are NaN until a state dict is loaded.
+        """
         return Prior(self.stft, compute) if self.config.prior else None
 
 
@@ -271,7 +275,7 @@ class DualPathNeuroMSBG(NeuroMSBG):
         """Predict the factor by which the spectrogram is multiplied, besides that of the prior.
 
         Shape: (items, 2 to 4, frames, rows), (items, 8), (items,) -> complex (items, frames,
-            frequencies), or real without a predicted phase.
+            frequencies), or real if ``config.phase`` is ``"input"``.
 
         Args:
             features: Input channels from ``_features``.

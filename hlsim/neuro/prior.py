@@ -115,7 +115,7 @@ class BandGains(nn.Module):
                 self.get_buffer(f"{name}_known").copy_(torch.from_numpy(values))
 
     def _add_buffer(self, name: str, shape: tuple[int, ...]) -> None:
-        """Register a float32 buffer of NaN, which no checkpoint accepts."""
+        """Register a float32 buffer of NaN, which ``save_checkpoint`` rejects unless filled."""
         self.register_buffer(name, torch.full(shape, torch.nan, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
@@ -359,7 +359,7 @@ def _msbg_constants(stft: STFT, rate: float) -> dict[str, NDArray[np.float64]]:
 
 @lru_cache(maxsize=8)
 def _ear_constants(stft: STFT) -> dict[str, NDArray[np.float64]]:
-    """Compute the constants of ``Prior`` alone, by name: those of the fixed filters."""
+    """Compute the buffers of ``Prior`` that ``BandGains`` lacks, by name: its fixed filters."""
     ear_response = np.fft.rfft(ear_filter(), _GRID_RATIO * stft.fft * 441 // 160)
     points = _GRID_RATIO * 160
     responses = [fixed_response(BANKS[name], NEURO_RATE, points) for name in SEVERITIES]

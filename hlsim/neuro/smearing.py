@@ -209,7 +209,7 @@ class _Block:
         return [values[self.items, self.frames] for values in maps]
 
     def factors(self, gains: Tensor, matrices: Sequence[Tensor], out: Sequence[Tensor]) -> Planes:
-        """Compute the factors by which gains multiply the block's spectra, over the root of 8.
+        """Compute the factors by which gains multiply the block's spectra, divided by root 8.
 
         The gains of a frame, interpolated linearly between steps, are multiplied by each matrix.
 
@@ -342,7 +342,7 @@ def _smear_differentiably(
     *,
     step: int,
 ) -> Planes:
-    """Compute the output of ``_SmearAndAmplify`` by operations that autograd differentiates."""
+    """Compute ``smear_and_amplify`` by operations that autograd differentiates."""
     divisor = real.square() + _SILENCE + imaginary.square() + smeared_power.abs() / MAX_FACTOR
     ratio = smeared_power / divisor
     size = (ratio.square() + MIN_FACTOR**2).sqrt()

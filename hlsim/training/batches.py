@@ -188,7 +188,9 @@ def _read_ears(table: Path) -> list[tuple[float, ...]]:
 
 
 class _RandomBatches(Dataset[Batch]):
-    """Batches of random speech, noise and ears, which depend on the seed and the index alone.
+    """Data set of batches of random speech, noise and ears, by index.
+
+    A batch depends on the seed of the recipe and on its index alone.
 
     Args:
         recipe: Settings of the training.
@@ -335,7 +337,7 @@ class _CompensatorBatches(_RandomBatches):
 
         Returns:
             The clean speech, (count, ears, time), and the signals, (count, microphones, ears,
-            time).
+            time), in pascals.
         """
         clean, signal = scenes.draw_scenes(count, generator)
         levels = draw_uniform(*self.recipe.levels, (count,), generator)
@@ -351,7 +353,7 @@ class _CompensatorBatches(_RandomBatches):
 
         Returns:
             Clean speech and input of the aid, (count, time) each; for several microphones, (count,
-            ears, time) and (count, microphones, ears, time), with two ears.
+            ears, time) and (count, microphones, ears, time), with two ears. All are in pascals.
         """
         recipe = self.recipe
         voices = equalise_share(self.speech.draw(count, generator), recipe.equalised, generator)

@@ -203,16 +203,16 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     """
     loaded = load_simulator(simulator)
     if isinstance(loaded, PluginSimulator):
-        return {role: str(loaded), **_hash_own(role, loaded.plugin.function)}
+        return {role: str(loaded), **_hash_weights_and_code(role, loaded.plugin.function)}
     if isinstance(simulator, nn.Module):
         name = f"{type(simulator).__name__}({simulator.extra_repr()})"
-        return {role: name, **_hash_own(role, simulator)}
+        return {role: name, **_hash_weights_and_code(role, simulator)}
     if str(simulator) in BUILT_IN:
         return {role: str(simulator)}
     return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}
 
 
-def _hash_own(role: str, code: Any) -> dict[str, str]:
+def _hash_weights_and_code(role: str, code: Any) -> dict[str, str]:
     """Return hashes of a function or module: of its weights, and of the file of its source code.
 
     There is no hash of weights for a function. There is none of the file for code of hlsim or

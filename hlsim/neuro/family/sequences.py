@@ -63,7 +63,7 @@ class BidirectionalMamba(nn.Module):
 
     Args:
         channels: Number of channels of the input.
-        states: State size of the recursion per inner channel.
+        states: Number of states per inner channel, see ``Mamba``.
         expansion: Number of inner channels relative to ``channels``.
 
     >>> BidirectionalMamba(8, states=4, expansion=2)(torch.randn(3, 20, 8)).shape
