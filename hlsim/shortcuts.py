@@ -120,7 +120,7 @@ def simulate(
 
     Returns:
         The perceived signal, of the type and shape of ``audio``. For several ears and one signal,
-        one output per ear.
+        ``(time,)``, one output per ear, ``(ears, time)``.
 
     Raises:
         ValueError: The audio, the ear, the rate or the simulator is not valid.
@@ -159,8 +159,8 @@ def compensate(
 
     Returns:
         The output of the aid, of the type of ``audio`` and time-aligned with it. Its shape is that
-        of ``audio``; for several ears and one signal there is one output per ear. It is as loud as
-        the ear needs: turn the volume down before you play it.
+        of ``audio``; for several ears and one signal, ``(time,)``, there is one output per ear,
+        ``(ears, time)``. It is as loud as the ear needs: turn the volume down before you play it.
 
     Raises:
         ValueError: The audio, the ear, the rate or the compensator is not valid.

@@ -229,8 +229,8 @@ class constant(Generic[P, Values]):
 def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a function whose results are computed once and then come from a store.
 
-    Beyond ``STORE_BYTES``, the store drops the results that were not used for the longest time, but
-    never the latest result.
+    Beyond 256 MiB (``STORE_BYTES``), the store drops the results that were not used for the longest
+    time, but never the latest result.
 
     Args:
         function: Function at the top level of a module, with hashable arguments.
@@ -352,6 +352,9 @@ def flatten_items(tensor: Tensor, batch: torch.Size, dtype: torch.dtype) -> Tens
         dtype: Type of the result.
 
     Shape: (..., n) -> (items, n).
+
+    Raises:
+        RuntimeError: The leading dimensions do not broadcast.
 
     >>> flatten_items(torch.zeros(3, 1, 8), torch.Size([3, 2]), torch.float64).shape
     torch.Size([6, 8])

@@ -100,13 +100,15 @@ class Clips:
         return len(self.files)
 
     def read_recording(self, index: int) -> Tensor:
-        """Return a whole recording, scaled to a peak of 1.0, or silence if it cannot be read.
+        """Return a whole recording, scaled to a peak of 1.0, or one zero if it cannot be used.
+
+        A file that cannot be used causes a warning when it is first read.
 
         Args:
             index: Index of the file in ``files``.
 
         Returns:
-            Samples with shape (time,), or (channels, time) in a subclass.
+            Samples at the clips' sample rate with shape (time,), or (channels, time) in a subclass.
         """
         if index not in self._recordings:
             try:

@@ -61,7 +61,7 @@ class SceneFiles(NamedTuple):
 
     @property
     def ears(self) -> int:
-        """Number of ears."""
+        """Number of ears, 1 or 2: the number of references, or 1 without any."""
         return len(self.references) or 1
 
     @property
@@ -202,7 +202,7 @@ class SceneClips(Clips):
         return clips[:, : self.ears], clips[:, self.ears :].unflatten(1, (-1, self.ears))
 
     def judged_part(self, clip: Tensor) -> Tensor:
-        """Return the clean speech, which may be silent where there is noise."""
+        """Return the clean speech, (ears, samples), which may be silent where there is noise."""
         return clip[: self.ears]
 
     def _decode(self, index: int) -> Tensor:

@@ -111,9 +111,10 @@ def gammatone_response(
 
         g (1 - r cos(w) / z) / (1 - 2 r cos(w) / z + r^2 / z^2)
 
-    Here r is exp(-2 pi broadening ERB / fs), w is 2 pi f / fs, and g makes the gain 1 at the
-    channel's centre frequency f. The advance of the channel and its high-pass, if it has one, are
-    part of the response (``FilterBank.advances``, ``highpass_corners``).
+    Here r is exp(-2 pi broadening ERB / fs), w is 2 pi f / fs, fs is 44.1 kHz, and ERB is that of a
+    normal filter at the channel's centre frequency f, at which g makes the gain 1. The advance of
+    the channel and its high-pass, if it has one, are part of the response (``FilterBank.advances``,
+    ``highpass_corners``).
 
     Args:
         bank: Filter bank of a severity, a value of ``BANKS``.

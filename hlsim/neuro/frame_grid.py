@@ -137,12 +137,15 @@ def from_frame_rate(waveform: Tensor, severity: Tensor, length: int) -> Tensor:
 
 
 def analyse_frames(waveform: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the spectra of MSBG's frames of signals, with the time origin in their middle.
+    """Compute the spectra of MSBG's windowed frames, with the time origin in their middle.
 
     The first frame begins 72 samples (three hops) before the signal.
 
     Shape: (items, time) -> (items, ceil(time / 24) + 3, 97) twice, the real and the imaginary
         parts.
+
+    Args:
+        waveform: Signals at the frame rate, from ``to_frame_rate``.
 
     >>> real, imaginary = analyse_frames(torch.randn(1, 240))
     >>> real.shape
@@ -152,7 +155,7 @@ def analyse_frames(waveform: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def synthesise_frames(real: Tensor, imaginary: Tensor, length: int) -> Tensor:
-    """Compute signals from the spectra of their frames, the inverse of ``analyse_frames``.
+    """Compute signals at the frame rate from their spectra, the inverse of ``analyse_frames``.
 
     Shape: (items, frames, 97) twice -> (items, length).
 
