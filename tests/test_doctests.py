@@ -15,7 +15,7 @@ from tests.helpers import mostly_slow
 # Modules in which a public function or class may lack an example, such as those of commands and
 # pages, whose results are files. Remove yours when each has one.
 WITHOUT_EXAMPLES = re.compile(
-    r"hlsim\.(audiogram\.published|cli\..*|demo|evaluation\.(clarity|demo)"
+    r"hlsim\.(audiogram\.published|cli\..*|evaluation\.(clarity|demo)"
     r"|report\.(compensators|demo)_page|training\.trainer|version)"
 )
 
@@ -38,13 +38,17 @@ def one_position(monkeypatch: pytest.MonkeyPatch) -> None:
 # The examples of these modules take a second or more, and the tests of the modules call the same.
 SLOW_MODULES = {
     "hlsim.evaluation.compensators",
-    "hlsim.evaluation.digits.threshold",
+    "hlsim.evaluation.digits.speech_reception",
     "hlsim.export",
     "hlsim.metrics.haaqi_score",
     "hlsim.metrics.torchmetric",
     "hlsim.report.recordings_page",
     "hlsim.report.tables",
 }
+
+
+def test_slow_modules_exist() -> None:
+    assert set(MODULES) >= SLOW_MODULES
 
 
 @pytest.mark.usefixtures("one_position")

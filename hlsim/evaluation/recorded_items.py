@@ -338,7 +338,7 @@ def read_recordings(
     audiograms: str | Path | None = None,
     **settings: Any,
 ) -> tuple[list[RecordedItem], list[str]]:
-    """Return the recordings and the conditions of a manifest, each in the order of the first rows.
+    """Return the recordings of a manifest and the names of its conditions, in order of their rows.
 
     Args:
         manifest: CSV file or DataFrame with one row per output and the columns that the top of this

@@ -40,7 +40,8 @@ def perceive_items(
         count: Number of items to return, if there are as many.
         conditions: Names of the conditions with sounds; all of them if empty.
 
-    Returns: The sounds in pascals, or an empty list if there is no comparison or ``count`` is 0.
+    Returns: One ``ItemSounds`` per item, in the order of the ranking; an empty list if there is no
+        comparison or ``count`` is 0.
 
     >>> import pandas
     >>> from hlsim import Audiogram
