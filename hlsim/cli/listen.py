@@ -107,7 +107,8 @@ def _make_section(options: argparse.Namespace, recording: AudioInfo, make_sounds
             ``options.full_scale_spl``, and their rate in Hz to a dict from label to sound.
 
     Raises:
-        ValueError: The file cannot be read or processed; the message names it.
+        ValueError: The file cannot be read or processed, or its played part is silent; the message
+            names the file.
     """
     import torch
 
@@ -121,6 +122,11 @@ def _make_section(options: argparse.Namespace, recording: AudioInfo, make_sounds
     level, gain_db = level_and_gain(recording.power, options)
     stop = min(recording.samples, max(1, round(options.seconds * rate)))
     (waveform,) = read_parts(recording, [(0, stop)])
+    if not waveform.any():
+        raise ValueError(
+            f"{file}: the first {stop / rate:g} s are silent; play more of it (--seconds), or cut "
+            "the silence off"
+        )
     with torch.no_grad():
         scaled = waveform * 10.0 ** (gain_db / 20.0)
         sounds = convert_at(str(file), make_sounds, scaled, rate)

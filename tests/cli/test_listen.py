@@ -38,6 +38,20 @@ def test_a_page_plays_what_each_ear_perceives_without_and_with_an_aid(
     assert f"N4: {levels} dB HL" in text
 
 
+def test_an_error_names_the_file_whose_played_part_is_silent(
+    tmp_path: Path, files: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    speech = hlsim.example_speech()[8000:24000]
+    late = tmp_path / "late.wav"
+    write_audio(late, torch.cat((torch.zeros(16000), speech)), 16000)
+    options = "--audiogram N2 --simulator attenuation --seconds 0.5 --out"
+    assert main(["listen", *files, str(late), *options.split(), str(tmp_path / "page.html")]) == 2
+    assert (
+        f"{late}: the first 0.5 s are silent; play more of it (--seconds)"
+        in capsys.readouterr().err
+    )
+
+
 def test_options_of_an_aid_need_an_aid(
     tmp_path: Path, files: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
