@@ -429,7 +429,7 @@ def _run_study(
 
 @contextmanager
 def _collect_warnings() -> Iterator[list[str]]:
-    """Yield a list to which the texts of warnings are appended when they are shown."""
+    """Yield a list that gets the text of each warning that is shown within the ``with`` block."""
     texts = []
     show = warnings.showwarning
 

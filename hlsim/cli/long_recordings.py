@@ -100,6 +100,9 @@ def process_recording(
     Yields:
         Consecutive parts at the scale of the file, (channels, time). An aid with
         ``takes_microphones`` returns one channel per ear.
+
+    Raises:
+        ValueError: The file cannot be read, or the model rejects the ears or the channels.
     """
 
     def read(blocks: Sequence[Block]) -> Iterable[Tensor]:

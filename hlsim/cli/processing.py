@@ -73,7 +73,7 @@ def _declare_files(
     *examples: str,
     ears: str,
 ) -> None:
-    """Declare the options that both commands have.
+    """Declare the options that ``simulate`` and ``compensate`` have in common.
 
     Args:
         parser: Parser of the command.

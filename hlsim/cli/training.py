@@ -38,7 +38,7 @@ def train_compensator(parser: Parser) -> None:
 
 
 def _declare_common(parser: Parser) -> None:
-    """Declare the options that both commands have."""
+    """Declare the options of both trainings, apart from those of their recipes."""
     option = parser.option
     speech = parser.add_mutually_exclusive_group(required=True)
     option("--speech", input_path, "folder of clean speech", group=speech)

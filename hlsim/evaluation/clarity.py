@@ -92,7 +92,7 @@ class _Pair(NamedTuple):
 
     @property
     def output_name(self) -> str:
-        """Name of the file with an aid's output for both ears, as the challenges name it."""
+        """Name of the file with an aid's output for both ears: SCENE_LISTENER_HA-output.wav."""
         return f"{self.scene}_{self.name}_HA-output.wav"
 
 

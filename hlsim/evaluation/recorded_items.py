@@ -116,7 +116,7 @@ class RecordedItem:
 
     @cached_property
     def facts(self) -> dict[str, Any]:
-        """Columns of the table that describe the recording, except its name."""
+        """Listener, ear, utterance, SNR, degree of loss and thresholds, by column of the table."""
         return {
             "listener": self.listener,
             "ear": self.ear,

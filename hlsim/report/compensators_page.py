@@ -173,7 +173,7 @@ def _about(evaluation: Evaluation) -> str:
 
 
 def _columns(group: Evaluation) -> Columns:
-    """Return the columns of a table of scores: those of all pages, and ``_COLUMNS``."""
+    """Return the columns of a table of scores: those of ``score_columns``, and ``_COLUMNS``."""
     target = _describe_loudness(group.settings["loudness"])
     columns = {title.format(target=target): column for title, column in _COLUMNS.items()}
     return {**score_columns(group), **columns}

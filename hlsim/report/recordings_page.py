@@ -96,7 +96,7 @@ def report_page(evaluation: Evaluation) -> Page:
 
 
 def _words(evaluation: Evaluation, c: ConditionComparison) -> list[str]:
-    """Return sentences that predict the words understood, or none if ``c`` is not about HASPI."""
+    """Return two texts that predict the words understood, or [] if ``c`` is not about HASPI."""
     if c.measure != "haspi":
         return []
     words = evaluation.words(c.before, c.after)

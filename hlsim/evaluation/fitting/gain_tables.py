@@ -128,7 +128,10 @@ def _equaliser_points(gains: Array) -> Array:
 
 
 def _interpolate(points: Array) -> Array:
-    """Return the equaliser's gains in dB at 1, 2, ..., 8000 Hz. Shape: (8,) -> (8000,)."""
+    """Return an equaliser's gains in dB at 1, 2, ..., 8000 Hz from those at ``FREQUENCIES``.
+
+    Shape: (8,) -> (8000,).
+    """
     return interpolate_over_log(_HERTZ, FREQUENCIES, points)
 
 
