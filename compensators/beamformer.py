@@ -159,12 +159,15 @@ class AdaptiveBeamformer(FilterAndSum):
         return output / gain, new_state
 
     def _adapt(self, frames: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the weights at the end of each frame, and the memory of their averages.
+        """Compute the weights at the end of each frame, and the new averages of the state.
 
         Args:
             frames: Beams, then the signals with little sound from the front (blocked), in Pa.
             state: Memory of earlier frames, of which ``levels``, ``covariance`` and, if there is no
                 frame, ``weights`` are used.
+
+        Returns:
+            The weights, and the new ``levels`` and ``covariance`` of the state.
 
         Shape: (..., hops, signals, ears, FRAME) -> (..., hops, blocked signals, ears, bands).
         """

@@ -226,14 +226,14 @@ class HearingAid(Wearable, HubModel):
     def _amplification(
         self, levels: Tensor, fitted: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of restoring gain and correction in dB, and the new state.
+        """Return restoring gain plus correction in dB, and the new ``levels`` of the state.
 
         The sum is limited, and fades for quiet sounds.
 
         Args:
             levels: Levels in dB SPL of the bands and of the whole frame.
             fitted: Hearing loss in dB HL in each band, then NAL-R's gain in dB in each band.
-            state: Memory of earlier frames, of which ``levels`` is used and returned.
+            state: Memory of earlier frames, of which ``levels`` is used.
 
         Shape: (items, frames, bands + 1), (items, 2 * bands) -> (items, frames, bands).
         """

@@ -589,7 +589,7 @@ class Stream:
 
 
 def _glide(start: Tensor, target: Tensor, frames: int) -> Tensor:
-    """Move sliders gradually from their values to new ones, because a jump would click.
+    """Move sliders to new values by at most ``SLIDER_STEP`` per frame, because a jump would click.
 
     Args:
         start: Values before the first frame.

@@ -258,6 +258,7 @@ def adaptation() -> StateSpace:
 # -- gammatone filters -----------------------------------------------------------------------------
 
 GAMMATONE_ORDER = 4
+"""Order of the gammatone filters, the number of their poles."""
 
 
 @constant
