@@ -2,8 +2,9 @@
 
     python examples/haspi_study.py CLEAN_DIR NOISY_DIR AUDIOGRAMS.csv OUT [ITEMS]
 
-CLEAN_DIR and NOISY_DIR contain recordings with equal names, such as those of VoiceBank-DEMAND.
-AUDIOGRAMS.csv contains measured ears, with the columns listener, ear, hl_250, ... hl_8000. Each of
+CLEAN_DIR and NOISY_DIR contain recordings with equal names (in equal subfolders, if any), such as
+those of VoiceBank-DEMAND. AUDIOGRAMS.csv contains measured ears, with the columns listener, ear,
+hl_250, ... hl_8000. Each of
 ITEMS utterances (12 by default) goes to the left ear of one of four listeners, with clean speech at
 65 dB SPL, under three conditions: unaided, NAL-R, and the unaided signal at the output level of
 NAL-R (gain), which shows the effect of amplification alone. The audio files and a manifest are
@@ -19,7 +20,7 @@ from torch import Tensor
 from compensators import NALR
 from hlsim import Audiogram
 from hlsim.audio import find_audio, read_audio, write_audio
-from hlsim.audiogram.table import read_audiograms
+from hlsim.audiogram.table import named_ear, read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
 from hlsim.progress import ProgressLine
@@ -47,6 +48,11 @@ def read_pair(clean_path: Path, noisy_path: Path) -> tuple[Tensor, Tensor, int]:
     return clean * gain, noisy[0, :samples] * gain, rate
 
 
+def name_below(folder: Path, path: Path) -> str:
+    """Return the path of a file below a folder, without its extension."""
+    return path.relative_to(folder).with_suffix("").as_posix()
+
+
 def make_conditions(noisy: Tensor, ear: Audiogram, sample_rate: int) -> dict[str, Tensor]:
     """Make the signals of the three conditions by name. Shape: (time,) each."""
     prescribed = NALR(sample_rate=sample_rate)(noisy, ear)
@@ -57,21 +63,19 @@ def make_conditions(noisy: Tensor, ear: Audiogram, sample_rate: int) -> dict[str
 def main() -> None:
     clean_dir, noisy_dir, audiograms, out = map(Path, sys.argv[1:5])
     count = int(sys.argv[5]) if len(sys.argv) > 5 else 12
-    noisy_paths = {path.stem: path for path in find_audio(noisy_dir)}
+    noisy_paths = {name_below(noisy_dir, path): path for path in find_audio(noisy_dir)}
     clean_paths = find_audio(clean_dir)
-    left_ears = [
-        (row, ear) for row, ear in read_audiograms(audiograms) if row["ear"] in ("l", "left")
-    ]
+    left_ears = [(row, ear) for row, ear in read_audiograms(audiograms) if named_ear(row) == "left"]
     left_ears = left_ears[:LISTENERS]
     rows = []
     for number in range(count):
         row, ear = left_ears[number % len(left_ears)]
         clean_path = clean_paths[number % len(clean_paths)]
-        clean, noisy, rate = read_pair(clean_path, noisy_paths[clean_path.stem])
+        utterance = name_below(clean_dir, clean_path)
+        clean, noisy, rate = read_pair(clean_path, noisy_paths[utterance])
         snr = float(level_spl(clean) - level_spl(noisy - clean))
-        name = f"{row['listener']}-{clean_path.stem}.wav"
+        name = f"{row['listener']}/{utterance}.wav"
         for condition, signal in {"clean": clean, **make_conditions(noisy, ear, rate)}.items():
-            (out / condition).mkdir(parents=True, exist_ok=True)
             write_audio(out / condition / name, signal, rate)
             if condition != "clean":
                 rows.append(

@@ -20,7 +20,8 @@ which contains the model `moonshine-tiny`. Both run offline.
 words. `compare` processes these sentences by every aid for every ear, scales all outputs to the level
 of the first aid's output (unless `--own-levels` is given), and prints words correct with 95 %
 intervals (bootstrap over sentences and ears), paired differences, and the speech reception threshold.
-A stopped comparison continues where it was.
+A stopped comparison continues where it was; outputs of a plug-in are computed again unless it has an
+attribute `fingerprint`, such as a version.
 
 An aid is a name that `load_compensator` takes, a plug-in `file.py:NAME` called with a waveform and an
 ear, or `unaided`; `hearing-aid@0.5` is an aid with half of its noise reduction, and
@@ -296,8 +297,13 @@ class WordsCorrect:
     ) -> None:
         self.recognise = recognise or load_recogniser(os.environ["WHISPER_MODEL"])
         if sentences is None and "WHISPER_SENTENCES" in os.environ:
-            rows = read_table(os.environ["WHISPER_SENTENCES"], "the sentences")
-            sentences = {row["item"]: row["text"] for _, row in rows}
+            sentences = {}
+            for place, row in read_table(os.environ["WHISPER_SENTENCES"], "the sentences"):
+                if sentences.setdefault(row["item"], row["text"]) != row["text"]:
+                    raise ValueError(
+                        f"{place}: the item {row['item']} has another text in an earlier line; "
+                        "remove one of them"
+                    )
         self.sentences = sentences or {}
         self.simulator = load_simulator(simulator, sample_rate=RATE)
 
@@ -489,8 +495,10 @@ class AtEqualLevel(Condition):
         assert isinstance(self.process, AtLevelOf)
         aid, other = self.process.aid, self.process.other
         time = item.signal.shape[-1]  # Samples after the end of the input are not scored.
-        level = item.once("level", lambda: level_spl(other(item.signal, item.ear)[..., :time]))
-        return set_level(aid(item.signal, item.ear)[..., :time], level)
+        # A plug-in that changes its input in place must not change the item.
+        copies = item.signal.clone(), item.signal.clone()
+        level = item.once("level", lambda: level_spl(other(copies[0], item.ear)[..., :time]))
+        return set_level(aid(copies[1], item.ear)[..., :time], level)
 
 
 def make_conditions(aids: Sequence[str], *, own_levels: bool) -> list[Condition]:

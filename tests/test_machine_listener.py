@@ -108,6 +108,21 @@ def test_measure_is_loaded_by_its_name_and_finds_sentences(
     unknown = Item("b", signal, signal, Audiogram.standard("NH"), facts={"utterance": "s2"})
     with pytest.raises(ValueError, match="the text of b is unknown"):
         words(unknown, signal)
+    (tmp_path / "sentences.csv").write_text("item,text\ns1,one two\ns1,three\n")
+    with pytest.raises(ValueError, match="line 3: the item s1 has another text"):
+        load_measure(f"{FILE}:WordsCorrect")
+
+
+def test_an_aid_that_changes_its_input_in_place_does_not_change_the_item(
+    example: ModuleType, tmp_path: Path
+) -> None:
+    path = tmp_path / "aid.py"
+    path.write_text("def double(signal, ear): return signal.mul_(2.0)")
+    signal = set_level(torch.randn(1600), 65.0)
+    item = Item("a", signal.clone(), signal.clone(), Audiogram.standard("N3"))
+    for condition in example.make_conditions([f"{path}:double", "unaided"], own_levels=False):
+        assert condition.output(item) == pytest.approx(2.0 * signal, rel=1e-4)
+        assert torch.equal(item.signal, signal)
 
 
 def test_pieces_end_in_pauses_and_are_kept_where_recognisers_agree(

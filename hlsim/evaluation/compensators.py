@@ -200,7 +200,8 @@ def evaluate_compensators(
             "'reference' (--manifest), and no digit test (--srt)"
         )
     clean_speech: Any = speech if scenes is None else scenes.clean_files
-    clips = Clips(clean_speech, sample_rate=NEURO_RATE, seconds=3.0)
+    # Silence after short recordings would make the speech louder than the levels say.
+    clips = Clips(clean_speech, sample_rate=NEURO_RATE, seconds=3.0, repeat=True)
     utterances = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     enhancer_plugins = load_enhancers(enhancers)
     prescriptions = {

@@ -122,6 +122,23 @@ def test_conditions_groups_and_page(
 
 
 @pytest.mark.slow
+def test_short_recordings_have_the_stated_level_in_gain_curves(
+    tmp_path: Path, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clip = torch.randn(16000, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr("hlsim.evaluation.compensators.perceive_items", lambda *_: [])
+    curves = []
+    for times in (1, 4):
+        folder = tmp_path / str(times)
+        write_audio(folder / "clip.wav", 0.1 * clip.tile(times), 16000)
+        settings = {**options, "speech": folder, "noise": None, "items": 1, "audiogram": N3}
+        curves.append(evaluate_compensators({"mine": Gain()}, **settings).details["gain_curves"])
+    short, long = (next(row for row in rows if row["aid"] == "WDRC") for rows in curves)
+    difference = np.subtract(short["gain_db"], long["gain_db"])
+    assert float(np.median(np.abs(difference))) < 0.5  # about 1.7 with silence after the clip
+
+
+@pytest.mark.slow
 def test_another_prescription_may_be_the_rival(
     options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,7 +15,7 @@ from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.checkpoint import list_pretrained
 from hlsim.evaluation.conditions import AtLevelOf
-from hlsim.evaluation.running.fingerprint import _hash_sources, fingerprint
+from hlsim.evaluation.running.fingerprint import _hash_sources, fingerprint, value_hash
 from hlsim.plugins import WaveformPlugin, load_plugin
 
 N3 = Audiogram.standard("N3")
@@ -115,6 +115,33 @@ def test_functions_of_one_name_in_two_files_have_two_fingerprints(tmp_path: Path
         (tmp_path / name).write_text("def half(x, rate): return x / 2\nhalf.fingerprint = '1'")
         fingerprints.add(fingerprint(WaveformPlugin(f"{tmp_path / name}:half", "enhancer")))
     assert len(fingerprints) == 2 and None not in fingerprints
+
+
+def test_a_condition_that_contains_a_function_of_a_user_needs_its_fingerprint(
+    tmp_path: Path,
+) -> None:
+    aid = nn.Linear(2, 2)
+    fingerprints = []
+    for number, source in enumerate(("", "aid.fingerprint = '1'", "aid.fingerprint = '2'")):
+        path = tmp_path / f"{number}.py"
+        path.write_text(f"def aid(signal, ear): return signal\n{source}")
+        function = load_plugin(f"{path}:aid", "aid")
+        fingerprints.append(fingerprint(AtLevelOf(aid, function)))
+    assert fingerprints[0] is None
+    assert None is not fingerprints[1] != fingerprints[2]
+
+
+def test_the_source_of_a_function_counts_and_not_only_its_name(tmp_path: Path) -> None:
+    hashes = []
+    for number, factor in enumerate((1.0, 2.0)):
+        path = tmp_path / f"{number}.py"
+        path.write_text(f"def gain(signal): return {factor} * signal")
+        hashes.append(value_hash(load_plugin(f"{path}:gain", "aid")))
+    assert hashes[0] != hashes[1]
+    notebook: dict[str, Any] = {"__name__": "__main__"}
+    exec("def gain(signal): return signal", notebook)
+    with pytest.raises(TypeError, match="source"):
+        value_hash(notebook["gain"])
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import hashlib
 import json
 from functools import cache
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -101,8 +102,8 @@ def fingerprint(processing: Any) -> str | None:
             str(getattr(module, "fingerprint", None)),
         ]
         # A condition of hlsim, such as an aid at another's level, contains the aids of a user.
-        contained = module.children() if _is_from_hlsim(module) else ()
-        if any(fingerprint(child) is None for child in contained if not _is_known(type(child))):
+        contained = _parts(module) if _is_from_hlsim(module) else ()
+        if any(fingerprint(part) is None for part in contained if not _is_known(_code(part))):
             return None
         if None in parts[place][1]:
             return None
@@ -117,8 +118,9 @@ def value_hash(value: Any) -> str:
 
     Args:
         value: Text, number, list, or dict (in any order), nested as you like, with tensors, arrays,
-            dataclasses, functions and classes (of which only the name counts), and modules with a
-            fingerprint.
+            dataclasses, modules with a fingerprint, and functions and classes. Of a function or
+            class of hlsim or torch, only the name counts; of another one, also its attribute
+            ``fingerprint`` or the file with its source code.
 
     Raises:
         TypeError: The value contains something else, such as a lambda or another function within a
@@ -136,12 +138,23 @@ def _is_from_hlsim(module: nn.Module) -> bool:
     return type(module).__module__.startswith(("hlsim.", "compensators."))
 
 
-def _is_known(kind: type) -> bool:
-    """Return whether a class belongs to hlsim or torch, or is built into Python.
+def _is_known(code: Any) -> bool:
+    """Return whether a class or function belongs to hlsim or torch, or is built into Python.
 
-    Classes of Python's library, such as ``abc.ABC``, are not known.
+    Those of Python's library, such as ``abc.ABC``, are not known.
     """
-    return kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "builtins")
+    package = (code.__module__ or "builtins").split(".")[0]
+    return package in ("hlsim", "compensators", "torch", "builtins")
+
+
+def _parts(module: nn.Module) -> list[Any]:
+    """Return the submodules of a module, and those of ``_attributes`` that can be called."""
+    return [*module.children(), *filter(callable, _attributes(module).values())]
+
+
+def _code(thing: Any) -> Any:
+    """Return a function or class as it is, and the class of another object."""
+    return thing if hasattr(thing, "__qualname__") else type(thing)
 
 
 _hash_source = cache(source_hash)
@@ -162,18 +175,19 @@ def _attributes(module: nn.Module) -> dict[str, Any]:
 
 def _name(thing: Any) -> str:
     """Return the qualified name of a function or class, or of the class of another object."""
-    kind = thing if hasattr(thing, "__qualname__") else type(thing)
-    return str(kind.__qualname__)
+    return str(_code(thing).__qualname__)
 
 
 def _describe(value: Any) -> Any:
     """Convert an object that JSON cannot represent: the ``default`` function of ``value_hash``.
 
     A tensor or array becomes its type, shape and hash; a dataclass its name and attributes, which
-    JSON converts in turn; a function or class its name; and a module its fingerprint.
+    JSON converts in turn; a function or class its name, with a hash unless it belongs to hlsim or
+    torch; and a module its fingerprint.
 
     Raises:
-        TypeError: The object is none of these, or a function within another one, such as a lambda.
+        TypeError: The object is none of these, a function within another one, such as a lambda, or
+            has no source file, as in a notebook.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
@@ -183,8 +197,24 @@ def _describe(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return [_name(value), vars(value)]
     if hasattr(value, "__qualname__") and "<" not in value.__qualname__:
-        return value.__qualname__
+        return [value.__qualname__, None if _is_known(value) else _hash_code(value)]
     known = fingerprint(value)
     if known is None:
         raise TypeError(f"{value!r} cannot be described")
+    return known
+
+
+def _hash_code(code: Any) -> str | None:
+    """Return the fingerprint of a function, or else the hash of the source of a function or class.
+
+    It is None for compiled code, such as a function of NumPy.
+
+    Raises:
+        TypeError: There is no source file, as in a notebook.
+    """
+    # The fingerprint of a class may be a property of its objects.
+    stated = None if isinstance(code, type) else fingerprint(code)
+    known = stated or _hash_source(code)
+    if known is None and isinstance(code, type | FunctionType):
+        raise TypeError(f"the source of {code!r} is unknown")
     return known
