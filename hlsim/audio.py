@@ -313,6 +313,9 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
         by_name: Whether to list a file under the names of all links to it. This is needed where
             names have a meaning, for example if the clean speech of two outputs is one file.
 
+    Returns:
+        Paths that begin with ``folder``.
+
     Raises:
         ValueError: There is no such folder, a folder in it cannot be read, there is no audio in it,
             or a link that is named like audio, or has no extension, leads nowhere.

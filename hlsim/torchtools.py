@@ -94,7 +94,7 @@ def built_in_float32(construct: Callable[P, None]) -> Callable[P, None]:
 
 
 def checkpointed(function: Callable[P, Result]) -> Callable[P, Result]:
-    """Make a function compute its activations again in the backward pass instead of storing them.
+    """Wrap a function so that its activations are computed again in the backward pass, not stored.
 
     Args:
         function: Function that draws no random numbers, because their state is not stored.
@@ -517,7 +517,7 @@ def on_device(values: Tensor, device: torch.device) -> Tensor:
 def on_host(values: Tensor) -> Tensor:
     """Return a tensor without a gradient on the CPU.
 
-    This synchronises with a GPU unless a copy of the values on the CPU is known.
+    This synchronises with a GPU unless a copy of the values on the CPU is remembered.
 
     Args:
         values: Tensor of any shape on any device.
@@ -533,10 +533,10 @@ def on_host(values: Tensor) -> Tensor:
 
 
 def known_on_host(values: Tensor) -> Tensor | None:
-    """Return a tensor without a gradient on the CPU if its values are known there, else None.
+    """Return a tensor without a gradient on the CPU if that needs no waiting for a GPU, else None.
 
-    They are known if the tensor is on the CPU, or if ``on_device`` or ``on_host`` copied it and it
-    has not changed since. So this never waits for a GPU.
+    No waiting is needed if the tensor is on the CPU, or if ``on_device`` or ``on_host`` copied it
+    and it has not changed since.
 
     Args:
         values: Tensor of any shape on any device.

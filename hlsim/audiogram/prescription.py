@@ -248,7 +248,7 @@ def _log_weights(grid: Frequencies, points: Frequencies) -> NDArray[np.float64]:
 
 @constant
 def _table(name: str) -> list[Any]:
-    """Return one of the ``PRESCRIPTION_TABLES``, so that tensors of it are stored."""
+    """Return one of the ``PRESCRIPTION_TABLES`` by name, as a constant whose tensors are stored."""
     table: list[Any] = PRESCRIPTION_TABLES[name]
     return table
 

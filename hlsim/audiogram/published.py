@@ -12,7 +12,7 @@ _TABLES = read_json(Path(__file__).with_suffix(".json"))
 
 
 def _over_frequency(name: str) -> dict[int, Any]:
-    """Return a table whose keys in the file are frequencies in Hz."""
+    """Return a table of the file by frequency in Hz, with numbers instead of texts as keys."""
     return {int(hz): value for hz, value in _TABLES[name].items()}
 
 

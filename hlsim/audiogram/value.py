@@ -622,7 +622,7 @@ def _as_array(values: Any) -> NDArray[np.float64]:
 
 
 def _describe_points(points: Iterable[tuple[float, float]]) -> str:
-    """Return the text of a dict of frequencies to levels."""
+    """Return the text of a dict of frequencies to levels, such as ``{500: 20}``."""
     return f"{{{', '.join(f'{hz:g}: {level:g}' for hz, level in points)}}}"
 
 

@@ -279,8 +279,9 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
 
 @constant
 def _before_advanced_end(bank: FilterBank, points: int, length: int) -> NDArray[np.bool]:
-    """Compute a mask: True for the samples of each channel before its end, bool (channels, points).
+    """Compute a mask, bool (channels, points), which is True before the end of each channel.
 
-    pyclarity advances each channel by dropping its first samples, and fills the end with zeros.
+    The signal has ``length`` samples at 44.1 kHz. pyclarity advances each channel by dropping its
+    first samples, and fills the end with zeros.
     """
     return np.arange(points) < length - np.array(bank.advances)[:, None]

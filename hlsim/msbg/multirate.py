@@ -237,7 +237,7 @@ def _envelope_step(rate_divisor: int) -> float:
 
 
 def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
-    """Compute a correction of the envelope of channels that are merged into one.
+    """Compute the factor that corrects the envelope of channels that are merged into one.
 
     With this factor on its envelope, the merged channel has the gain that the sum of separately
     expanded channels would have. It is exact at one frequency, and if channels change by

@@ -178,7 +178,7 @@ class NetworkConfig(ModelConfig):
 
     @property
     def hz(self) -> tuple[float, ...]:
-        """Frequencies of a spectrogram at 16 kHz in Hz."""
+        """The ``fft // 2 + 1`` frequencies in Hz of a spectrogram at 16 kHz."""
         return tuple(NEURO_RATE * k / self.fft for k in range(self.fft // 2 + 1))
 
     @property

@@ -150,5 +150,5 @@ class EarNetwork(nn.Module):
 
 
 def _samples_at_once(signals: Tensor) -> int:
-    """Return the number of samples at 16 kHz that run at once on the signals' device."""
+    """Return the number of samples at 16 kHz to process at once on the signals' device."""
     return _CPU_SAMPLES if signals.device.type == "cpu" else _DEVICE_SAMPLES

@@ -119,7 +119,7 @@ class BandGains(nn.Module):
         self.register_buffer(name, torch.full(shape, torch.nan, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
-        """Return constants with their learned correction.
+        """Return the buffer ``<name>_known`` with its learned correction, in the same shape.
 
         The correction is a factor: exp(learned), or for the complex responses ``"relative"``
         1 + learned.

@@ -52,7 +52,7 @@ def power(real: Tensor, imaginary: Tensor) -> Tensor:
 
 
 class _Power(DifferentiableFunction):
-    """Squared magnitudes with a hand-written backward pass, which takes half of autograd's time."""
+    """The function ``power``, whose hand-written backward pass takes half of autograd's time."""
 
     @staticmethod
     def forward(real: Tensor, imaginary: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def smear_and_amplify(
 
 
 class _SmearAndAmplify(DifferentiableFunction):
-    """Smoothed smearing and gains, with bounded derivatives and a hand-written backward pass.
+    """The function ``smear_and_amplify``, with a hand-written backward pass.
 
     Autograd would store four times as much for the gradient of the loss, and take longer. The
     second derivative is autograd's, of ``_smear_differentiably``.

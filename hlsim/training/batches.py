@@ -146,7 +146,7 @@ class TrainingData:
         return cls(**(sources | replacements))
 
     def validation(self) -> TrainingData:
-        """Return the data for validation as ``speech``, ``noise``, ``audiograms`` and ``scenes``.
+        """Return new data with ``speech``, ``noise``, ``audiograms`` and ``scenes`` for validation.
 
         They are ``valid_speech``, ``valid_noise``, ``valid_audiograms`` and ``valid_scenes`` where
         these are set, and otherwise the data for training.
@@ -159,9 +159,10 @@ class TrainingData:
         )
 
     def identity(self) -> str:
-        """Compute a hash of all recordings and ears, which must be the same if a training resumes.
+        """Compute a hash of all recordings and ears, in hexadecimal, for a training's record.
 
-        See ``hash_source`` for what is read of large corpora.
+        A training resumes only with the same hash. See ``hash_source`` for what is read of large
+        corpora.
 
         Raises:
             ValueError: A folder does not exist or contains no audio, or a table is not valid.

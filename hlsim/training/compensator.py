@@ -134,7 +134,7 @@ def _freeze(part: nn.Module) -> Iterator[None]:
 
 
 def _load_beamforming_aid(config: BeamformerConfig, name: str) -> nn.Module:
-    """Load the aid of a checkpoint, or place a new front end before it if it is a hearing aid.
+    """Load the aid of a checkpoint, and place a new front end before it if it is a ``HearingAid``.
 
     Args:
         config: Settings of the front end, which joins several microphones.
