@@ -103,8 +103,8 @@ def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tens
 
     The result can be compared with MSBG's output for the impaired ear. It takes two Fourier
     transforms, because MSBG is linear at 0 dB HL. For speech and ears without a loss, it equals
-    MSBG's output with an SNR of 75 dB or more. It keeps the last 80 Hz below half the sample rate,
-    which MSBG fades out at rates below 44.1 kHz.
+    MSBG's output with an SNR of 70 dB or more, apart from the last 80 Hz below half the sample
+    rate, which it keeps, and which MSBG fades out at rates below 44.1 kHz.
 
     Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
 

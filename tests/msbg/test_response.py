@@ -9,7 +9,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import set_level
 from hlsim.dsp.resample import resample
 from hlsim.msbg.filter_bank import BANKS
-from hlsim.msbg.response import apply_bank_phase, fixed_response
+from hlsim.msbg.response import apply_bank_phase, fixed_response, simulate_normal_ear
 
 EARS = ("NH", "N1", "N3", "N5")
 
@@ -39,6 +39,14 @@ def test_response_equals_msbgs_for_a_normal_ear(rate: int) -> None:
     band = slice(100, 7800)
     spectrum = np.fft.rfft(output.numpy(), points)[band]
     assert np.linalg.norm(spectrum - expected[band]) < 2e-3 * np.linalg.norm(expected[band])
+
+
+def test_normal_ear_equals_msbg_below_the_band_that_msbg_fades_out(utterance: Tensor) -> None:
+    ears = thresholds("NH")
+    output = MSBG()(utterance, ears)
+    error = simulate_normal_ear(utterance, ears, 16000) - output
+    error_spectrum, spectrum = (torch.fft.rfft(signal)[:, :7920] for signal in (error, output))
+    assert float(error_spectrum.norm() / spectrum.norm()) < 10.0 ** (-70.0 / 20.0)
 
 
 @pytest.mark.parametrize("name", EARS)
