@@ -35,8 +35,8 @@ onnxruntime run the file (``np.savez`` stores the inputs):
         play(outputs.pop("output"))
         inputs |= outputs
 
-Without torch, the file of ``export_fit`` computes ``fitted`` for an ear. The state after silence is
-zeros, except ``gliding``, which equals ``sliders``.
+Without torch, the file of ``export_fit`` computes ``fitted`` for an ear. The first state is zeros,
+except ``gliding``, which equals ``sliders``.
 """
 
 import warnings
