@@ -100,7 +100,7 @@ class AudioInfo:
 
 
 def scan_audio(path: str | Path) -> AudioInfo:
-    """Read an audio file once, a part at a time, and return its properties.
+    """Read an audio file once, a part at a time, and return its ``AudioInfo``.
 
     The samples are not kept in memory. A truncated file is read up to its end, with a warning.
 
@@ -367,7 +367,7 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
 
 
 def _visible_files(folder: str | Path) -> Iterator[tuple[Path, str]]:
-    """Yield the path and the real path of each file, and of each link to a searched folder.
+    """Yield the path and the real path of each file, and of each link to a folder already searched.
 
     Hidden files and folders are left out. Every folder is searched once: first the folders that are
     no links, then those to which links lead.

@@ -240,8 +240,8 @@ def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
     """Compute the factor that corrects the envelope of channels that are merged into one.
 
     With this factor on its envelope, the merged channel has the gain that the sum of separately
-    expanded channels would have. It is exact at one frequency, and if channels change by
-    ``_MERGED_RATIO`` dB per dB of their input.
+    expanded channels would have. It is exact at the frequency of ``responses``, and if channels
+    change by ``_MERGED_RATIO`` dB per dB of their input.
 
     Args:
         responses: Complex responses of the channels at one frequency, (channels,).

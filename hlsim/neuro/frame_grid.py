@@ -345,7 +345,7 @@ def _ear_taps() -> NDArray[np.float64]:
     """Compute the impulse response of outer and middle ear, advanced by ``_FRAME_OFFSET``.
 
     Returns:
-        Coefficients at 44.1 kHz, (2 * half length,), with time 0 in the middle.
+        Coefficients at 44.1 kHz, time 0 in the middle, (2 * ``_EAR_HALF_LENGTH``,).
     """
     omega, points = _grid()
     response = np.fft.rfft(ear_filter(), points)[: len(omega)]
@@ -359,7 +359,7 @@ def _bank_taps() -> NDArray[np.float64]:
     """Compute the impulse responses of ``from_frame_rate``, delayed by ``_FRAME_OFFSET``.
 
     Returns:
-        Coefficients at 44.1 kHz, (severities, 2 * half length), with time 0 in the middle.
+        Coefficients at 44.1 kHz, time 0 in the middle, (severities, 2 * ``_BANK_HALF_LENGTH``).
     """
     omega, points = _grid()
     responses = []

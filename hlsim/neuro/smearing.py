@@ -205,7 +205,7 @@ class _Block:
     buffers: Sequence[Tensor]
 
     def cut(self, *maps: Tensor) -> list[Tensor]:
-        """Return this part of tensors, (items, frames, n) each."""
+        """Cut the items and frames of the block out of tensors, (items, frames, n) each."""
         return [values[self.items, self.frames] for values in maps]
 
     def factors(self, gains: Tensor, matrices: Sequence[Tensor], out: Sequence[Tensor]) -> Planes:
