@@ -242,9 +242,10 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
     inputs = first_inputs(aid, EAR, items=items, hops=hops)
     state_names = inputs.keys() - STATELESS_INPUTS
     noise = _draw_noise(aid, CHECKED_CALLS, items, hops * HOP).to(inputs["samples"])
+    process = program.module()
     for samples in noise[:-1]:
         inputs["samples"] = samples
-        outputs = program.module()(**inputs)
+        outputs = process(**inputs)
         inputs |= {name: outputs[f"next_{name}"] for name in state_names}
     _write_onnx(program, path, inputs | {"samples": noise[-1]})
 
