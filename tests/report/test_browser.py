@@ -5,6 +5,7 @@ Run with ``pytest -m browser``. The tests need playwright and a Chromium: its ow
 ``CHROMIUM``.
 """
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -110,11 +111,12 @@ def players(window: Any, players_file: Path) -> Any:
 
 def wait_until(page: Any, expression: str, argument: Any = None) -> None:
     """Wait for an expression; playwright's own function needs ``eval``, which the page forbids."""
-    for _ in range(200):
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
         if page.evaluate(expression, argument):
             return
         page.wait_for_timeout(25)
-    raise AssertionError(f"not true after 5 s: {expression}")
+    raise AssertionError(f"not true after 60 s: {expression}")
 
 
 def check_images(page: Any, count: int) -> None:
