@@ -312,8 +312,8 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
     Returns:
         The table with one row per utterance and condition; ``item`` is the number of the utterance.
         Facts of the ear, such as ``audiogram``, are the same in all rows of an utterance: those of
-        the better ear under the last condition. Its number in ``table`` is in the column
-        ``source``.
+        the better ear under the last condition that has all scores, or under the last one. Its
+        number in ``table`` is in the column ``source``.
     """
     rows = table.assign(source=table["item"], item=[utterances[i] for i in table["item"]])
     left, right = (
@@ -323,7 +323,7 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
     changes = (right[scores] - left[scores]).bfill(axis=1).iloc[:, 0]
     better = left.where(changes.isna() | (changes <= 0.0), right)
     better[scores] = np.maximum(left[scores], right[scores])  # NaN if one of them is
-    better["failure"] = [
+    failures = [
         "; ".join(
             f"{side} ear: {reason}"
             for side, reason in zip(EARS, reasons, strict=True)
@@ -332,10 +332,14 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
         or None
         for reasons in zip(left["failure"], right["failure"], strict=True)
     ]
+    # A column of texts would have NaN for None.
+    better["failure"] = type(table["failure"])(failures, index=better.index, dtype=object)
     parts = better[["listener", "utterance", "snr"]].itertuples(index=False)
     better["name"] = [join_name(*part) for part in parts]
     better = better.reset_index(drop=True).sort_values("item", kind="stable", ignore_index=True)
-    last = better.drop_duplicates("item", keep="last").set_index("item")
+    is_complete = better[scores].notna().all(axis=1)
+    last = better.loc[is_complete.sort_values(kind="stable").index]
+    last = last.drop_duplicates("item", keep="last").set_index("item")
     for fact in last.columns.intersection(_EAR_FACTS):
         better[fact] = better["item"].map(last[fact])
     return better

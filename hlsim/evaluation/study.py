@@ -417,8 +417,10 @@ def run_measures(
         else m
         for m in measures
     ]
-    table = pandas.DataFrame(_make_rows(items, conditions, measures, results))
-    table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
+    rows = _make_rows(items, conditions, measures, results)
+    table = pandas.DataFrame(rows).drop(columns="failure")
+    # It is the last column whatever the values are. A column of texts would have NaN for None.
+    table["failure"] = pandas.Series([row["failure"] for row in rows], dtype=object)
     return table, measures
 
 

@@ -382,6 +382,18 @@ def test_an_utterance_that_lacks_the_score_of_an_ear_is_left_out(tmp_path: Path)
     assert report.table.stoi.isna().sum() == 2
 
 
+def test_facts_are_those_of_the_better_ear_under_the_last_condition_with_scores(
+    tmp_path: Path,
+) -> None:
+    swapped = {"left": 0.5, "right": 0.01}
+    noises = {key: swapped[key[1]] for key in BOTH_EARS}
+    del noises["aid", "left", 0]
+    path = write_ears(tmp_path, noises)
+    table = haspi_report(manifest=path, measures=["stoi"], better_ear=True, jobs=1).table
+    assert set(table.ear) == {"right"} and table.clean_level.notna().all()
+    assert [failure is None for failure in table.failure] == [True, False] + [True] * 4
+
+
 def test_ears_that_all_lack_a_score_are_an_error(tmp_path: Path) -> None:
     noises = {key: math.nan if key[1] == "left" else noise for key, noise in BOTH_EARS.items()}
     path = write_ears(tmp_path, noises)

@@ -208,6 +208,7 @@ def test_a_measure_without_a_value_for_one_item_is_a_failure_of_this_item(
 
     table = run_study(items, gains(1), [MEASURES[0], Measure("mine", compute)], jobs=1)
     assert table["failure"].isna().tolist() == [True, False, False]
+    assert table["failure"].iloc[0] is None
     assert table["failure"].iloc[-1] == "mine has returned no own"
     assert table["peak"].notna().all()
 
