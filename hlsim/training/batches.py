@@ -487,7 +487,8 @@ def make_data(
 
     Raises:
         ValueError: Files are missing or invalid, or used for both training and validation, the
-            recipe requires noise and there is none, or the microphones of its network do not fit
+            recipe requires noise and there is none, a compensator is trained on recorded scenes
+            and there is other speech for validation, or the microphones of its network do not fit
             the data (see ``_CompensatorBatches``).
 
     >>> from hlsim.data.bundled import SPEECH
@@ -503,6 +504,13 @@ def make_data(
         plain |= {"levels": levels, "treated": False}
     elif isinstance(recipe, CompensatorRecipe):
         plain["equalised"] = 0.0
+        valid_speech_of_scenes = [scene.clean for scene in data.valid_scenes]
+        if data.scenes and data.valid_speech not in (None, valid_speech_of_scenes):
+            raise ValueError(
+                "recorded scenes are validated on recorded scenes, so that valid_speech "
+                "(--valid-speech) would have no effect; leave it out, and write valid in the "
+                "column 'split' of some rows of the manifest"
+            )
         _warn_of_settings_without_effect(recipe, data)
         has_noise = data.noise or data.scenes
         if (recipe.trains_noise_reduction() or recipe.babble) and not has_noise:

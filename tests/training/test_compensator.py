@@ -324,6 +324,26 @@ def test_a_batch_of_one_needs_recorded_scenes_for_two_ears(
         make_data(data, random)
 
 
+def test_recorded_scenes_are_not_validated_on_other_speech(
+    scenes: TrainingData, tmp_path: Path
+) -> None:
+    row = Utterance("clean.wav", "mixture.wav", split="valid", reference="1 2")
+    write_manifest(tmp_path / "manifest.csv", [row])
+    both = replace(
+        TrainingData.from_manifest(tmp_path / "manifest.csv"),
+        speech=scenes.speech,
+        scenes=scenes.scenes,
+    )
+    for data in (scenes, both):
+        with pytest.raises(ValueError, match=r"\(--valid-speech\) would have no effect"):
+            make_data(replace(data, valid_speech=tmp_path), SMALL)
+    other = TrainingData.from_manifest(tmp_path / "manifest.csv", valid_speech=tmp_path)
+    assert other.valid_speech == tmp_path  # a simulator is validated on it
+    # The files of one split are those of the other here.
+    with pytest.raises(ValueError, match="both training and validation"):
+        make_data(both, SMALL)
+
+
 def test_settings_without_effect_are_named(scenes: TrainingData, data: TrainingData) -> None:
     recipe = replace(SMALL, babble=0.5, snr=(-5.0, 5.0), sounds=0.5)
     with pytest.warns(UserWarning, match="recipe: babble, snr, sounds without effect on recorded"):
