@@ -105,8 +105,9 @@ def prepare(
 
     Raises:
         ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
-            file, a scene lacks one of the microphones, the share is not from 0 to below 1 or cannot
-            be moved (see ``hold_out_speakers``), or the manifest cannot be written.
+            file, a scene lacks one of the microphones, a microphone is named twice, the share is not
+            from 0 to below 1 or cannot be moved (see ``hold_out_speakers``), or the manifest
+            cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -134,6 +135,7 @@ def prepare(
         )
     if microphones:
         utterances = [_choose_microphones(row, microphones) for row in utterances]
+        check_utterances(utterances)
     if valid_share:
         utterances = hold_out_speakers(utterances, valid_share)
     write_manifest(out, utterances)
@@ -274,16 +276,23 @@ def _read_clarity_scenes(files: Sequence[str]) -> list[Utterance]:
     train.
 
     Raises:
-        ValueError: A scene lacks its clean speech, or its first microphone.
+        ValueError: A scene lacks its clean speech or its first microphone, or has two files of a
+            microphone.
     """
     known_files = set(files)
-    mixtures: dict[str, list[str]] = defaultdict(list)
+    mixtures: dict[str, dict[str, str]] = defaultdict(dict)  # files by scene and microphone
     for file in sorted(files):
         match = _CLARITY_MIXTURE.fullmatch(file)
-        if match:
-            mixtures[match["scene"]].append(file)
+        if match is None:
+            continue
+        first = mixtures[match["scene"]].setdefault(match["microphone"], file)
+        if first != file:
+            raise ValueError(
+                f"{first} and {file} are one microphone of one scene; remove one of the two"
+            )
     utterances = []
-    for scene, microphones in mixtures.items():
+    for scene, by_microphone in mixtures.items():
+        microphones = [*by_microphone.values()]
         candidates = [scene + ending for ending in CLARITY_REFERENCES]
         clean = next((path for path in candidates if path in known_files), None)
         if clean is None or not microphones[0].endswith("_CH1.wav"):

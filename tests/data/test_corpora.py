@@ -103,12 +103,15 @@ def test_scenes_of_the_clarity_challenges_are_recognised(tmp_path: Path) -> None
     assert read_manifest(tmp_path / "m.csv")[-1].noisy_files == microphones[::-2]
     with pytest.raises(ValueError, match=r"expected microphones \[4\] .*, got \[1, 2, 3\]"):
         prepare(tmp_path, tmp_path / "m.csv", microphones=[4])
+    with pytest.raises(ValueError, match="a microphone is listed twice"):
+        prepare(tmp_path, tmp_path / "m.csv", microphones=[3, 3])
     (tmp_path / clean).unlink()
     with pytest.raises(ValueError, match=r"of microphone 1 .* and clean speech"):
         prepare(tmp_path, tmp_path / "m.csv")
 
 
 REJECTED = {
+    "a microphone twice": [f"S1_{kind}_CH1.wav" for kind in ("mix", "mixed", "target_anechoic")],
     "no noisy folder": [name for name in voicebank("_16k") if "noisy_test" not in name],
     "a missing file": [name for name in voicebank() if name != "noisy_testset_wav/p232_001.wav"],
     "noise beside LibriSpeech": ["dev-clean/84/1/c.wav", "noise/1.wav"],
