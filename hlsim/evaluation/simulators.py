@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from hlsim.calibration import NEURO_RATE
+from hlsim.calibration import NEURO_RATE, level_spl
 from hlsim.checks import loud_outputs
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import SIMULATOR_LEVELS, apply_treatments, draw_simulator_items
@@ -69,7 +69,7 @@ def evaluate_simulators(
         measures: Further measures, ``package.module:name``.
         items: Number of items, each of which is measured for each of ``inputs``.
         seconds: Length of an item in seconds. STOI needs 0.4 s of speech without its pauses.
-        levels: Levels of the input in dB SPL, through which the items cycle.
+        levels: Levels in dB SPL, before the input is processed, through which the items cycle.
         inputs: Names of ways to process the input before the simulator: ``"as-is"``, ``"louder"``
             (by 20 dB), ``"nalr"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
@@ -220,5 +220,6 @@ def _example_sounds(evaluation: Evaluation) -> ItemSounds:
     end = int(item.signal.nonzero().max()) + item.sample_rate // 10
     groups = {"": {name: signal[:end] for name, signal in signals.items()}}
     facts = item.facts
-    name = f"{item.name}: {facts['treatment']}, {facts['speech']}, {facts['input_level']:g} dB SPL"
+    level = float(level_spl(item.signal))  # after the treatment
+    name = f"{item.name}: {facts['treatment']}, {facts['speech']}, {level:.0f} dB SPL"
     return ItemSounds(name, item.ear, item.sample_rate, groups, failures)

@@ -6,6 +6,7 @@ window, no global state and no notebook's backend is involved.
 
 import io
 from collections.abc import Callable, Mapping, Sequence
+from colorsys import hls_to_rgb
 from functools import partial
 from itertools import cycle
 from textwrap import fill
@@ -106,11 +107,18 @@ def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     names = [condition.name for condition in conditions]
     aided = [c.name for c in conditions if c.of not in names and c.kind != "unaided"]
     colours: dict[str, Any] = dict.fromkeys(names, UNAIDED_COLOUR)
-    colours.update(zip(aided, cycle(_COLOURS), strict=False))
+    colours.update(zip(aided, _palette(len(aided)), strict=False))
     for condition in conditions:
         if condition.of in names:
             colours[condition.name] = (colours[condition.of], 0.6)
     return colours
+
+
+def _palette(count: int) -> Sequence[Any]:
+    """Return ``count`` or more different colours of matplotlib."""
+    if count <= len(_COLOURS):
+        return _COLOURS
+    return [hls_to_rgb(number / count, 0.45, 0.6) for number in range(count)]
 
 
 def curves_picture(

@@ -61,7 +61,7 @@ _TREATMENTS = {
 
 _FACTS = {
     "severity": "By MSBG's degree of loss",
-    "input_level": "By level (dB SPL)",
+    "input_level": "By level before processing (dB SPL)",
     "speech": "Clean or noisy",
 }
 """Titles of the tables for each fact of the items."""

@@ -94,6 +94,8 @@ def test_a_treatment_without_any_value_does_not_prevent_the_page(options: dict[s
     page = simulators_page(study)
     assert page.verdict.startswith("Speech as it is: soft has a median SNR")
     assert page.markdown().count("too loud") == 1
+    quiet = evaluate_simulators({"soft": Soft()}, **{**settings, "levels": [50.0]}, listen=1)
+    assert quiet.sounds[0].name.endswith("louder, clean, 70 dB SPL")
 
 
 def test_an_evaluation_without_any_snr_names_the_reason(

@@ -57,6 +57,8 @@ def test_colours_of_conditions() -> None:
     assert colours["none"] == UNAIDED_COLOUR
     assert colours["NAL-R, same level"] == (colours["mine"], 0.6)
     assert len({str(colour) for colour in colours.values()}) == 4
+    many = condition_colours([Condition(f"aid {number}") for number in range(9)])
+    assert len({*many.values()}) == 9, "two aids of one colour cannot be told apart"
 
 
 def test_settings_of_the_user_neither_change_a_picture_nor_are_changed() -> None:
