@@ -105,8 +105,8 @@ def prepare(
 
     Raises:
         ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
-            file, a scene lacks one of the microphones, a microphone is named twice, the share is not
-            from 0 to below 1 or cannot be moved (see ``hold_out_speakers``), or the manifest
+            file, a scene lacks one of the microphones, a microphone is named twice, the share is
+            not from 0 to below 1 or cannot be moved (see ``hold_out_speakers``), or the manifest
             cannot be written.
 
     >>> from tempfile import TemporaryDirectory
