@@ -79,6 +79,7 @@ def window(request: pytest.FixtureRequest, chromium: Any) -> Iterator[Any]:
     width, scheme = request.param.split()
     size = {"width": int(width), "height": 844}
     page = chromium.new_page(viewport=size, color_scheme=scheme)
+    page.set_default_timeout(180_000)  # several pages share a core
     logged: list[str] = []
     requests: list[str] = []
     page.on("console", lambda message: logged.append(message.text))
