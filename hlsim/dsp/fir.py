@@ -137,8 +137,9 @@ def filters_with_gains(
 def _unit_filters(order: int) -> NDArray[np.float64]:
     """Design a filter for each of ``order + 1`` frequencies, evenly spaced from 0 Hz to Nyquist.
 
-    The gain of a filter is 1 at its frequency and 0 at the other frequencies. Filters are linear in
-    their gains: the sum of these filters times some gains is the filter with these gains.
+    Each filter is that of ``frequency_sampling_fir`` for a gain of 1 at its frequency and of 0 at
+    the others. The window makes its response lower and wider. Filters are linear in these gains:
+    the sum of these filters times some gains is the filter that is designed for these gains.
 
     Returns:
         Coefficients, (order + 1, order + 1), one row per frequency.

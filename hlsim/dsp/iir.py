@@ -113,7 +113,9 @@ def coefficients(filter_: ZerosPoles) -> tuple[Array, Array]:
 
 
 def frequency_response(filter_: ZerosPoles, omega: Array) -> ComplexArray:
-    """Compute the response of a digital filter at frequencies in radians per sample, (n,).
+    """Compute the complex response of a digital filter at frequencies in radians per sample.
+
+    Shape: (n,) -> complex (n,).
 
     >>> lowpass = digital_filter(butterworth(1), 4000.0, 16000.0)
     >>> abs(frequency_response(lowpass, np.array([0.0]))).round(3).tolist()

@@ -17,8 +17,11 @@ _LEVEL_TOLERANCE_DB = 1.0
 def verdict(c: ConditionComparison, subject: str = "", rival: str = "", noun: str = "item") -> str:
     """Return a sentence that says which condition is better, with scores and p values.
 
-    A higher score is called better only if the output levels differ by less than 1 dB, because
-    HASPI rises with gain.
+    If each test that is defined has a p value below 0.05, the condition ``after`` "is better" or
+    worse than ``before``; if only one of two tests has, it "may be". If none has, the conditions
+    "cannot be distinguished". If the output levels differ by 1 dB or more or are not known, the
+    sentence says that the condition "scores higher" or lower instead, because HASPI rises with
+    gain.
 
     Args:
         c: Comparison of two conditions.
@@ -57,8 +60,8 @@ def verdict(c: ConditionComparison, subject: str = "", rival: str = "", noun: st
 def limits(c: ConditionComparison) -> str:
     """Return the caveats of a verdict as text.
 
-    These are the change in level, items that are not independent, items that are left out, and that
-    the score is a prediction.
+    These are the change in level, and whether it may explain that of HASPI; items that are not
+    independent; items that are left out; and that the score is a prediction.
 
     Args:
         c: Comparison of two conditions.

@@ -63,7 +63,11 @@ class TrainingRecipe:
 
     @classmethod
     def criteria(cls) -> tuple[str, ...]:
-        """Return the names of the criteria that ``weights`` may contain."""
+        """Return the names of the criteria that ``weights`` may contain.
+
+        Raises:
+            NotImplementedError: This class has none; each subclass returns its own.
+        """
         raise NotImplementedError
 
     def __post_init__(self) -> None:
