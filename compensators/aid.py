@@ -64,7 +64,8 @@ class Aid(StoredEars, nn.Module):
             audiogram: One ear for all signals, or ears whose shape (..., 8) broadcasts over the
                 leading dimensions of the waveform; by default those of the constructor.
 
-        Shape: (..., time) -> (..., time).
+        Shape: (..., time) -> (..., time), with the leading dimensions of waveform and ears
+            broadcast.
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL (120 for

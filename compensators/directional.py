@@ -260,7 +260,8 @@ class MicrophoneStream:
         Shape: -> (..., ears, latency), where the latency includes that of the aid.
 
         Raises:
-            ValueError: There was no chunk since the beginning of the signal.
+            ValueError: There was no chunk since the beginning of the signal, or the aid rejects a
+                slider.
         """
         if self._state is None:
             raise ValueError("expected a chunk before flush, got none; there is nothing to return")

@@ -460,7 +460,8 @@ class Stream:
 
     Chunks are tensors or NumPy arrays, and so are the outputs; ``flush`` returns a tensor.
 
-    Shape: (..., time) -> (..., time); the leading dimensions of all chunks are the same.
+    Shape: (..., time) -> (..., time), with the leading dimensions of chunk and ears broadcast;
+        those of all chunks are the same.
 
     Attributes:
         sliders: Value of each slider by its name, as it was set. The value in use moves there.
@@ -542,9 +543,12 @@ class Stream:
         """Return the end of the output, which is still missing because of the delay.
 
         The next chunk is then the beginning of another signal. The output is a tensor, also for
-        chunks that are arrays.
+        chunks that are arrays, in the precision in which the aid computes.
 
-        Shape: -> (..., latency), with the leading dimensions of the chunks.
+        Shape: -> (..., latency), with the leading dimensions of the other outputs.
+
+        Raises:
+            ValueError: A slider is outside 0 to 1, or does not broadcast to the items.
         """
         rest = self(self._fitted.new_zeros(*self._shape, DELAY))
         self._state = {}

@@ -1,4 +1,4 @@
-"""Reading, writing and listing of audio files. No other module imports soundfile.
+"""Reading, writing and listing of audio files.
 
 Recordings of any length are read by ``scan_audio`` and ``read_parts``, and written by
 ``write_parts``, so that only a part of them is in memory.
@@ -132,8 +132,8 @@ def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Itera
 
     Args:
         recording: Properties of the recording, from ``scan_audio``.
-        bounds: Half-open range of samples of each part, in ascending order. Parts may overlap, and
-            have no gap between them.
+        bounds: Half-open range of samples of each part. The first part begins at 0. Each later one
+            begins and ends later than the one before; it may overlap with it, and leaves no gap.
 
     Yields:
         Samples in float32, (channels, time), where 1.0 is full scale.
@@ -367,10 +367,11 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
 
 
 def _visible_files(folder: str | Path) -> Iterator[tuple[Path, str]]:
-    """Yield the path and the real path of each file, and of each link to a folder already searched.
+    """Yield the path and the real path of each file, and of some links.
 
-    Hidden files and folders are left out. Every folder is searched once: first the folders that are
-    no links, then those to which links lead.
+    These links lead nowhere, or to a folder that was searched already. Hidden files and folders are
+    left out. Every folder is searched once: first the folders that are no links, then those to
+    which links lead.
 
     Args:
         folder: Folder to search.

@@ -123,7 +123,7 @@ def simulate(
         ``(time,)``, one output per ear, ``(ears, time)``.
 
     Raises:
-        ValueError: The audio, the ear, the rate or the simulator is not valid.
+        ValueError: The audio, the ear, the rate, the level or the simulator is not valid.
 
     Example:
         >>> import hlsim
@@ -163,7 +163,7 @@ def compensate(
         ``(ears, time)``. It is as loud as the ear needs: turn the volume down before you play it.
 
     Raises:
-        ValueError: The audio, the ear, the rate or the compensator is not valid.
+        ValueError: The audio, the ear, the rate, the level or the compensator is not valid.
 
     Example:
         >>> import hlsim
@@ -197,8 +197,9 @@ def listen(
         A player that a notebook displays; its ``save`` method writes a page for a browser.
 
     Raises:
-        ValueError: There is no signal, all signals are silent, one has another shape or samples
-            that are NaN or infinite, or the sample rate or the level is not valid.
+        ValueError: There is no signal, all signals are silent, one has another shape, no samples,
+            whole numbers, or a sample that is NaN, infinite or above 1e9 in magnitude, or the
+            sample rate or the level is not valid.
         MissingExtraError: matplotlib or Pillow is not installed.
 
     Example:

@@ -26,8 +26,9 @@ def read_audiograms(
     ``R250`` if each row has both ears; one of uncomfortable levels ``ucl_250``, or ``ucl_L250`` and
     ``ucl_R250``. A long table has the columns ``frequency`` in Hz and ``threshold``, perhaps
     ``ucl``, and ``listener`` and ``ear`` if it has several ears. Other columns may have any name,
-    in a long table only if it has ``listener`` and ``ear``. A file may have commas, semicolons or
-    tabs, and is in UTF-8, UTF-16 or Windows' cp1252.
+    in a long table only if it has ``listener`` and ``ear``; those of a long table are not read, and
+    a warning names those that differ within an ear. A file may have commas, semicolons or tabs, and
+    is in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
         path: A CSV file, a pandas ``DataFrame``, or ``"standard"`` for Bisgaard's audiograms N1 to
@@ -258,6 +259,8 @@ def _without_units(column: str) -> str:
 
 def _widen(rows: Sequence[_Row], frequency: str, threshold: str, ucl: Sequence[str]) -> list[_Row]:
     """Join the rows of each ear of a table with one threshold per row.
+
+    Further columns are left out. A warning names those that differ between the rows of an ear.
 
     Args:
         rows: Rows of the table.

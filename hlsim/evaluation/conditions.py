@@ -175,7 +175,7 @@ class OnMicrophones(nn.Module):
 
 
 def takes_microphones(aid: object) -> bool:
-    """Return whether an aid takes the signals of several microphones.
+    """Return whether an aid takes several microphones: its attribute ``takes_microphones``, if any.
 
     >>> takes_microphones(Unaided())
     False
@@ -255,6 +255,9 @@ class EqualiserLike(nn.Module):
         """Measure the aid's gain for an ear in the 24 bands of ``measure_gain_curve``, in dB.
 
         The gain of a band is the mean over ``levels``, at least -100 dB, rounded to 0.1 dB.
+
+        Raises:
+            ValueError: An output of the aid is not valid, see ``cut_output``.
         """
         curve = measure_gain_curve(self.aid, audiogram, self.utterances, self.levels)
         mean = np.mean(curve["gain_db"], 0).clip(_LOWEST_GAIN_DB, None)

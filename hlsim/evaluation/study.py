@@ -193,11 +193,14 @@ class Condition:
         return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
-        """Process the input of an item, or read its recorded output. Shape: (time,).
+        """Process the input of an item, or read its recorded output.
+
+        Returns:
+            The output, (time,). It is not validated here, but by ``cut_output``.
 
         Raises:
-            ValueError: There is neither a function nor a recorded output. Functions of a user may
-                raise other errors.
+            ValueError: There is neither a function nor a recorded output, or its file cannot be
+                read. Functions of a user may raise other errors.
         """
         if self.process is None:
             if item.recorded is None:
