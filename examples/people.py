@@ -16,7 +16,7 @@ It prints the tables of docs/people.md and draws its figures to the folder OUT, 
 - ``clarity_responses.csv``: see ``docs/figures/fit_words.py``.
 
 It takes about ten minutes on one core. Simulated values are kept in OUT and used
-again; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers
+again for the same ears; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers
 only, and the tables show the others, unless they say otherwise.
 """
 
@@ -81,6 +81,7 @@ def is_fitted(names: pd.Series) -> pd.Series:
 def simulate(
     path: Path,
     keys: pd.DataFrame,
+    inputs: Sequence[object],
     simulators: Sequence[str],
     compute: Callable[[nn.Module], np.ndarray],
 ) -> None:
@@ -89,15 +90,17 @@ def simulate(
     Args:
         path: File of the simulated values.
         keys: Columns that identify the rows, to which the simulated values are added.
+        inputs: What the values of each row are computed from; the file has its text, too.
         simulators: Names of the simulators.
         compute: Function that returns the values of all rows for a simulator.
     """
-    names = [*keys.columns]
+    table = keys.assign(inputs=[str(row) for row in inputs])
+    names = [*table.columns]
     if path.is_file():
         stored = pd.read_csv(path)
-        if len(stored) == len(keys) and (stored[names].to_numpy() == keys.to_numpy()).all():
+        is_comparable = len(stored) == len(table) and {*names} <= {*stored.columns}
+        if is_comparable and (stored[names].to_numpy() == table.to_numpy()).all():
             return
-    table = keys.copy()
     for name in simulators:
         print(f"simulating {path.stem}: {name}", file=sys.stderr, flush=True)
         table[name] = compute(SIMULATORS[name]())
@@ -148,7 +151,9 @@ def simulated_levels(rows: pd.DataFrame, out: Path) -> tuple[pd.DataFrame, dict[
         return levels
 
     path = out / "simulated-ucl.csv"
-    simulate(path, rows[["person", "ear", "hz", "threshold"]], [*SIMULATORS], compute)
+    keys = rows[["person", "ear", "hz", "threshold"]]
+    inputs = [*zip(rows.audiogram, rows.hz.map(normal), strict=True)]
+    simulate(path, keys, inputs, [*SIMULATORS], compute)
     stored = pd.read_csv(path)
     return rows.assign(**{name: stored[name].to_numpy() for name in SIMULATORS}), normal
 
@@ -283,6 +288,7 @@ def compare_loudness(path: Path, out: Path) -> None:
     simulate(
         growths,
         rows[["person", "ear", "threshold"]],
+        ears,
         THREE_EARS,
         lambda simulator: recruitment.growth_of_perceived_level(simulator, ears),
     )
@@ -396,6 +402,7 @@ def compare_tuning(path: Path, out: Path) -> None:
     simulate(
         stored,
         rows[["ear", "hz"]],
+        ears,
         THREE_EARS,
         lambda simulator: tuning.tuning_depths(simulator, ears, hz),
     )
@@ -495,6 +502,7 @@ def compare_steps(rows: pd.DataFrame, out: Path) -> None:
     simulate(
         path,
         keys,
+        flat,
         THREE_EARS,
         lambda simulator: tuning.tuning_depths(simulator, flat, list(keys.hz)),
     )

@@ -68,6 +68,18 @@ def test_a_curve_with_a_step_on_a_slope_gives_the_step_back() -> None:
     assert people.flat_step(curve, limit=15.0) == pytest.approx(1.5)
 
 
+def test_simulated_values_are_used_again_only_for_the_same_ears(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    people = load_example("people.py")
+    monkeypatch.setattr(people, "SIMULATORS", {"msbg": MSBG})
+    path, keys = tmp_path / "values.csv", pd.DataFrame({"person": ["P001", "P002"], "hz": 500})
+    for ears, value in ((FLAT_EARS[:2], 1.0), (FLAT_EARS[:2], 2.0), (FLAT_EARS[1:3], 3.0)):
+        people.simulate(path, keys, ears, ["msbg"], lambda _, value=value: np.full(2, value))
+        used = 1.0 if value == 2.0 else value  # the second call finds those of the first
+        assert pd.read_csv(path).msbg.tolist() == [used, used]
+
+
 def test_slopes_are_read_with_the_mean_threshold_of_their_frequencies(tmp_path: Path) -> None:
     recruitment = load_example("people_recruitment.py")
     columns = ["left_500", "left_1500", "left_4000", "right_1500", "right_4000"]
