@@ -152,7 +152,7 @@ def evaluate_scenes(
             before NAL-R and before each aid.
         measures: Further measures: names of hlsim's own, or ``package.module:name`` of yours.
         precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
-        linked: Whether one level sets the gains of both ears, in compensators that support it.
+        linked: Whether one level sets the gains of both ears. All aids must support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
         listen: Number of scenes with sounds for the players of a page, as an ear perceives them.
@@ -384,8 +384,8 @@ def _make_conditions(
         levels: Arguments ``sample_rate`` and ``full_scale_spl`` of aids.
 
     Raises:
-        ValueError: An aid cannot be loaded, two aids have the same label, or the signals of two
-            conditions would have the same folder.
+        ValueError: An aid cannot be loaded or linked, two aids have the same label, or the signals
+            of two conditions would have the same folder.
     """
     loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
     for label in (*aids, *folders):
@@ -393,6 +393,11 @@ def _make_conditions(
             raise ValueError(f"{label} is already evaluated; give the aid another label")
     for label, name in aids.items():
         if ":" in name and not Path(name).exists():
+            if linked:
+                raise ValueError(
+                    f"{name} has no setting linked, because it is your own; link its ears in its "
+                    "own code, and leave out linked (--linked)"
+                )
             loaded[label] = PluginAid(name, levels["sample_rate"])
         else:
             loaded[label] = load_compensator(name, **levels, linked=linked)

@@ -388,6 +388,7 @@ LEFT_EAR_ONLY = {"L0001": {**EAR, "audiogram_levels_r": None}}
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
+        ({"aids": {"a": "torch:neg"}, "linked": True}, "torch:neg has no setting linked"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
         ({"precision": 16}, "expected precision 32 or 64"),
         ({"stride": 0}, "expected stride to be a whole number from 1"),
