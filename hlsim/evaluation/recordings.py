@@ -323,7 +323,8 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
     changes = (right[scores] - left[scores]).bfill(axis=1).iloc[:, 0]
     better = left.where(changes.isna() | (changes <= 0.0), right)
     better[scores] = np.maximum(left[scores], right[scores])  # NaN if one of them is
-    failures = [
+    # A new column of texts would have NaN for None.
+    better.loc[:, "failure"] = [
         "; ".join(
             f"{side} ear: {reason}"
             for side, reason in zip(EARS, reasons, strict=True)
@@ -332,8 +333,6 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
         or None
         for reasons in zip(left["failure"], right["failure"], strict=True)
     ]
-    # A column of texts would have NaN for None.
-    better["failure"] = type(table["failure"])(failures, index=better.index, dtype=object)
     parts = better[["listener", "utterance", "snr"]].itertuples(index=False)
     better["name"] = [join_name(*part) for part in parts]
     better = better.reset_index(drop=True).sort_values("item", kind="stable", ignore_index=True)
