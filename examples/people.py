@@ -15,8 +15,8 @@ It prints the tables of docs/people.md and draws its figures to the folder OUT, 
   ``threshold_500ms_db_spl`` and ``tuning_depth_db``, as measured by Lecluyse et al. (2013).
 - ``clarity_responses.csv``: see ``docs/figures/fit_words.py``.
 
-It takes about ten minutes on one core. Simulated values are kept in OUT and used
-again for the same ears; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers
+It takes about ten minutes on one core. Simulated values are kept in OUT and used again for the same
+ears; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers
 only, and the tables show the others, unless they say otherwise.
 """
 
@@ -90,7 +90,7 @@ def simulate(
     Args:
         path: File of the simulated values.
         keys: Columns that identify the rows, to which the simulated values are added.
-        inputs: What the values of each row are computed from; the file has its text, too.
+        inputs: Values from which the result of each row is computed. The file has their text, too.
         simulators: Names of the simulators.
         compute: Function that returns the values of all rows for a simulator.
     """
