@@ -409,7 +409,8 @@ class DirectionalAid(nn.Module):
 
     Raises:
         ValueError: The front end is not a ``FilterAndSum``, the aid is not a module, or was built
-            for another sample rate.
+            for another sample rate or, behind an ``AdaptiveBeamformer``, another
+            ``full_scale_spl``.
 
     >>> from compensators import NALR
     >>> aid = DirectionalAid(DifferentialMicrophone(), NALR())
@@ -430,6 +431,8 @@ class DirectionalAid(nn.Module):
         if not isinstance(aid, nn.Module):
             raise ValueError(f"expected an aid, got {aid!r}; load it by hlsim.load_compensator")
         check_attributes(aid, "an aid", sample_rate=front_end.sample_rate)
+        if hasattr(front_end, "full_scale_spl"):
+            check_attributes(aid, "an aid", full_scale_spl=front_end.full_scale_spl)
         self.front_end = front_end
         self.aid = aid
 

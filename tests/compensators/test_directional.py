@@ -275,6 +275,8 @@ def test_wrong_numbers_of_microphones_and_settings_raise_errors() -> None:
     assert bool(stream(torch.zeros(2, 2, 100)).isfinite().all())
     with pytest.raises(ValueError, match="an aid with sample_rate=16000, got 44100"):
         DirectionalAid(front_end, NALR(sample_rate=44100))
+    with pytest.raises(ValueError, match="an aid with full_scale_spl=100"):
+        DirectionalAid(AdaptiveBeamformer(full_scale_spl=100.0), NALR())
     with pytest.raises(ValueError, match="load it by"):
         DirectionalAid(front_end, "nalr")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"write BinauralMVDR\(\)"):
