@@ -58,10 +58,11 @@ def find_highest_levels(limits: Tensor, bands: int) -> Tensor:
 
     Args:
         limits: Levels of tones in dB HL at ``FREQUENCIES`` that bands stay below.
-        bands: Number of bands.
+        bands: Number of bands of an aid, at ``filter_centres``.
 
     Returns:
-        Highest level of each band in dB SPL.
+        Highest level of each band in dB SPL: ``MARGIN_DB`` below the limit of a tone at the centre
+        of the band or of a neighbour, whichever is lower.
 
     Shape: (items, 8) -> (items, bands).
 

@@ -176,11 +176,14 @@ def warn_of_other_ears(
         ValueError: There is no such compensator, or its checkpoint cannot be read.
     """
     from compensators import trained_for
+    from hlsim.audiogram.listener import Listener
 
+    used = [*ears.ears().values()] if isinstance(ears, Listener) else [ears]
+    thresholds = {ear and ear.thresholds for ear in used}
     warnings = []
     for label, checkpoint in checkpoints.items():
         trained_ear = trained_for(checkpoint)
-        if trained_ear and trained_ear.thresholds != getattr(ears, "thresholds", None):
+        if trained_ear and thresholds != {trained_ear.thresholds}:
             levels = ", ".join(f"{level:g}" for level in trained_ear.thresholds)
             text = f"{label} was trained for one ear, {levels} dB HL, and does not fit other ears."
             print(f"hlsim: warning: {text}", file=sys.stderr)

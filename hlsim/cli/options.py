@@ -378,7 +378,9 @@ def _read_levels(text: str) -> list[float]:
 
 
 def loudness(text: str) -> float | dict[float, float]:
-    """Convert the text of ``--loudness`` to a number, or to numbers by level.
+    """Convert the text of a loudness target, such as ``--loudness`` of ``evaluate-compensator``.
+
+    It is a number, or numbers by level. ``--loudness`` of ``compensate`` is another option.
 
     Args:
         text: Loudness in dB relative to a normal ear, a number, or levels of the input in dB SPL

@@ -55,7 +55,7 @@ class Utterance:
 
     @property
     def noisy_files(self) -> list[str]:
-        """Paths of the noisy version, of which there are several only with ``reference``."""
+        """Paths of the noisy version, the parts of ``noisy`` between ``|``; none if it is empty."""
         return self.noisy.split(FILE_SEPARATOR) if self.noisy else []
 
     @property
@@ -167,7 +167,7 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
             without a noisy one is listed twice, a clean file is in a folder of noises, mixtures or
             impulse responses by its name, a file or a speaker is in two splits, a microphone is in
             a row twice, or a reference is not valid, lacks a noisy file, or is missing in some rows
-            only.
+            only or for several noisy files.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):
@@ -191,6 +191,11 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         listed.add(file)
         if len({*utterance.noisy_files}) < len(utterance.noisy_files):
             raise ValueError(f"{utterance.noisy}: a microphone is listed twice; remove one of them")
+        if len(utterance.noisy_files) > 1 and not utterance.references:
+            raise ValueError(
+                f"{utterance.noisy}: several noisy files are those of several microphones, and "
+                "need the number of the reference (column 'reference'); add it"
+            )
         if clean.intersection(utterance.noisy_files):
             raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
         for folder in utterance.path.split("/")[:-1]:

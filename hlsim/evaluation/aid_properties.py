@@ -327,7 +327,8 @@ def measure_reception_thresholds(
         One dict per ear and aid, as ``measure_aids`` returns it, with ``threshold_db``, the
         signal-to-noise ratio in dB at which half of the triplets of digits are understood, and
         ``benefit_db``, the threshold with the reference minus that with the aid. Both are an
-        ``Estimate`` with its 95 % interval.
+        ``Estimate`` with its 95 % interval. A threshold above 32 dB is infinite; the benefit is
+        then infinite, or NaN if both are.
 
     Raises:
         ValueError: An aid fails; the message names aid and ear.

@@ -204,7 +204,8 @@ def load_measure(name: str) -> Measure:
 
     The function is not tried: one that returns something else fails in the study. Its values are
     stored only if it has the attribute ``fingerprint``, such as a version, which you change with
-    its code. Those of a module (``nn.Module``) are stored without it.
+    its code. Those of a module (``nn.Module``) whose attributes can be hashed are
+    stored without it.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -259,11 +260,12 @@ The column ``full_scale_spl`` has the level in dB SPL of a signal whose RMS is 1
 def find_lag(output: Tensor, clean: Tensor) -> int | None:
     """Return by how many samples an output is later than the clean speech.
 
-    It is the lag at which the magnitude of the cross-correlation of both is largest.
+    It is the lag at which the magnitude of the cross-correlation of both, without their means, is
+    largest.
 
     Args:
-        output: The output. Shape: (time,).
-        clean: Clean speech. Shape: (time,).
+        output: The output, on the CPU and without a gradient. Shape: (time,).
+        clean: Clean speech, likewise. Shape: (other time,).
 
     Returns:
         The lag, negative if the output is early, or None if the magnitude of the correlation

@@ -478,9 +478,9 @@ def _parse_snr(text: str) -> float:
     Raises:
         ValueError: The text is not a number, or is NaN or minus infinity.
     """
-    number = text.lower().removesuffix("db").strip().replace(",", ".")
-    if not number:
+    if not text.strip():
         return math.nan
+    number = text.strip().lower().removesuffix("db").replace(",", ".")
     try:
         snr = float(number)
     except ValueError:

@@ -452,7 +452,7 @@ def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> 
     # Tables write the names of some columns in capitals.
     spellings = {column.casefold(): column for column in owners}
     for column in values:
-        spelling = spellings.get(column.casefold(), column)
+        spelling = spellings.setdefault(column.casefold(), column)
         if owners.setdefault(spelling, measure.name) != measure.name or spelling != column:
             raise ValueError(
                 f"{measure.name} returns {column}, a column that exists already; rename it in "

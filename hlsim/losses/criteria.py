@@ -105,7 +105,7 @@ class Criterion:
     two_ears: bool = False
 
     def parts(self, comparison: Comparison) -> dict[str, Tensor]:
-        """Compute the parts of all items, (items,) each, without the padding after their ends."""
+        """Compute the parts of all items by name, (items,) each, without padding after the ends."""
         time = comparison.output.shape[-1]
         is_padded = any(length < time for length in comparison.lengths)
         if self.handles_padding or not is_padded:

@@ -4,8 +4,9 @@ The score is that of ``haaqi_v1`` of pyclarity 0.9.0, which the Cadenza challeng
 gradient. It differs from ``compute_haaqi`` in these points:
 
 - ``full_scale_spl`` is 94 dB SPL by default, where ``level1`` is 65.
-- The noise at the threshold of hearing is fixed instead of drawn, and a rate of 44.1 kHz is not
-  rounded to 44. ``noise="seeded", seed=..., whole_khz=True`` gives the digits of pyclarity.
+- The noise, 10 dB below the threshold of hearing, is fixed instead of drawn, and a rate of
+  44.1 kHz is not rounded to 44. ``noise="seeded", seed=..., whole_khz=True`` gives the digits of
+  pyclarity.
 - Both signals have one sample rate. Thresholds at other frequencies than the audiometric ones are
   interpolated on a logarithmic scale of frequency.
 - Empty or soft signals and those shorter than 0.7 s raise ``ValueError``. ``compute_haaqi`` scores
@@ -83,9 +84,9 @@ def haaqi(
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
-        noise: Noise at the threshold of hearing. ``"expected"`` uses the same noise every time;
-            ``"seeded"`` draws the noise that pyclarity draws with ``seed``; ``"none"`` leaves it
-            out.
+        noise: Noise 10 dB below the threshold of hearing. ``"expected"`` uses the same noise every
+            time; ``"seeded"`` draws the noise that pyclarity draws with ``seed``; ``"none"`` leaves
+            it out.
         seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
         whole_khz: Round the rate to whole kHz, as pyclarity does.
         equalisation: Mode of pyclarity: 1 amplifies clean music by NAL-R here, 2 takes music that

@@ -47,8 +47,8 @@ def hasqi(
         sample_rate: Sample rate in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of a signal with RMS 1.0, 0 to 200.
         lengths: Number of samples of each item in a padded batch. Shape: (...).
-        noise: Noise at the threshold of hearing, which matters where nothing of the output is
-            audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the noise
+        noise: Noise 10 dB below the threshold of hearing, which matters where nothing of the output
+            is audible. ``"expected"`` uses the same noise every time; ``"seeded"`` draws the noise
             that pyclarity draws with ``seed``; ``"none"`` leaves it out.
         seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
         whole_khz: Round the rate to whole kHz, as pyclarity does.

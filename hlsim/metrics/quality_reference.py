@@ -96,7 +96,7 @@ class QualityReference(Reference):
         Args:
             output: Outputs with the shape, rate and scale of the clean signals. Shape: (...,
                 time).
-            noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
+            noise: Noise 10 dB below the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 
@@ -116,7 +116,7 @@ class QualityReference(Reference):
         Args:
             output: Outputs with the shape, rate and scale of the clean signals. Shape: (...,
                 time).
-            noise: Noise at the threshold of hearing: ``"expected"``, the same every time;
+            noise: Noise 10 dB below the threshold of hearing: ``"expected"``, the same every time;
                 ``"seeded"``, the noise that pyclarity draws; or ``"none"``.
             seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 

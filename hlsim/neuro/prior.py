@@ -327,8 +327,12 @@ def _msbg_constants(stft: STFT, rate: float) -> dict[str, NDArray[np.float64]]:
     """Compute the constants of MSBG's formulae at the frequencies of a transform, by name.
 
     The computation takes most of the time in which a network is built. The constants are stored,
-    because they are the same for all networks with this transform. Their shapes are those of the
-    buffers of ``BandGains``.
+    because they are the same for all networks with this transform and rate. Their shapes are those
+    of the buffers of ``BandGains``.
+
+    Args:
+        stft: Transform of the signals.
+        rate: Sample rate of the signals in Hz, 16000, or 3/8 of 44100.
     """
     # 44.1 kHz is 441 / 160 times 16 kHz and 8 / 3 times MSBG's frame rate.
     grid_ratio = _GRID_RATIO if rate == NEURO_RATE else 3

@@ -247,13 +247,20 @@ class Page:
     cards: Sequence[Card] = ()
 
     def html(self) -> str:
-        """Return the page as the text of one HTML file, which needs no network."""
+        """Return the page as the text of one HTML file, which needs no network.
+
+        Raises:
+            MissingExtraError: jinja2 is not installed.
+        """
         return _render("page.html", page=self)
 
     def markdown(self) -> str:
         """Return text and tables in Markdown, without sounds and pictures.
 
         Characters of the texts that have a meaning in Markdown are escaped.
+
+        Raises:
+            MissingExtraError: jinja2 is not installed.
         """
         return _render("page.md", page=self)
 

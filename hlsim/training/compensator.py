@@ -136,9 +136,14 @@ def _freeze(part: nn.Module) -> Iterator[None]:
 def _load_beamforming_aid(config: BeamformerConfig, name: str) -> nn.Module:
     """Load the aid of a checkpoint, and place a new front end before it if it is a ``HearingAid``.
 
+    Any other aid is returned as it is. The new front end is untrained.
+
     Args:
         config: Settings of the front end, which joins several microphones.
         name: Name or folder of the checkpoint.
+
+    Raises:
+        ValueError: There is no such checkpoint.
     """
     start: Any = load_compensator(name)
     if not isinstance(start, HearingAid):

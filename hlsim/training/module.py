@@ -191,12 +191,14 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     Returns:
         Dict with the entry ``role``: the name of the simulator, or its class with its
         ``extra_repr``. A network, or any module, adds a hash of its weights as ``<role>_sha256``,
-        because a file may contain other weights when the training resumes. Your own code without an
-        attribute ``fingerprint`` adds a hash of its file as ``<role>_code_sha256``.
+        because a file may contain other weights when the training resumes. Your own code adds its
+        attribute ``fingerprint`` to the name, as in ``ear.py:Ear (v2)``. Without this attribute, it
+        adds a hash of its file as ``<role>_code_sha256``.
 
     Raises:
-        ValueError: There is no such simulator, or a module was built for another sample rate than
-            16 kHz or for another full scale than pascals.
+        ValueError: There is no such simulator, it is not valid (see ``load_simulator``), or a
+            module was built for another sample rate than 16 kHz or for another full scale than
+            pascals.
 
     >>> describe_simulator("teacher", "msbg")
     {'teacher': 'msbg'}
@@ -206,6 +208,8 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
         return {role: str(loaded), **_hash_weights_and_code(role, loaded.plugin.function)}
     if isinstance(simulator, nn.Module):
         name = f"{type(simulator).__name__}({simulator.extra_repr()})"
+        if hasattr(simulator, "fingerprint"):
+            name += f" ({simulator.fingerprint})"
         return {role: name, **_hash_weights_and_code(role, simulator)}
     if str(simulator) in BUILT_IN:
         return {role: str(simulator)}

@@ -30,6 +30,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import save_checkpoint
 from hlsim.cli.evaluation import _read_labels
+from hlsim.cli.inputs import warn_of_other_ears
 from hlsim.cli.main import main, make_parser
 from hlsim.evaluation.fitting.gain_tables import export_gains
 from tests.helpers import write_table
@@ -373,6 +374,16 @@ def test_a_compensator_for_another_ear_warns_once(
     options = ("--audiogram", ear, "--compensator", tmp_path / "mine")
     assert run("compensate", utterance, tmp_path / "out.wav", *options) == 0
     assert capsys.readouterr().err.count("was trained for one ear") == warnings
+
+
+@pytest.mark.parametrize(("right", "count"), [("N4", 0), ("N3", 1), (None, 0)])
+def test_a_listener_with_another_ear_than_the_trained_one_warns(
+    tmp_path: Path, right: str | None, count: int
+) -> None:
+    model = MappingCompensator(config=MappingConfig(channels=8, blocks=1))
+    save_compensator(model, tmp_path / "mine", "N4")
+    listener = Listener(Audiogram.standard("N4"), Audiogram.standard(right) if right else None)
+    assert len(warn_of_other_ears({"mine": str(tmp_path / "mine")}, listener)) == count
 
 
 @pytest.mark.parametrize(

@@ -131,6 +131,11 @@ def test_a_microphone_that_is_listed_twice_is_an_error() -> None:
         check_utterances([Utterance("clean.wav", "CH1.wav|CH1.wav", reference="1")])
 
 
+def test_several_noisy_files_without_a_reference_are_an_error() -> None:
+    with pytest.raises(ValueError, match="need the number of the reference"):
+        check_utterances([Utterance("clean.wav", "CH1.wav|CH2.wav")])
+
+
 def test_references_that_differ_cause_a_warning(tmp_path: Path, row: Utterance) -> None:
     rows = [row, Utterance(row.path, row.noisy, reference="1 2")]
     scenes = [SceneFiles.from_utterance(scene, tmp_path) for scene in rows]

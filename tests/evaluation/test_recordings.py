@@ -463,6 +463,14 @@ def test_texts_of_an_snr(tmp_path: Path, text: str, snr: float) -> None:
     assert recording.snr == pytest.approx(snr, nan_ok=True)
 
 
+@pytest.mark.parametrize("text", ["dB", "-inf", "nan", "five"])
+def test_an_snr_that_is_no_number_is_an_error(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "study.csv"
+    path.write_text(f"condition,clean,processed,snr,audiogram\naid,c.wav,p.wav,{text},N3\n")
+    with pytest.raises(ValueError, match="expected a number in dB in the column snr"):
+        read_recordings(path)
+
+
 def test_speech_in_quiet_is_a_null_in_json(tmp_path: Path) -> None:
     path = write_ears(tmp_path, {("aid", "left", 0): 0.01})
     text = path.read_text().replace(",audiogram", ",audiogram,snr").replace(",N1", ",N1,inf")

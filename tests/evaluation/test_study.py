@@ -231,6 +231,12 @@ def test_a_column_of_the_table_is_rejected_at_the_first_value(
     assert len(calls) == 1
 
 
+def test_columns_of_one_measure_that_differ_only_in_case_are_rejected(items: list[Item]) -> None:
+    measure = Measure("own", lambda item, output: {"Score": 1.0, "score": 2.0})
+    with pytest.raises(ValueError, match="own returns score, a column that exists already"):
+        run_study(items[:1], gains(1)[:1], [measure], jobs=1)
+
+
 def test_a_change_of_the_code_or_of_facts_that_a_measure_uses_computes_scores_again(
     items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

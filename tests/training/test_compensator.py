@@ -111,6 +111,20 @@ def test_a_simulator_of_your_own_is_named_in_the_record(data: TrainingData, tmp_
     assert about["simulator"] == "hlsim:MSBG"
 
 
+def test_the_version_of_a_module_of_your_own_is_in_the_record() -> None:
+    class Half(torch.nn.Module):
+        fingerprint = "version 1"
+
+        def forward(self, waveform: torch.Tensor, audiogram: Audiogram) -> torch.Tensor:
+            return 0.5 * waveform
+
+    half = Half()
+    first = describe_simulator("teacher", half)
+    half.fingerprint = "version 2"
+    assert first["teacher"] == "Half() (version 1)"
+    assert describe_simulator("teacher", half)["teacher"] == "Half() (version 2)"
+
+
 def test_a_training_does_not_continue_with_an_edited_simulator(
     data: TrainingData, tmp_path: Path
 ) -> None:
