@@ -14,11 +14,12 @@ import argparse
 import copy
 import time
 from collections.abc import Sequence
+from functools import partial
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
-from train_by_recogniser import relative_rate
+from train_by_recogniser import minimise
 
 from compensators import HearingAid, load_compensator
 from hlsim.audiogram.table import read_audiograms
@@ -118,30 +119,6 @@ class Lessons:
         return torch.where(is_measured, self.measured_ears[rows], random_ears)
 
 
-def train(aid: HearingAid, lessons: Lessons, steps: int, generator: torch.Generator) -> None:
-    """Train an aid, and print the means of the loss's terms."""
-    aid.train().requires_grad_(True)
-    optimiser = torch.optim.AdamW(
-        aid.parameters(), LEARNING_RATE, betas=(0.9, 0.98), weight_decay=0.0
-    )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: relative_rate(step, steps))
-    recent = []
-    for step in range(1, steps + 1):
-        terms = lessons.loss_terms(aid, generator)
-        loss: Tensor = sum(weight * terms[name] for name, weight in WEIGHTS.items())
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(aid.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        recent.append(torch.stack([*terms.values()]).detach())
-        if step % REPORT_STEPS == 0 or step == steps:
-            values = zip(terms, torch.stack(recent).mean(0).tolist(), strict=True)
-            report = ", ".join(f"{name} {value:.3f}" for name, value in values)
-            print(f"step {step}: {report}", flush=True)
-            recent.clear()
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("speech", help="folder of training speech")
@@ -161,7 +138,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ears = as_thresholds([ear for _, ear in read_audiograms(options.audiograms, simulated=True)])
     untrained = copy.deepcopy(aid).eval().requires_grad_(False)
     lessons = Lessons(speech, noise, ears, options.simulators, untrained)
-    train(aid, lessons, options.steps, torch.Generator().manual_seed(options.seed))
+    generator = torch.Generator().manual_seed(options.seed)
+    draw_terms = partial(lessons.loss_terms, aid, generator)
+    minimise(aid, draw_terms, WEIGHTS, LEARNING_RATE, options.steps, REPORT_STEPS)
     about = {
         "start_sha256": start["sha256"],
         "audiogram": None,

@@ -27,8 +27,7 @@ import argparse
 import copy
 import math
 import time
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -224,26 +223,52 @@ def train(
     Training runs on the device of the likelihood, and prints the means of the loss's terms.
     """
     device = likelihood.device
-    aid.to(device).train().requires_grad_(True)
+    aid.to(device)
     untrained = copy.deepcopy(aid).eval().requires_grad_(False)
     simulator = MSBG(sample_rate=RATE).to(device)
+
+    def draw_terms() -> dict[str, Tensor]:
+        batch = Batch(*(tensor.to(device) for tensor in next(batches)))
+        return loss_terms(aid, untrained, batch, likelihood, simulator)
+
+    minimise(aid, draw_terms, WEIGHTS, LEARNING_RATE, steps, REPORT_STEPS)
+
+
+def minimise(
+    aid: HearingAid,
+    draw_terms: Callable[[], dict[str, Tensor]],
+    weights: dict[str, float],
+    learning_rate: float,
+    steps: int,
+    report_steps: int,
+) -> None:
+    """Train all weights of an aid, and print the means of the loss's terms.
+
+    Args:
+        aid: Aid to train. Afterwards it is on the CPU and needs no gradient.
+        draw_terms: Function that returns the terms of the loss for a new batch, by name, each of
+            which is averaged.
+        weights: Weight of each term.
+        learning_rate: Highest learning rate, see ``relative_rate``.
+        steps: Number of steps.
+        report_steps: Number of steps after which the means are printed.
+    """
+    aid.train().requires_grad_(True)
     optimiser = torch.optim.AdamW(
-        aid.parameters(), LEARNING_RATE, betas=(0.9, 0.98), weight_decay=0.0
+        aid.parameters(), learning_rate, betas=(0.9, 0.98), weight_decay=0.0
     )
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: relative_rate(step, steps))
     recent = []
-    for step, batch in enumerate(islice(batches, steps), start=1):
-        on_device = Batch(*(tensor.to(device) for tensor in batch))
-        terms = loss_terms(aid, untrained, on_device, likelihood, simulator)
-        means = {name: term.mean() for name, term in terms.items()}
-        loss: Tensor = sum(weight * means[name] for name, weight in WEIGHTS.items())
+    for step in range(1, steps + 1):
+        means = {name: term.mean() for name, term in draw_terms().items()}
+        loss: Tensor = sum(weight * means[name] for name, weight in weights.items())
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(aid.parameters(), 1.0)
         optimiser.step()
         schedule.step()
         recent.append(torch.stack([*means.values()]).detach())
-        if step % REPORT_STEPS == 0 or step == steps:
+        if step % report_steps == 0 or step == steps:
             values = zip(means, torch.stack(recent).mean(0).tolist(), strict=True)
             report = ", ".join(f"{name} {value:.3f}" for name, value in values)
             print(f"step {step}: {report}", flush=True)
