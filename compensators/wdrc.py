@@ -141,8 +141,8 @@ class CAMFIT(WDRC):
 
     The rule is published for 125 to 6000 Hz. As in openMHA, it continues above, with high gains,
     because normal thresholds rise there and speech has little power. For the ears N4 to N6, S2 and
-    S3, the gain in a pause reaches 90 to 100 dB at 8 kHz. At the onset of a sound, the output then
-    exceeds ``limit_spl`` by 20 to 40 dB, and its distortion is heard at lower frequencies.
+    S3, the gain in a pause reaches 90 to 100 dB at 8 kHz. At the onset of a sound, the limit of the
+    peaks then distorts the output, which is heard at lower frequencies.
 
     In equal bands, the prescribed gains for levels of 40 to 90 dB SPL are openMHA's within 0.1 dB.
     They differ beyond: openMHA's gain rises without end towards soft sounds, while here a band that

@@ -218,7 +218,7 @@ def is_finite(value: Any) -> bool:
 
 
 def describe(value: Any) -> str:
-    """Return the text of a value for an error message, with its type unless it is a number.
+    """Return the text of a value for an error message, with its type unless it is a finite number.
 
     >>> describe(3), describe("3")
     ('3', "'3' (str)")

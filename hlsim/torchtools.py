@@ -230,7 +230,8 @@ def compute_once(function: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a function whose results are computed once and then come from a store.
 
     Beyond 256 MiB (``STORE_BYTES``), the store drops the results that were not used for the longest
-    time, but never the latest result.
+    time, but never the latest result. All callers get the same object, so it must not be changed.
+    A program that torch.compile traces calls the function itself.
 
     Args:
         function: Function at the top level of a module, with hashable arguments.

@@ -207,7 +207,7 @@ class AtLevelOf(nn.Module):
         Both outputs are cut to the length of the waveform first, because a study scores no later
         sample.
 
-        Shape: (..., time) -> (..., time).
+        Shape: as for the aids, such as (..., time) -> (..., time).
         """
         time = waveform.shape[-1]
         level = level_spl(self.other(waveform.clone(), audiogram)[..., :time])
@@ -321,7 +321,8 @@ class PluginAid(nn.Module):
             Outputs for both ears. Shape: (2, time), where ``time`` may differ from the input's.
 
         Raises:
-            ValueError: The function fails, or its output is not finite or has another shape.
+            ValueError: The function fails, or its output is no floating-point tensor, has another
+                shape or is not finite.
         """
         return self.plugin(waveform, listener, self.sample_rate)
 
@@ -361,11 +362,11 @@ class Enhanced(nn.Module):
     def forward(self, waveform: Tensor, ear: Any) -> Tensor:
         """Enhance the waveform, and return the aid's output for the enhanced signal.
 
-        Shape: (..., time) -> (..., time).
+        Shape: as for the aid, such as (..., time) -> (..., time).
 
         Raises:
-            ValueError: The enhancer fails, or its output is no floating-point tensor of this shape,
-                or is NaN or infinite.
+            ValueError: The enhancer fails, or its output is no floating-point tensor of the shape
+                of the waveform, or is NaN or infinite.
         """
         enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
         return self.aid(enhanced, ear)

@@ -57,9 +57,9 @@ def draw_simulator_items(
 
     Half of the ears are from ``audiograms``, a quarter are mild standard ears (NH, N1, N2, S1) and
     a quarter are random. With noise, every second item is noisy, and the signal-to-noise ratios of
-    these items cycle through 2.5, 7.5, 12.5 and 17.5 dB. With five levels, the 80 noisy ones of 160
-    items contain each combination of a ratio, a level and one of the four quarters of the ears
-    once.
+    these items (by RMS level) cycle through 2.5, 7.5, 12.5 and 17.5 dB. With five levels, the 80
+    noisy ones of 160 items contain each combination of a ratio, a level and one of the four
+    quarters of the ears once.
 
     Args:
         speech: Folder of recordings of clean speech.
@@ -117,9 +117,9 @@ def draw_aid_items(
     """Draw the items on which hearing aids are compared: clips of speech, each for one of the ears.
 
     The items cycle through the ears. With noise, every second item is noisy, and the
-    signal-to-noise ratios of these items cycle through 2.5, 7.5, 12.5 and 17.5 dB. The noisy ones
-    of ``8 * len(levels) * len(ears)`` items contain each combination of an ear, a level and a ratio
-    once; fewer items contain some of the combinations.
+    signal-to-noise ratios of these items (by RMS level) cycle through 2.5, 7.5, 12.5 and 17.5 dB.
+    The noisy ones of ``8 * len(levels) * len(ears)`` items contain each combination of an ear, a
+    level and a ratio once; fewer items contain some of the combinations.
 
     Args:
         speech: Folder of recordings of clean speech.

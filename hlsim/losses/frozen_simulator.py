@@ -114,7 +114,8 @@ class FrozenSimulator:
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
 
         Raises:
-            ValueError: The simulator rejects its input, or returns another shape.
+            ValueError: The simulator rejects its input, or returns no floating-point tensor of this
+                shape.
         """
         if not type(self.simulator).__module__.startswith("hlsim."):
             # A module that changes its arguments in place must not change the ears of the loss.
@@ -156,7 +157,8 @@ class FrozenSimulator:
             Clean speech, or what a normal ear perceives of it, (*batch, time).
 
         Raises:
-            ValueError: The simulator or the normal ear returns another shape.
+            ValueError: The simulator or the normal ear returns no floating-point tensor of this
+                shape.
         """
         shape = (*batch, clean.shape[-1])
         if reference is None:

@@ -96,9 +96,9 @@ def haaqi(
         Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of different shapes or on different devices, too short, or not finite;
-            clean music that is silent or below 20 dB SPL; a rate, level, audiogram, length, seed or
-            equalisation out of range; an unknown noise.
+        ValueError: Signals of different shapes or on different devices, too short, not
+            floating-point or not finite; clean music that is silent or below 20 dB SPL; a rate,
+            level, audiogram, length, seed or equalisation out of range; an unknown noise.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> chord = sum(torch.sin(2 * torch.pi * hz * seconds) for hz in (220.0, 277.2, 329.6))

@@ -94,9 +94,10 @@ def haspi(
         Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of different shapes or on different devices, too short, or not finite;
-            clean speech that is silent, below 20 dB SPL or inaudible to a normal ear; a rate,
-            level, audiogram, length or seed out of range; an unknown noise.
+        ValueError: Signals of different shapes or on different devices, too short, not
+            floating-point or not finite; clean speech that is silent, below 20 dB SPL or inaudible
+            to a normal ear; a rate, level, audiogram, length or seed out of range; an unknown
+            noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -229,9 +230,10 @@ class HaspiReference(Reference):
             Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
 
         Raises:
-            ValueError: Outputs of another shape, not finite or on another device; clean speech that
-                a normal ear does not hear or, with ``keep=False``, that is silent, too soft or too
-                short; an audiogram or seed out of range; an unknown noise.
+            ValueError: Outputs of another shape, not floating-point, not finite or on another
+                device; clean speech that a normal ear does not hear or, with ``keep=False``, that
+                is silent, too soft or too short; an audiogram or seed out of range; an unknown
+                noise.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
         return as_type_of(output, _intelligibility(self._compare_all(output, noise, seed, ears)))

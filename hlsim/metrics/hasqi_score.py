@@ -59,9 +59,9 @@ def hasqi(
         Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of different shapes or on different devices, too short, or not finite;
-            clean speech that is silent or below 20 dB SPL; a rate, level, audiogram, length, seed
-            or equalisation out of range; an unknown noise.
+        ValueError: Signals of different shapes or on different devices, too short, not
+            floating-point or not finite; clean speech that is silent or below 20 dB SPL; a rate,
+            level, audiogram, length, seed or equalisation out of range; an unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

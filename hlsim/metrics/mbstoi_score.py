@@ -82,9 +82,9 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
         Scores, an array if ``output`` is one. Shape: (...).
 
     Raises:
-        ValueError: Signals of different shapes, without two channels, on different devices or not
-            finite; clean speech that is silent or lasts less than 0.41 s without its pauses; a rate
-            out of range.
+        ValueError: Signals of different shapes, without two channels, on different devices, not
+            floating-point or not finite; clean speech that is silent or lasts less than 0.41 s
+            without its pauses; a rate out of range.
 
     >>> from hlsim import example_speech
     >>> clean = torch.stack([example_speech(), example_speech()])

@@ -43,10 +43,10 @@ class PreparedBatch(NamedTuple):
     """Clean signals of a batch with their features in an ear, to be compared with outputs of aids.
 
     Attributes:
-        clean: The clean signals.
+        clean: Audible parts of the clean signals, to which outputs are aligned.
         cells: Hair cells of the ear of each item that receives the clean signals. Shape: (items,
             32).
-        features: Features of the clean signals, one object for each group of channels of the ear.
+        features: Features of the clean signals, one object for each group of ``channel_chunks``.
 
     >>> PreparedBatch._fields
     ('clean', 'cells', 'features')

@@ -133,7 +133,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 
 class StepProgress(L.Callback):
-    """Callback that shows steps, remaining time, loss and scores on stderr, see ``ProgressLine``.
+    """Callback that shows steps, remaining time, loss and score on stderr, see ``ProgressLine``.
 
     >>> StepProgress().line is None  # until the training starts
     True

@@ -65,6 +65,8 @@ class Triplets(NamedTuple):
 def load_digits() -> Tensor:
     """Load the bundled digits, each scaled so that its spoken part has RMS 1.
 
+    All calls return the same tensor, which must not be changed.
+
     Returns:
         Samples at 16 kHz, (voices, 10, SLOT_SAMPLES), where the second index is the digit, 0 to 9.
 

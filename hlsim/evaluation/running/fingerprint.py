@@ -186,8 +186,8 @@ def _describe(value: Any) -> Any:
     torch; and a module its fingerprint.
 
     Raises:
-        TypeError: The object is none of these, a function within another one, such as a lambda, or
-            has no source file, as in a notebook.
+        TypeError: The object is none of these, a lambda or a function within another one, a module
+            whose ``fingerprint`` is None, or has no source file, as in a notebook.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
