@@ -129,6 +129,32 @@ def _filter_taps(bands: int) -> NDArray[np.float64]:
     return taps * np.hanning(2 * DELAY + 3)[1:-1]
 
 
+@constant
+def filter_leakage(bands: int) -> NDArray[np.float64]:
+    """Return the share of the power of a sound that passes the filter of another band.
+
+    A filter attenuates sounds in distant bands by 30 to 120 dB. An aid that amplifies its band by
+    as much makes them audible again.
+
+    Args:
+        bands: Number of bands, 4 to 40.
+
+    Returns:
+        Largest share for a sound in each band (rows) by the filter of each band (columns), (bands,
+        bands): 1 for the band itself, and 0 for the two next ones on either side, which are not
+        distant.
+
+    >>> decibels = 10.0 * np.log10(filter_leakage(20)[5, :3])  # sounds near 627 Hz
+    >>> print(decibels.round())
+    [-63. -54. -46.]
+    """
+    responses = np.abs(np.fft.rfft(_filter_taps(bands), GRID_POINTS)) ** 2
+    nearest = _filter_shares(bands, GRID_POINTS).argmax(1)
+    shares = np.stack([responses[:, nearest == band].max(1) for band in range(bands)])
+    distance = np.abs(np.arange(bands)[:, None] - np.arange(bands))
+    return np.where(distance > 2, shares, np.eye(bands))
+
+
 def apply_gains(samples: Tensor, excess_gains: Tensor, position: int = 0) -> Tensor:
     """Divide a signal into bands, multiply each by its gain, and add them up again.
 

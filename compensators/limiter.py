@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from compensators.filter_bank import filter_centres, filter_powers, level_db
+from compensators.filter_bank import filter_centres, filter_leakage, filter_powers, level_db
 from compensators.smoothing import follow_peaks
 from hlsim.audiogram.prescription import highest_band_levels
 from hlsim.calibration import PASCAL_SPL
@@ -79,6 +79,9 @@ def limit_gains(
 ) -> tuple[Tensor, Tensor]:
     """Limit the gain of each band so that the output stays below its highest level.
 
+    A band's gain is limited for the sounds in the band, and for those in distant bands that its
+    filter attenuates: a high gain would bring them above the highest level of their own band.
+
     Args:
         gains_db: Gains in dB.
         powers: Power spectrum in Pa^2 of each frame of the input.
@@ -99,4 +102,7 @@ def limit_gains(
     neighbours = pad(band_powers, (1, 1)).unfold(-1, 3, 1).sum(-1)
     # The window of a frame spreads a tone over its band and the next ones.
     levels, memory = follow_peaks(level_db(0.5 * (band_powers + neighbours)), memory, 0.0, RELEASE)
-    return torch.minimum(gains_db, highest_levels.unsqueeze(1) - levels), memory
+    # Sounds are in the rows of the matrix, and filters are in its columns.
+    power_ratios = 10.0 ** ((levels - highest_levels.unsqueeze(1)) / 10.0)
+    passed_ratios = power_ratios @ filter_leakage(gains_db.shape[-1], like=levels)
+    return torch.minimum(gains_db, -10.0 * passed_ratios.log10()), memory

@@ -39,6 +39,20 @@ def test_no_tone_exceeds_the_measured_level(name: str, hertz: float, reference: 
     assert largest_third_spl(limited, hertz) < highest < largest_third_spl(free, hertz)
 
 
+@pytest.mark.parametrize("name", ["hearing-aid", "wdrc", "camfit"])
+def test_distant_bands_amplify_no_loud_tone_above_the_measured_level(name: str) -> None:
+    """Far from a tone of 100 dB SPL, an aid has high gains, which filters of bands must attenuate.
+
+    The limit at these tones is 80.3, 77.7 and 69.1 dB SPL: 75 dB HL.
+    """
+    levels = Audiogram.standard("N4").levels
+    ear = Audiogram(levels, ucl={1000: 75.0, 2000: 75.0, 4000: 75.0})
+    aid = load_compensator(name, limit_to_ear=True)
+    for hertz, highest in ((449.0, 80.3), (696.0, 77.7), (3240.0, 69.1)):
+        output = aid(tone(hertz, 100.0), ear)[8000:-1000]
+        assert float(level_spl(output)) < highest
+
+
 @each_aid
 def test_measured_levels_reach_the_aid_by_every_way(name: str, utterance: Tensor) -> None:
     loud = 20.0 * utterance[:8000]
