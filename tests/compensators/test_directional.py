@@ -20,6 +20,7 @@ from compensators.directional import (
     DirectionalAid,
     FilterAndSum,
 )
+from hlsim.calibration import level_spl
 from hlsim.data.scenes import make_scene
 from hlsim.dsp.resample import resample
 from hlsim.dsp.sphere import SPEED_OF_SOUND, evenly_spread_directions, head_responses, unit_vectors
@@ -207,6 +208,31 @@ def test_another_rate_passes_the_front(build: Callable[..., FilterAndSum]) -> No
     middle = slice(time // 4, -time // 4)
     ratio = output[..., middle].square().mean() / scene.reference[..., middle].square().mean()
     assert abs(float(10.0 * ratio.log10())) < 1.0
+
+
+def mirror_error(module: Callable[..., Tensor], waveform: Tensor, *ears: str) -> float:
+    """Compute how far the output for a mirrored scene is from the mirrored output, relative RMS."""
+    output = module(waveform, list(ears) or None)
+    mirrored = module(waveform.flip(-2), list(reversed(ears)) or None).flip(-2)
+    assert (level_spl(mirrored) - level_spl(output)).abs().max() < 0.2  # at each ear
+    return float((mirrored - output).norm() / output.norm())
+
+
+@torch.no_grad()
+def test_a_mirrored_scene_has_the_mirrored_output(speech: Tensor, noise: Tensor) -> None:
+    """An exchange of the ears anywhere in a front end would change the whole output.
+
+    Directions of the model of diffuse noise are not exactly symmetric, nor are trained weights.
+    """
+    trained = load_compensator("hearing-aid-directional")
+    for azimuth in (90.0, 135.0):
+        scene = make_scene(speech, [noise], [azimuth], snr=0.0).input
+        for build in (DifferentialMicrophone, AdaptiveDifferentialMicrophone):
+            assert mirror_error(build(), scene) == 0.0
+        for build in (BinauralMVDR, AdaptiveBeamformer):
+            assert mirror_error(build(), scene) < 0.01
+        assert mirror_error(trained.front_end, scene) < 0.05
+        assert mirror_error(trained, scene, "N2", "N4") < 0.2
 
 
 def test_silence_gives_silence_and_finite_gradients() -> None:
