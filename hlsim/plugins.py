@@ -9,6 +9,7 @@ import itertools
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,9 @@ from torch import Tensor, nn
 
 _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
 """Names of plug-ins: a module or a file, and one of its attributes."""
+
+_LARGEST_CHANGE = 0.01
+"""Change of a plug-in's output, relative to its RMS, from one call to an equal one."""
 
 
 def load_plugin(name: str, kind: str) -> Any:
@@ -153,6 +157,31 @@ class WaveformPlugin:
         if not output.requires_grad and not bool(output.isfinite().all()):
             raise ValueError(f"{self.kind} {self.name} returned samples that are NaN or infinite")
         return output.to(waveform)
+
+    def try_twice(self, waveform: Tensor, *arguments: Any) -> Tensor:
+        """Call the plug-in twice, and return the first output.
+
+        A plug-in whose second output has another shape, or differs by more than 1 % (-40 dB),
+        causes a warning: it keeps a state or draws random numbers.
+
+        Args:
+            waveform: First argument of the plug-in.
+            arguments: Further arguments of the plug-in.
+
+        Raises:
+            ValueError: A call fails, see ``call``.
+        """
+        output, repeated = (self(waveform, *arguments) for _ in range(2))
+        has_shape = repeated.shape == output.shape
+        limit = _LARGEST_CHANGE * float(output.norm())
+        if not has_shape or float((repeated - output).norm()) > limit:
+            warnings.warn(
+                f"{self.kind} {self.name} returns another output if it is called again with the "
+                "same input, so that results depend on the order of the items and on the number of "
+                "processes; reset its state in each call, or seed its random numbers",
+                stacklevel=3,
+            )
+        return output
 
 
 _load_numbers = itertools.count()

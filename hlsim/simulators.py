@@ -1,7 +1,6 @@
 """Loading of all simulators: MSBG, trained networks, a linear ear, and simulators of your own."""
 
 import math
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -43,9 +42,6 @@ _HALF_LENGTH_SECONDS = 0.064
 
 _MAX_DELAY_SECONDS = 2e-3
 """Largest delay in seconds of a plug-in that must be time-aligned."""
-
-_LARGEST_CHANGE = 0.01
-"""Change of a plug-in's output, relative to its RMS, from one call to an equal one."""
 
 _LOWEST_PLUGIN_RATE = 1000
 """Lowest sample rate of a plug-in in Hz."""
@@ -220,7 +216,8 @@ def check_aligned(
     """Call a plug-in, and reject an output that is delayed or advanced by more than 2 ms.
 
     The delay is that at which the first channels of input and output correlate most. A plug-in
-    whose second output for the same input differs by more than 1 % (-40 dB) causes a warning.
+    whose second output for the same input differs causes a warning, see
+    ``WaveformPlugin.try_twice``.
 
     Args:
         plugin: Simulator or enhancer.
@@ -233,7 +230,7 @@ def check_aligned(
 
     >>> check_aligned(WaveformPlugin("torch:sin", "enhancer"), torch.randn(2, 16000), 16000)
     """
-    output = plugin(waveform, *arguments)
+    output = plugin.try_twice(waveform, *arguments)
     channels = [signal.reshape(-1, signal.shape[-1])[0] for signal in (output, waveform)]
     delay, coefficient = correlate(*channels)
     if coefficient == 0.0:
@@ -245,14 +242,6 @@ def check_aligned(
         raise ValueError(
             f"{plugin.kind} {plugin.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
             "an output that is time-aligned with the input; shift the output in your code"
-        )
-    change = plugin(waveform, *arguments) - output
-    if float(change.norm()) > _LARGEST_CHANGE * float(output.norm()):
-        warnings.warn(
-            f"{plugin.kind} {plugin.name} returns another output if it is called again with the "
-            "same input, so that results depend on the order of the items and on the number of "
-            "processes; reset its state in each call, or seed its random numbers",
-            stacklevel=2,
         )
 
 

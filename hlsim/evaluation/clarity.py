@@ -448,7 +448,8 @@ def _measure_look_ahead(
 ) -> float | None:
     """Measure the look-ahead of a condition in ms, on the first 4 s of a scene.
 
-    It is None for existing outputs, and for an aid whose call raises ValueError.
+    It is None for existing outputs, and for an aid whose call raises ValueError. An aid of the
+    user's own that keeps a state causes a warning, see ``WaveformPlugin.try_twice``.
 
     Args:
         condition: Condition of the study.
@@ -469,6 +470,8 @@ def _measure_look_ahead(
     time = scene.shape[-1]
     positions = range(time // 4, time, max(1, time // (_CHANGES + 3)))[:_CHANGES]
     try:
+        if isinstance(condition.process, PluginAid):
+            condition.process.plugin.try_twice(scene, pair.listener, rate)
         samples = measure_look_ahead(condition.process, pair.listener, scene, other, positions)
     except ValueError:
         return None

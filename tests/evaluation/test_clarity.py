@@ -255,6 +255,24 @@ def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_pat
     assert not [*signals.iterdir()], "an output of an earlier run stays although the aid fails"
 
 
+class Adapting:
+    calls = 0
+
+    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+        self.calls += 1
+        return waveform / self.calls
+
+
+@pytest.mark.usefixtures("quick_scores")
+def test_an_aid_of_ones_own_that_keeps_a_state_causes_a_warning(
+    clarity: Path, tmp_path: Path
+) -> None:
+    with pytest.warns(UserWarning, match=r"aid .*:Adapting returns another output"):
+        evaluate_scenes(
+            {"mine": f"{__name__}:Adapting"}, out=tmp_path, **options(clarity, stride=4)
+        )
+
+
 def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
     return torch.cat((waveform, waveform[:, :220]), -1)
 
