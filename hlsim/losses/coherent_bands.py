@@ -86,7 +86,7 @@ _WEIGHT_FLOOR = 1e-9
 def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> dict[str, Tensor]:
     """Compute four errors of perceived speech: in coherence, phase and level, and excess level.
 
-    Weights of bands and segments carry no gradient. Perceived sound has a gradient even where the
+    Weights of bands and segments carry no gradient. Audible sound has a gradient even where the
     reference is silent.
 
     Args:

@@ -212,7 +212,8 @@ def read_criterion(
         and the weight of each part by its name, multiplied by the weight of its criterion.
 
     Raises:
-        ValueError: A criterion or a part is unknown, or a weight is negative or not finite.
+        ValueError: A criterion or a part is unknown, a weight is negative or not finite, or all
+            weights are 0.
 
     >>> criteria, weights = read_criterion({"bands": 0.5, "haspi": 2.0, "paper": 0.0})
     >>> list(criteria), weights

@@ -56,21 +56,21 @@ _LEVEL_WEIGHTS = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
 class HearingLossLoss(StoredEars, nn.Module):
     """Difference between what an impaired ear and what a normal ear perceives.
 
-    The impaired ear perceives the output of an aid, and the normal ear clean speech. A simulator
-    computes both. It is frozen: it stays in eval mode and has no trainable parameter, but gradients
-    pass through it to the output of the aid. It is not registered as a submodule, so that the
-    parameters and the state dict of a module that contains this loss do not include it. It still
-    moves with ``.to()``. Use ``DistributedDataParallel`` instead of ``nn.DataParallel``, because
-    all threads of a process share one simulator.
+    The impaired ear perceives the output of an aid, and the normal ear clean speech. The
+    simulator is frozen: it stays in eval mode and has no trainable parameter, but gradients pass
+    through it to the output of the aid. It is not registered as a submodule, so that the parameters
+    and the state dict of a module that contains this loss do not include it. It still moves with
+    ``.to()``. Use ``DistributedDataParallel`` instead of ``nn.DataParallel``, because all threads
+    of a process share one simulator.
 
     The level is not normalised: 65 dB SPL is an RMS of 0.035 at the default ``full_scale_spl``. NaN
     and infinity are not rejected, so that a gradient scaler can detect them. They make the value of
-    their item NaN.
+    their item NaN; only ``"haspi"`` and ``"hasqi"`` reject them in clean speech.
 
-    In an autocast region, the loss computes in float32. Call ``backward()`` outside of the region,
-    as torch recommends, because gradients in float16 may be NaN. A compiled caller runs the loss
-    uncompiled, with a graph break. ``torch.func.grad`` works unless ``checkpoint`` is set or the
-    criterion is ``"haspi"`` or ``"hasqi"``.
+    In an autocast region, the loss computes in float32 (or float64). Call ``backward()`` outside of
+    the region, as torch recommends, because gradients in float16 may be NaN. A compiled caller runs
+    the loss uncompiled, with a graph break. ``torch.func.grad`` works unless ``checkpoint`` is set
+    or the criterion is ``"haspi"`` or ``"hasqi"``.
 
     The criterion is one of
 
@@ -227,7 +227,7 @@ class HearingLossLoss(StoredEars, nn.Module):
                 floating-point tensor with time last, shapes do not fit, thresholds are outside -10
                 to 100 dB HL, lengths are outside 1 to time, a simulator, normal ear or criterion
                 returns another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, an item
-                is shorter than 0.7 s.
+                is shorter than 0.7 s, or its clean speech has NaN or infinity.
         """
         parts = self.parts(output, clean, audiogram, lengths)
         return weighted_sum(parts, self.weights)

@@ -27,7 +27,7 @@ def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
         sample_rate: Sample rate in Hz.
 
     Returns:
-        One loss per pair of ears, 0 for equal differences. Shape: (...).
+        One loss per pair of ears, about 0 for equal differences. Shape: (...).
 
     >>> noise = torch.randn(2, 16000)
     >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)

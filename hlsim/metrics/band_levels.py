@@ -49,8 +49,8 @@ _WEIGHT_FLOOR = 1e-3
 def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     """Compute the level in 24 bands from 80 Hz to 7.5 kHz in frames of 32 ms, every 16 ms.
 
-    The bands are about as wide as auditory filters, 1.25 ERB each. Frame k is centred on k * 16 ms;
-    zeros surround the signal.
+    The bands are about as wide as auditory filters, 1.25 ERB each. Frame k is centred on k hops of
+    16 ms, rounded to whole samples; zeros surround the signal.
 
     Shape: (..., time) -> (..., frames, 24).
 
@@ -77,9 +77,9 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
     """Compute by how many dB the band levels of perceived speech differ from those of a normal ear.
 
     The result is a weighted mean of absolute differences over frames and bands. A gain of g dB
-    costs ``abs(g)``. Perceived levels are not raised to the threshold of hearing: otherwise, a band
-    that the impaired ear misses altogether would have no gradient, and no compensator would learn
-    to restore it.
+    costs ``abs(g)``, if it is 40 dB or less. Perceived levels are not raised to the threshold of
+    hearing: otherwise, a band that the impaired ear misses altogether would have no gradient, and
+    no compensator would learn to restore it.
 
     The weight of a band in a frame is the audibility, 0 to 1, of clean speech or of perceived
     speech for a normal ear, whichever is higher: noise that fills a pause is an error, too.

@@ -81,7 +81,7 @@ def raw_mse(reference: Signal, estimate: Signal) -> float:
 def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int) -> float:
     """Compute the median over bands of the absolute difference in dB of two signals' levels.
 
-    The bands are one-third octaves from 125 Hz to 7 kHz; their levels are those of the whole
+    The 18 bands are one-third octaves around 125 to 6350 Hz; their levels are those of the whole
     signal. Bands more than 50 dB below the loudest band of the reference are ignored. A level of
     the estimate that is more than 120 dB below this loudest band is replaced by this limit.
 
@@ -104,12 +104,12 @@ def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int)
         raise ValueError(
             f"expected a sample rate of 16000 Hz or more for bands up to 7 kHz, got {sample_rate}"
         )
-    # The frequencies are at most 4 Hz apart, because the lowest band is 29 Hz wide.
+    # The frequencies are at most about 4 Hz apart, because the lowest band is 29 Hz wide.
     points = max(len(x), sample_rate // 4)
     powers = np.stack([_third_octave_powers(signal, points, sample_rate) for signal in (x, y)])
     loudest = powers[0].max()
     if loudest <= 0.0:
-        raise ValueError("expected a reference with power between 125 Hz and 7 kHz, got none")
+        raise ValueError("expected a reference with power from 111 Hz to 7.1 kHz, got none")
     reference_levels, levels = 10.0 * np.log10(np.maximum(powers / loudest, _MIN_BAND_RATIO))
     is_loud = reference_levels >= -_BAND_RANGE_DB
     return float(np.median(np.abs(reference_levels - levels)[is_loud]))
@@ -175,8 +175,8 @@ def pesq_wb(output: Signal, clean: Signal, sample_rate: int) -> float:
 
     Raises:
         ValueError: The signals are empty, not one-dimensional or of different lengths, or PESQ is
-            not defined: a signal is silent, has a sample that is not finite, or has no speech that
-            pesq detects.
+            not defined: a signal is silent, is shorter than 0.25 s, has a sample that is not
+            finite, or has no speech that pesq detects.
         MissingExtraError: pesq is not installed.
 
     >>> noise = np.random.default_rng(0).standard_normal(16000)

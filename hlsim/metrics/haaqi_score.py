@@ -9,8 +9,8 @@ gradient. It differs from ``compute_haaqi`` in these points:
   pyclarity.
 - Both signals have one sample rate. Thresholds at other frequencies than the audiometric ones are
   interpolated on a logarithmic scale of frequency.
-- Empty or soft signals and those shorter than 0.7 s raise ``ValueError``. ``compute_haaqi`` scores
-  empty signals 1 or 0.
+- Empty signals, soft clean music and signals shorter than 0.7 s raise ``ValueError``.
+  ``compute_haaqi`` scores empty signals 1 or 0.
 
 Identical signals do not score 1, here as in pyclarity. The ear expects the amplification of NAL-R:
 1.2 s of chords at 70 dB SPL score 0.91 against themselves for the ear NH, 0.73 for N2 and 0.28 for
@@ -97,8 +97,8 @@ def haaqi(
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, not
-            floating-point or not finite; clean music that is silent or below 20 dB SPL; a rate,
-            level, audiogram, length, seed or equalisation out of range; an unknown noise.
+            floating-point, not finite or above 1e9; clean music that is silent or below 20 dB SPL;
+            a rate, level, audiogram, length, seed or equalisation out of range; an unknown noise.
 
     >>> seconds = torch.arange(24000) / 24000
     >>> chord = sum(torch.sin(2 * torch.pi * hz * seconds) for hz in (220.0, 277.2, 329.6))
@@ -167,8 +167,8 @@ class HaaqiReference(QualityReference):
 
     Raises:
         ValueError: Clean music that lasts less than 0.7 s, has less than 16 ms of sound, is not
-            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
-            of range.
+            floating-point, not finite, above 1e9, silent or below 20 dB SPL; a rate, level,
+            audiogram, length or equalisation out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

@@ -61,7 +61,8 @@ def haspi(
 
     The score compares the output of an aid in the impaired ear with clean speech in a normal ear.
     The delay of an output is removed, to whole samples at 24 kHz. A silent output has the score of
-    the ear's internal noise. ``HaspiReference`` prepares clean speech once for many scores.
+    the ear's internal noise (if there is any). ``HaspiReference`` prepares clean speech once for
+    many scores.
 
     The score is differentiable in ``output``. The delays that align the output are constants for
     the gradient, and bands that are inaudible have no gradient.
@@ -95,9 +96,9 @@ def haspi(
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, not
-            floating-point or not finite; clean speech that is silent, below 20 dB SPL or inaudible
-            to a normal ear; a rate, level, audiogram, length or seed out of range; an unknown
-            noise.
+            floating-point, not finite or above 1e9; clean speech that is silent, below 20 dB SPL or
+            inaudible to a normal ear; a rate, level, audiogram, length or seed out of range; an
+            unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -134,7 +135,8 @@ class HaspiReference(Reference):
 
     Raises:
         ValueError: Clean speech that lasts less than 0.7 s, has less than 16 ms of sound, is not
-            finite, silent or below 20 dB SPL; a rate, level or length out of range.
+            floating-point, not finite, above 1e9, silent or below 20 dB SPL; a rate, level or
+            length out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -230,10 +232,10 @@ class HaspiReference(Reference):
             Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
 
         Raises:
-            ValueError: Outputs of another shape, not floating-point, not finite or on another
-                device; clean speech that a normal ear does not hear or, with ``keep=False``, that
-                is silent, too soft or too short; an audiogram or seed out of range; an unknown
-                noise.
+            ValueError: Outputs of another shape, not floating-point, not finite, above 1e9 or on
+                another device; clean speech that a normal ear does not hear or, with
+                ``keep=False``, that is silent, too soft or too short; an audiogram or seed out of
+                range; an unknown noise.
         """
         ears = ear_model.hair_cells(self._thresholds(audiogram))
         return as_type_of(output, _intelligibility(self._compare_all(output, noise, seed, ears)))

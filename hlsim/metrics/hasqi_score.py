@@ -1,7 +1,8 @@
 """HASQI version 2 in PyTorch: the quality of speech in an impaired ear.
 
 The score is that of pyclarity 0.9.0, with a gradient. The notes in ``hlsim.metrics.haspi_score`` on
-rates, lengths, levels and alignment apply here, too.
+rates, lengths, levels and alignment apply here, too, but clean speech of 20 dB SPL or more that a
+normal ear does not hear scores 0 instead of being rejected.
 
 Source: Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio
 Eng. Soc. 62(3), 99-117.
@@ -60,8 +61,8 @@ def hasqi(
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, not
-            floating-point or not finite; clean speech that is silent or below 20 dB SPL; a rate,
-            level, audiogram, length, seed or equalisation out of range; an unknown noise.
+            floating-point, not finite or above 1e9; clean speech that is silent or below 20 dB SPL;
+            a rate, level, audiogram, length, seed or equalisation out of range; an unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]
@@ -101,8 +102,8 @@ class HasqiReference(QualityReference):
 
     Raises:
         ValueError: Clean speech that lasts less than 0.7 s, has less than 16 ms of sound, is not
-            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
-            of range.
+            floating-point, not finite, above 1e9, silent or below 20 dB SPL; a rate, level,
+            audiogram, length or equalisation out of range.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

@@ -35,8 +35,8 @@ class Interaural(NamedTuple):
         time: Time in microseconds by which the left ear receives the sound earlier, from -1000 to
             1000.
         coherence: Correlation of both ears' signals after a shift by this time, 1 at most. It is
-            negative if no shift brings the signals into phase. The time difference is meaningful
-            where the coherence is close to 1.
+            negative if no such shift brings the signals into phase. The time difference is
+            meaningful where the coherence is close to 1.
 
     >>> Interaural(torch.zeros(5), torch.zeros(5), torch.ones(5)).coherence
     tensor([1., 1., 1., 1., 1.])
@@ -63,8 +63,8 @@ def interaural(waveform: Samples, *, sample_rate: int = 16000) -> Interaural:
         Shape of each: (..., 5).
 
     Raises:
-        ValueError: The waveform is not a floating-point signal of two channels, or the rate is out
-            of range.
+        ValueError: The waveform is not a floating-point signal of two channels, has a sample above
+            1e9, or the rate is out of range.
 
     >>> noise = torch.randn(16000)
     >>> interaural(torch.stack((10.0 * noise, noise))).level.round()
@@ -103,8 +103,8 @@ def interaural_change(before: Samples, after: Samples, *, sample_rate: int = 160
         and the coherence of the output. Shape of each: (..., 5).
 
     Raises:
-        ValueError: The signals are not floating-point samples, the shapes differ or are not
-            (..., 2, time), or the rate is out of range.
+        ValueError: The signals are not floating-point samples of at most 1e9, the shapes differ or
+            are not (..., 2, time), or the rate is out of range.
 
     >>> noise = torch.randn(2, 16000)
     >>> interaural_change(noise, noise).level

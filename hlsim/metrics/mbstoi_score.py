@@ -67,9 +67,9 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
 
     The score is deterministic and differentiable in both signals. Decisions are constants for the
     gradient: which frames are speech, the interaural delays and levels, and the better ear. Scores
-    are computed in float64 (float32 on Apple's GPUs), and returned in the dtype of the signals.
-    Zeros at the end of an item change its score by up to 0.007, so score the items of a padded
-    batch one by one.
+    are computed in float64 (float32 on Apple's GPUs), and returned in the wider dtype of both
+    signals. Zeros at the end of an item change its score by up to 0.007, so score the items of a
+    padded batch one by one.
 
     Args:
         output: Output of an aid at the left and the right ear. Shape: (..., 2, time).
@@ -83,8 +83,8 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
 
     Raises:
         ValueError: Signals of different shapes, without two channels, on different devices, not
-            floating-point or not finite; clean speech that is silent or lasts less than 0.41 s
-            without its pauses; a rate out of range.
+            floating-point, not finite or above 1e9; clean speech that is silent or lasts less than
+            0.41 s without its pauses; a rate out of range.
 
     >>> from hlsim import example_speech
     >>> clean = torch.stack([example_speech(), example_speech()])
@@ -255,7 +255,8 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
     The correlation is a mean over bands. The envelopes are those after equalisation and
     cancellation with the best delay and level, or those of one ear where its ratio of modulation is
     larger. A band in which clean speech has no modulation at either ear has the correlation -1. If
-    only the output has none, it is 0, or -1 if one ear alone may not be used.
+    only the output has none, it is 0, or -1 if one ear alone may not be used or clean speech has
+    none at one ear.
 
     Args:
         windows: Segments of the output of ``_band_features``. Shape: (segments, bands, 8, frames).

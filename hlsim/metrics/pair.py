@@ -131,8 +131,8 @@ def scores_or_errors(
         settings: Further keyword arguments of ``score``.
 
     Returns:
-        For each item, its result of ``score``, or its ValueError. A wrong setting or shape causes
-        the same error for every item.
+        For each item, its result of ``score``, or its ValueError. A wrong setting causes the same
+        error for every item.
 
     >>> from hlsim.metrics import haspi
     >>> silence = torch.zeros(1, 16000)

@@ -74,8 +74,8 @@ class QualityReference(Reference):
 
     Raises:
         ValueError: Clean signals that last less than 0.7 s, have less than 16 ms of sound, are not
-            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
-            of range.
+            floating-point, not finite, above 1e9, silent or below 20 dB SPL; a rate, level,
+            audiogram, length or equalisation out of range.
 
     >>> from hlsim import example_speech
     >>> from hlsim.metrics import HasqiReference
@@ -104,9 +104,9 @@ class QualityReference(Reference):
             Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
 
         Raises:
-            ValueError: Outputs of another shape, not floating-point, not finite or on another
-                device; an unknown noise or a seed out of range; with ``keep=False``, a clean signal
-                that is silent, too soft or too short.
+            ValueError: Outputs of another shape, not floating-point, not finite, above 1e9 or on
+                another device; an unknown noise or a seed out of range; with ``keep=False``, a
+                clean signal that is silent, too soft or too short.
         """
         return as_type_of(output, self.parts(output, noise=noise, seed=seed).combined)
 
@@ -124,9 +124,9 @@ class QualityReference(Reference):
             Score and parts, tensors even if ``output`` is an array. Shape of each: (...).
 
         Raises:
-            ValueError: Outputs of another shape, not floating-point, not finite or on another
-                device; an unknown noise or a seed out of range; with ``keep=False``, a clean signal
-                that is silent, too soft or too short.
+            ValueError: Outputs of another shape, not floating-point, not finite, above 1e9 or on
+                another device; an unknown noise or a seed out of range; with ``keep=False``, a
+                clean signal that is silent, too soft or too short.
         """
         return QualityParts(*self._compare_all(output, noise, seed).unbind(-1))
 

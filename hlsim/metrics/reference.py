@@ -79,8 +79,8 @@ class Reference(ABC):
 
     Raises:
         ValueError: Clean signals that last less than 0.7 s, have less than 16 ms of sound, are not
-            finite, silent or below 20 dB SPL; a rate, level, audiogram, length or equalisation out
-            of range.
+            floating-point, not finite, above 1e9, silent or below 20 dB SPL; a rate, level,
+            audiogram, length or equalisation out of range.
 
     >>> from hlsim.metrics import HaspiReference
     >>> issubclass(HaspiReference, Reference)

@@ -159,10 +159,10 @@ class _MeanScore(_Metric):
     ) -> None:
         """Score a batch, and add the scores to the mean.
 
-        An item that cannot be scored (clean speech that is silent or soft, NaN, less than 0.7 s) is
-        left out with a warning and counted in ``failed``. A silent output is scored. With two
-        channels, left and right, the score and the level of the better ear count, and an item is
-        left out if one of its ears cannot be scored.
+        An item that cannot be scored (clean speech that is silent or soft, NaN, infinity, less than
+        0.7 s) is left out with a warning and counted in ``failed``. A silent output is scored. With
+        two channels, left and right, the score and the level of the better ear count, and an item
+        is left out if one of its ears cannot be scored.
 
         Args:
             output: Outputs of the compensator. Shape: (time,), (batch, time), (batch, 1, time) or,
@@ -176,7 +176,8 @@ class _MeanScore(_Metric):
 
         Raises:
             ValueError: The shapes do not fit, a signal is not a floating-point tensor with time
-                last, there is no audiogram, or ``audiogram`` or ``lengths`` are not as described.
+                last or has a sample above 1e9, there is no audiogram, or ``audiogram`` or
+                ``lengths`` are not as described.
         """
         pair = match_pair(output, clean, self.sample_rate)
         longest = max(output.shape[-1], clean.shape[-1])
@@ -381,7 +382,7 @@ class MBSTOI(_MeanScore):
 
         Raises:
             ValueError: The shapes do not fit, a signal is not a floating-point tensor with time
-                last, or ``lengths`` are not as described.
+                last or has a sample above 1e9, or ``lengths`` are not as described.
         """
         check_two_channels(output)
         if output.ndim == 2:

@@ -77,8 +77,8 @@ def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
     these differences is the change of the correlation with the signal from one lag to the next.
     Near the maximum, single precision resolves these changes, but not the values themselves.
 
-    Blocks of half a second are transformed, which fit into caches. Neighbouring blocks overlap by
-    twice the largest lag.
+    Blocks of about half a second are transformed, which fit into caches. Neighbouring blocks
+    overlap by twice the largest lag.
 
     Args:
         reference: Envelope or motion of the clean signal. Shape: (items, channels, padded).
