@@ -25,7 +25,7 @@ def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
     Items 0, 2, 4 and so on have one to four steady tones, 100 to 7500 Hz, which begin together at a
     random time, in the first half of the item or before the item, and rise over 10 ms. (If no tone
     began before the item, a network would learn that a tone always follows silence.) The other
-    items have one to eight clicks of one sample.
+    items have one to eight clicks of one sample. A single item has either, at random.
 
     The frequency of about half of the tones is a multiple of 250 Hz, as in audiometry. Such a tone
     has a whole number of periods in 4 or 8 ms, so that it has the same phase in every frame of a
@@ -74,5 +74,6 @@ def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
     is_absent = uniform(0.0, 1.0, _MAX_CLICKS - 1) < 0.5
     heights[:, 1:][is_absent] = 0.0
     clicks = torch.zeros(items, samples).scatter_add_(1, positions, heights)
-    has_tones = (torch.arange(items) % 2 == 0).unsqueeze(-1)
+    first_item = torch.randint(2, (1,), generator=generator) if items == 1 else 0
+    has_tones = ((first_item + torch.arange(items)) % 2 == 0).unsqueeze(-1)
     return torch.where(has_tones, tones.sum(1) * rise, clicks)

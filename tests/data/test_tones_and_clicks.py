@@ -30,6 +30,11 @@ def test_clicks_are_single_samples_that_depend_on_the_seed_alone() -> None:
     assert torch.equal(draw(6), draw(6)) and not torch.equal(draw(6), draw(6, seed=1))
 
 
+def test_single_items_have_tones_or_clicks() -> None:
+    are_clicks = [int((draw(1, 1000, seed) != 0.0).sum()) <= 8 for seed in range(40)]
+    assert 10 < sum(are_clicks) < 30
+
+
 def test_a_sound_has_at_least_one_sample() -> None:
     with pytest.raises(ValueError, match="expected samples to be a whole number from 1, got 0"):
         draw(2, samples=0)
