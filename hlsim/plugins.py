@@ -104,8 +104,7 @@ class WaveformPlugin:
         self._number = next(_load_numbers)
 
     def __str__(self) -> str:
-        fingerprint = getattr(self.function, "fingerprint", None)
-        return self.name if fingerprint is None else f"{self.name} ({fingerprint})"
+        return self.name
 
     def __reduce__(self) -> Any:
         return _load_copy, (self.name, self.kind, self._number)

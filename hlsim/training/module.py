@@ -204,16 +204,19 @@ def describe_simulator(role: str, simulator: str | Path | nn.Module) -> dict[str
     {'teacher': 'msbg'}
     """
     loaded = load_simulator(simulator)
+    code: Any
     if isinstance(loaded, PluginSimulator):
-        return {role: str(loaded), **_hash_weights_and_code(role, loaded.plugin.function)}
-    if isinstance(simulator, nn.Module):
-        name = f"{type(simulator).__name__}({simulator.extra_repr()})"
-        if hasattr(simulator, "fingerprint"):
-            name += f" ({simulator.fingerprint})"
-        return {role: name, **_hash_weights_and_code(role, simulator)}
-    if str(simulator) in BUILT_IN:
+        name, code = loaded.plugin.name, loaded.plugin.function
+    elif isinstance(simulator, nn.Module):
+        name, code = f"{type(simulator).__name__}({simulator.extra_repr()})", simulator
+    elif str(simulator) in BUILT_IN:
         return {role: str(simulator)}
-    return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}
+    else:
+        return {role: str(simulator), f"{role}_sha256": read_record(simulator)["sha256"]}
+    version = getattr(code, "fingerprint", None)
+    if version is not None:
+        name += f" ({version})"
+    return {role: name, **_hash_weights_and_code(role, code)}
 
 
 def _hash_weights_and_code(role: str, code: Any) -> dict[str, str]:
@@ -231,6 +234,7 @@ def _hash_weights_and_code(role: str, code: Any) -> dict[str, str]:
     owner = code if inspect.isroutine(code) else type(code)
     package = str(getattr(owner, "__module__", "")).partition(".")[0]
     digest = source_hash(owner)
-    if digest and package not in ("hlsim", "torch") and not hasattr(code, "fingerprint"):
+    is_versioned = getattr(code, "fingerprint", None) is not None
+    if digest and package not in ("hlsim", "torch") and not is_versioned:
         hashes[f"{role}_code_sha256"] = digest
     return hashes
