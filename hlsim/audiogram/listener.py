@@ -55,7 +55,7 @@ class Listener:
         return self
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the audiograms of both ears, the left one blue and the right one red.
+        """Draw the audiograms of the known ears, the left one blue and the right one red.
 
         Args:
             axes: Matplotlib axes to draw on; by default new axes.

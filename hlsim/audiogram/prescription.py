@@ -90,7 +90,7 @@ def nalrp_gains_db(
 ) -> Tensor:
     """Compute the gains that NAL-RP prescribes, at any frequencies.
 
-    NAL-RP has NAL-R's formula, with an additional constant for 1500 Hz, and a correction for
+    NAL-RP has NAL-R's formula, with additional constants for 1500 and 3000 Hz, and a correction for
     profound losses: if the threshold at 2 kHz is above 90 dB HL, low frequencies get more gain and
     high ones less. The published table of this correction, in steps of 5 dB, is interpolated
     linearly.
@@ -130,10 +130,10 @@ def camfit_gains(
     """Compute the gains that CAMFIT prescribes for bands, as lines over the level of each band.
 
     The line of a band goes through two points. A band of average speech at 65 dB SPL gets the gain
-    of the Cambridge formula, 0.48 of the loss plus a constant, in dB. A band that is 38 dB softer
-    is amplified to the threshold. If the compression ratio would be below 1 or above 2.92, the line
-    goes through the second point only, with the nearer of these ratios. ``compressed_gains_db``
-    computes the gain for a level, and limits it.
+    of the Cambridge formula, 0.48 of the loss plus a constant, at least 0 dB. A band that is 38 dB
+    softer is amplified to the threshold. If the compression ratio would be below 1 or above 2.92,
+    the line goes through the second point only, with the nearer of these ratios.
+    ``compressed_gains_db`` computes the gain for a level, and limits it.
 
     Args:
         thresholds: Thresholds in dB HL, which are interpolated over log frequency.

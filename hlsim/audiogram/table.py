@@ -77,15 +77,16 @@ def read_listeners(
 
     Args:
         path: A file, whose name ends in ``.json`` if it is Clarity's, or a pandas ``DataFrame``.
-        names: Names of the listeners to read, by default all. Other listeners are not validated.
+        names: Names of the listeners to read, by default all. The thresholds of other listeners are
+            not validated.
 
     Returns:
         Listeners, each under its name. An ear without thresholds in a table is None.
 
     Raises:
-        ValueError: The file cannot be read, has no listener of a name, the names of two listeners
-            differ only in case, or an ear is not valid, is neither left nor right, or occurs twice.
-            The message names the file and the line or the listener.
+        ValueError: The file cannot be read, has no column ``listener`` or no listener of a name,
+            the names of two listeners differ only in case, or an ear is not valid, is neither left
+            nor right, or occurs twice. The message names the file and the line or the listener.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

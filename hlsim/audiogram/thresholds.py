@@ -52,7 +52,7 @@ def as_thresholds(
 
     Raises:
         ValueError: The value does not describe ears, an ear is missing, a tensor does not have
-            eight real numbers per ear, or a level is NaN or outside -10 to ``highest`` dB HL.
+            eight real numbers per ear or has NaN, or a level is outside -10 to ``highest`` dB HL.
 
     >>> as_thresholds(["N1", "N3"]).shape
     torch.Size([2, 8])
@@ -78,7 +78,7 @@ def _list_ears(audiogram: Any) -> tuple[list[Audiogram], tuple[int, ...]] | None
     result is ``None`` for a tensor, a sequence of tensors, and a value that does not describe ears.
 
     Raises:
-        ValueError: A listener lacks an ear.
+        ValueError: An ear is not valid, or a listener lacks one.
     """
     if isinstance(audiogram, Tensor):
         return None

@@ -490,8 +490,9 @@ def ears_in_row(
     Raises:
         ValueError: There is no measured threshold, a column is not understood, a threshold is not a
             number from -10 to ``highest``, an uncomfortable level is not one from 20 to 140 or is
-            below the threshold, some columns name an ear and others do not, an ear has
-            uncomfortable levels but no thresholds, or a remark is a number.
+            below the threshold, some columns name an ear and others do not, two have the same
+            frequency and ear, an ear has uncomfortable levels but no thresholds, its frequencies
+            all lie below 250 or above 8000 Hz, or a remark is a number.
 
     >>> ears_in_row({"L500": "20", "R500": "30"})
     {'left': Audiogram({500: 20}), 'right': Audiogram({500: 30})}

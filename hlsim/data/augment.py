@@ -162,6 +162,9 @@ def augment_speech(
         Signals in pascals with shape (items, time), whose RMS level is at most 115 dB SPL if
         ``treated``.
 
+    Raises:
+        ValueError: The noise has another shape or is silent, see ``mix``.
+
     >>> speech, ears = torch.randn(2, 1600), torch.full((2, 8), 40.0)
     >>> augment_speech(speech, None, ears, torch.Generator()).shape
     torch.Size([2, 1600])

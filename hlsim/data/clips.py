@@ -45,7 +45,7 @@ _SILENT_POWER = 1e-7
 """Mean square up to which a clip counts as silent, if the peak of its recording is 1.0."""
 
 _LOWEST_PEAK = 1e-9
-"""Peak below which a recording counts as silent."""
+"""Smallest peak that is scaled to 1.0; recordings with a lower one stay below 1.0."""
 
 
 class Clips:

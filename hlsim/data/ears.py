@@ -27,8 +27,8 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
     S3). Its thresholds from 250 to 2000 Hz are shifted together, by up to 20 dB up or down at 250
     Hz and less at higher frequencies. Gaussian deviations are added, with a standard deviation of
     2.4 to 8 dB and a correlation between neighbouring frequencies. Three in four ears are rounded
-    to 5 dB, as in audiometry. By MSBG's definition, 27 % have no loss, 18 % a mild one, 19 % a
-    moderate one and 36 % a severe one.
+    to 5 dB, as in audiometry. By MSBG's definition, about 27 % have no loss, 19 % a mild one, 19 %
+    a moderate one and 36 % a severe one.
 
     Args:
         count: Number of ears.

@@ -94,8 +94,8 @@ def prepare(
         out: CSV file to write. Its paths are relative to the folder of the corpus, or to that of
             the CSV file.
         folders: Meaning of each level of folders, see ``recognise``.
-        valid_share: Share of the training speakers that are moved to the validation split, if the
-            corpus has none.
+        valid_share: Share of the training speakers that are moved to the validation split, which
+            the corpus must not have; 0 moves none.
         microphones: Numbers of the microphones that are used of Clarity's scenes, the reference
             first; by default all.
 
@@ -104,10 +104,10 @@ def prepare(
         left out, their number.
 
     Raises:
-        ValueError: The layout is unknown or contradictory, levels of folders are named for a CSV
-            file, a scene lacks one of the microphones, a microphone is named twice, the share is
-            not from 0 to below 1 or cannot be moved (see ``hold_out_speakers``), or the manifest
-            cannot be written.
+        ValueError: The layout is unknown or contradictory, the CSV file is not a manifest, levels
+            of folders are named for a CSV file, a scene lacks one of the microphones, a microphone
+            is named twice, the share is not from 0 to below 1 or cannot be moved (see
+            ``hold_out_speakers``), or the manifest cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -200,7 +200,8 @@ def recognise(
         The name of the layout, and the utterances.
 
     Raises:
-        ValueError: The layout is unknown or contradictory.
+        ValueError: The layout is unknown or contradictory, or ``folders`` has an unknown meaning,
+            or twice the same.
 
     >>> layout, utterances = recognise(["ann/1.wav", "bob/1.wav"], folders=["speaker"])
     >>> [row.speaker for row in utterances]
@@ -240,8 +241,8 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
         New rows in the same order; the rows that were passed do not change.
 
     Raises:
-        ValueError: The share is not between 0 and 1, there is a validation split already, a speaker
-            is unknown, or no training speaker would remain.
+        ValueError: The share is not between 0 and 1, there is a validation split already, a
+            training speaker is unknown, or none would remain.
 
     >>> rows = [Utterance("ann/1.wav", speaker="ann"), Utterance("bob/1.wav", speaker="bob")]
     >>> [row.split for row in hold_out_speakers(rows, 0.5)]

@@ -136,8 +136,8 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
         utterances: Rows of the manifest.
 
     Raises:
-        ValueError: The file cannot be written, its name does not end in .csv, or it exists and is
-            no manifest.
+        ValueError: The file cannot be written, its name does not end in .csv, or it exists and does
+            not begin with the columns of a manifest in this order.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -166,8 +166,8 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         ValueError: There are no rows, a file is both clean and noisy, a noisy file or a clean file
             without a noisy one is listed twice, a clean file is in a folder of noises, mixtures or
             impulse responses by its name, a file or a speaker is in two splits, a microphone is in
-            a row twice, or a reference is not valid, lacks a noisy file, or is missing in some rows
-            only or for several noisy files.
+            a row twice, or a reference is not valid, lacks a noisy file, is missing for several
+            noisy files, or has not the same number of channels in all rows.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):

@@ -42,9 +42,9 @@ def mix(
 
     Raises:
         ValueError: The shapes, or that of the SNR, do not fit; a signal is not floating-point with
-            time last; the noise is silent or shorter than the speech, samples are NaN or infinite,
-            the SNR is no number, or too low for any level of noise, or the sample rate is out of
-            range.
+            time last, or is above 1e9; the noise is silent or shorter than the speech, samples are
+            NaN or infinite, the SNR is no number, or too low for any level of noise, or the sample
+            rate is out of range.
 
     Example:
         >>> import hlsim

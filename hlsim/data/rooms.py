@@ -31,8 +31,8 @@ class Room:
     Attributes:
         size: Length, width and height in m, 2 to 30.
         reverberation_time: Time in s in which sound decays by 60 dB, by Sabine's equation, 0.2 to
-            1.5. The impulse responses end then. A source takes about a second to compute for
-            0.5 s, and up to half a minute for 1.5 s.
+            1.5. Later echoes are left out. A source takes about a second to compute for 0.5 s, and
+            up to half a minute for 1.5 s.
         head: Position of the centre of the head in m, on the axes of ``size``: from the wall behind
             the listener, from the wall on the right, and above the floor; 0.0875 m, the radius of
             the head, or more from each surface.

@@ -69,8 +69,9 @@ def make_scene(
     """Place a talker, maskers and diffuse noise around a listener with two microphones a side.
 
     Talker and maskers are plane waves from the horizontal plane to a rigid sphere, see
-    ``hlsim.dsp.sphere``, and in a ``room``, so are their echoes. Diffuse noise comes from 64
-    directions that are evenly spread over the sphere, with another part of the recording from each.
+    ``hlsim.dsp.sphere``; in a ``room``, their echoes are plane waves from the whole sphere. Diffuse
+    noise comes from 64 directions that are evenly spread over the sphere, with a random part of the
+    recording from each.
 
     Args:
         target: Speech at its level at the centre of the head without the head, (time,).
@@ -84,7 +85,7 @@ def make_scene(
         target_azimuth: Azimuth of the target in degrees, -360 to 360.
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
         sample_rate: Sample rate of all signals in Hz, 16000 to 48000.
-        seed: Seed of the parts of the recording for diffuse noise, 0 or more.
+        seed: Seed of the parts of the recording for diffuse noise, 0 to 2**32 - 1.
         room: Room with echoes of the talker and the maskers, but not of diffuse noise; none by
             default, as in the open. Echoes make sounds louder, by about 3 dB at 0.3 s.
 
@@ -95,8 +96,8 @@ def make_scene(
         MissingExtraError: There is a room, and pyroomacoustics is not installed.
         ValueError: A signal is not valid, a masker or the diffuse noise is shorter than the target,
             all of them are silent, there is no masker and no diffuse noise, there is not one
-            azimuth for each masker, a number is out of range, ``room`` is no room, or a source is
-            outside the room.
+            azimuth for each masker, a number is out of range, ``room`` is no room or cannot have
+            its reverberation time, or a source is outside the room.
 
     >>> import hlsim
     >>> speech = hlsim.example_speech()

@@ -40,7 +40,7 @@ def draw_sounds(items: int, samples: int, generator: torch.Generator) -> Tensor:
         Sounds with shape (items, samples).
 
     Raises:
-        ValueError: There are fewer than 0 items, or no samples.
+        ValueError: A number is not whole, there are fewer than 0 items, or there are no samples.
 
     >>> draw_sounds(4, 16000, torch.Generator()).shape
     torch.Size([4, 16000])
