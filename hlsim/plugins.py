@@ -78,7 +78,9 @@ def load_plugin(name: str, kind: str) -> Any:
 class WaveformPlugin:
     """Your own function or ``nn.Module`` from waveform to waveform, with validated outputs.
 
-    A module is set to evaluation mode, and moved to the device of its input.
+    A class is called without arguments, and its object is the function. A module is set to
+    evaluation mode, and moved to the device of its input. A call of the plug-in computes no
+    gradients; through its method ``call``, gradients pass.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.

@@ -321,6 +321,8 @@ def measure_reception_thresholds(
         aids: Hearing aids, each under its name.
         ears: Audiograms, each under its name.
         reference: Name of one of ``aids``, such as ``"unaided"``, to which benefits are relative.
+            If it has a method ``is_measured``, this must return True for each ear for which another
+            aid is measured.
         test: Test with the same digits and noises for all ears and aids.
 
     Returns:
@@ -332,6 +334,7 @@ def measure_reception_thresholds(
 
     Raises:
         ValueError: An aid fails; the message names aid and ear.
+        KeyError: The reference was not measured for an ear.
 
     >>> test = DigitTest.draw(30, simulator="attenuation")
     >>> aids, ears = {"unaided": lambda signal, ear: signal}, {"N3": Audiogram.standard("N3")}

@@ -61,8 +61,9 @@ def hasqi(
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, not
-            floating-point, not finite or above 1e9; clean speech that is silent or below 20 dB SPL;
-            a rate, level, audiogram, length, seed or equalisation out of range; an unknown noise.
+            floating-point, not finite or above 1e9; clean speech that is silent, below 20 dB SPL,
+            or has less than 16 ms of sound; a rate, level, audiogram, length, seed or equalisation
+            out of range; an unknown noise.
 
     >>> from hlsim import example_speech
     >>> speech = example_speech()[:16000]

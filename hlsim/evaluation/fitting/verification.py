@@ -298,10 +298,14 @@ def section_powers(signal: Tensor, sample_rate: int) -> Array:
 
     Args:
         signal: Samples in pascals, (time,), of 125 ms or more.
-        sample_rate: Sample rate in Hz.
+        sample_rate: Sample rate in Hz, 16000 or more. At lower ones, which are not rejected, the
+            bands above the Nyquist frequency have no power.
 
     Returns:
         Powers in Pa^2 in the third octaves ``SII_BANDS``, (sections, 18).
+
+    Raises:
+        RuntimeError: The signal is shorter than 125 ms.
 
     >>> import torch
     >>> tone = (2.0 * torch.pi * 1000.0 * torch.arange(16000) / 16000).sin()
