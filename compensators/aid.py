@@ -1,7 +1,8 @@
-"""Base class of all aids, which may store an ear and measure their insertion gains.
+"""Base class of aids, which may store an ear and measure their insertion gains.
 
 The insertion gain is the level of an aid's output minus that of its input in dB, in a third of an
-octave around a frequency. It is measured with noise that has the spectrum of average speech.
+octave around a frequency. Aids whose gains depend on the signal measure it with noise that has the
+spectrum of average speech.
 """
 
 from typing import Any
@@ -21,9 +22,9 @@ from hlsim.torchtools import constant
 
 
 class Aid(StoredEars, nn.Module):
-    """Base class of all aids: it stores ears, and measures the gains of an aid.
+    """Base class of aids without a front end: it stores ears, and measures the gains of an aid.
 
-    Subclasses implement ``forward`` and ``_amplify``.
+    Subclasses implement ``forward``, and ``_amplify`` or ``gains``.
 
     Args:
         audiogram: One or more ears, which are used by all calls that pass none.
@@ -86,8 +87,8 @@ class Aid(StoredEars, nn.Module):
     def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
         """Measure the insertion gains for noise with the spectrum of average speech.
 
-        The limit of the output is not applied, and noise reduction is off in aids that have a
-        slider for it.
+        Neither the limit of the peaks nor that of ``limit_to_ear`` is applied, and noise reduction
+        is off in aids that have a slider for it.
 
         Args:
             audiogram: One or more ears, by default those of the constructor.

@@ -2,8 +2,8 @@
 
 Inputs have the shape (..., microphones, ears, time): at each side of the head, a front and a rear
 microphone, left side first. Outputs have the shape (..., ears, time), which any aid of two ears
-takes. Sounds from the front come out nearly as the front microphone receives them; sounds from
-other directions are attenuated. The look-ahead is 1 ms.
+takes. Sounds from the front come out nearly as the front microphone receives them; most sounds from
+other directions are attenuated. The filters look ahead by up to 1 ms.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ class FilterAndSum(nn.Module):
         Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The samples are not floating-point numbers with time last, there are no
-                samples, or there is another number of microphones or ears.
+            ValueError: The samples are not floating-point numbers with time last, there are none or
+                one above 1e9 in magnitude, or there is another number of microphones or ears.
         """
         signals = as_samples(waveform)
         return as_type_of(waveform, self.delayed_output(signals)[..., -signals.shape[-1] :])
@@ -129,7 +129,7 @@ class FilterAndSum(nn.Module):
         Args:
             waveform: Signals of the microphones.
 
-        Shape: (..., microphones, ears, time) -> (..., ears, latency + time).
+        Shape: (..., microphones, ears, time) -> (..., ears, look-ahead + time).
 
         Raises:
             ValueError: See ``forward``.
@@ -215,7 +215,7 @@ class MicrophoneStream:
         aid: Stream of the aid behind the front end; None for the front end alone.
 
     Attributes:
-        aid: Stream of the aid, whose sliders ``aid.set`` moves.
+        aid: Stream of the aid, whose sliders ``aid.set`` moves, or None.
 
     >>> stream = DifferentialMicrophone().stream()
     >>> stream(torch.zeros(2, 2, 100)).shape
@@ -235,7 +235,8 @@ class MicrophoneStream:
         Raises:
             ValueError: The chunk is not a floating-point waveform, or has no samples, another
                 number of microphones or ears, other leading dimensions than the first one, or a
-                sample that is NaN or infinite; or the aid rejects an ear or a slider.
+                sample that is NaN, infinite or above 1e9 in magnitude; or the aid rejects an ear or
+                a slider.
         """
         signals = as_samples(chunk)
         self._front_end.check_microphones(signals)
@@ -265,9 +266,15 @@ class MicrophoneStream:
         """
         if self._state is None:
             raise ValueError("expected a chunk before flush, got none; there is nothing to return")
-        rest = self(self._zero.expand(*self._zero.shape[:-1], self._front_end.latency))
+        latency = self._front_end.latency
+        rest = self._zero[..., 0, :, :0]  # (..., ears, 0)
+        if latency:
+            rest = self(self._zero.expand(*self._zero.shape[:-1], latency))
         self._state = None
-        return rest if self.aid is None else torch.cat((rest, self.aid.flush()), -1)
+        if self.aid is None:
+            return rest
+        end = self.aid.flush()
+        return torch.cat((rest, end), -1) if latency else end
 
 
 class DifferentialMicrophone(FilterAndSum):
@@ -283,7 +290,8 @@ class DifferentialMicrophone(FilterAndSum):
     Args:
         pattern: "cardioid", "supercardioid", "hypercardioid" or "dipole".
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
-        lowest: Frequency in Hz, 20 to 2000, at which sound from the front is 3 dB softer.
+        lowest: Frequency in Hz, 20 to 2000, at which sound from the front is 3 dB softer, if the
+            spacing is far below its wavelength.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
@@ -327,7 +335,7 @@ class AdaptiveDifferentialMicrophone(DifferentialMicrophone):
     Args:
         seconds: Time constant of the averages in seconds, 0.001 to 10.
         spacing: Distance between the two microphones of a side in m, 0.002 to 0.1.
-        lowest: Frequency in Hz, 20 to 2000, at which sound from the front is 3 dB softer.
+        lowest: Frequency in Hz, 20 to 2000, see ``DifferentialMicrophone``.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
@@ -449,8 +457,8 @@ class DirectionalAid(nn.Module):
         Shape: (..., microphones, ears, time) -> (..., ears, time).
 
         Raises:
-            ValueError: The waveform has another number of microphones or ears, or the aid rejects
-                an ear or a slider.
+            ValueError: The waveform is not valid, see ``FilterAndSum.forward``, or the aid rejects
+                an ear or the value of a slider.
         """
         delayed = self.front_end.delayed_output(waveform)
         output: Tensor = self.aid(delayed, audiogram, **sliders)
@@ -509,7 +517,7 @@ def look_ahead_samples(sample_rate: int) -> int:
 
 
 def filter_length(sample_rate: int) -> int:
-    """Return the length of front ends' filters in samples, 9 ms including the look-ahead.
+    """Return the length of front ends' filters in samples, up to 9 ms with the look-ahead.
 
     >>> filter_length(16000)
     144
@@ -535,7 +543,7 @@ def differential_responses(
     Args:
         delay: Delay of the rear microphone, relative to the time in which sound passes the spacing.
         spacing: Distance between the microphones in m.
-        lowest: Frequency in Hz at which the output for sound from the front is 3 dB softer.
+        lowest: Frequency in Hz, see ``DifferentialMicrophone``.
         sample_rate: Sample rate in Hz.
 
     Returns:
@@ -596,7 +604,8 @@ def beam_and_blocking_taps(loading: float, spacing: float, before: int) -> NDArr
     The beams are those of ``mvdr_taps``. The two other signals are, at each side, a cardioid to the
     rear, and the difference between the beam and a cardioid to the front, where the beam is
     filtered as the cardioid filters sound from the front. Of sound in front of a sphere, they have
-    -40 dB or less up to 4 kHz, relative to the front microphone, and -24 dB at 8 kHz.
+    -40 dB or less up to 4 kHz, relative to the front microphone, and up to -24 dB at 8 kHz, if the
+    spacing is 1 cm.
 
     Args:
         loading: Power of each microphone's own noise, see ``mvdr_taps``.

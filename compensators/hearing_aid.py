@@ -32,7 +32,7 @@ QUIET_FADE_DB = 15.0
 """Range of levels in dB over which the gain of quiet sounds fades."""
 
 INITIAL_REDUCTION_LOGIT = -3.0
-"""Initial logit of noise reduction: 5 % of the largest attenuation."""
+"""Initial bias of the logits of noise reduction: 5 % of the largest attenuation."""
 
 NO_GAIN_SPL = 100.0
 """Level of a band in dB SPL from which the restoring gain is 0.
@@ -84,8 +84,9 @@ class HearingAid(Wearable, HubModel):
             and correction stays 0 dB or more.
 
     Raises:
-        ValueError: A rate or level is out of range, ``linked`` or ``limit_to_ear`` is neither True
-            nor False, an ear is not valid, or ``config`` is not a ``HearingAidConfig``.
+        ValueError: A rate, level or ``loudness`` is out of range, ``linked`` or ``limit_to_ear`` is
+            neither True nor False, an ear is not valid, or ``config`` is not a
+            ``HearingAidConfig``.
 
     >>> import hlsim
     >>> aid = HearingAid().eval()
@@ -178,8 +179,8 @@ class HearingAid(Wearable, HubModel):
         Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: A slider is outside 0 to 1 or has another number of values, or an argument
-                is not valid, see ``Aid.forward``.
+            ValueError: A slider is outside 0 to 1 (on a GPU this gives NaN) or has another number
+                of values, or an argument is not valid, see ``Aid.forward``.
         """
         sliders: dict[str, Slider] = {
             "noise_reduction": noise_reduction,

@@ -1,7 +1,7 @@
 """Two limiters that protect the ear: of the peaks of an output, and of its bands.
 
-The limit of the peaks is the same for every ear. The limit of a band is the uncomfortable level of
-the ear, and aids have it only with ``limit_to_ear``.
+The limit of the peaks is the same for every ear. The limit of a band is below the uncomfortable
+level of the ear, and aids have it only with ``limit_to_ear``.
 """
 
 import torch

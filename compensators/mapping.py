@@ -42,9 +42,10 @@ class MappingCompensator(Aid, EarNetwork, HubModel):
 
     In dB, the gain at a time and a frequency is that of the prescription NAL-R plus a correction by
     the network, which is smooth over time and frequency. The network gets the log magnitude of the
-    input, the audiogram and the prescribed gain. It has the encoder, dual-path blocks and decoder
-    of Neuro-MSBG. Training needs the prescription: an inaudible band has almost no gradient, and
-    without a prescription the trained network is worse than NAL-R.
+    input (with a predicted phase also its phase), the audiogram and the prescribed gain. It has the
+    encoder, dual-path blocks and decoder of Neuro-MSBG. Training needs the prescription: an
+    inaudible band has almost no gradient, and without a prescription the trained network is worse
+    than NAL-R.
 
     The output is time-aligned with the input, and has its phase, which a second decoder shifts if
     ``config.phase`` is "predicted". Gains depend on the level of the input, because nothing is

@@ -37,7 +37,7 @@ def follow_peaks(
         values: Levels or gains in dB, n for each frame.
         memory: Second result of the call for the preceding frames, zeros before the first frame.
         attack: Time constant of a rise in seconds. With 0, the result follows at once.
-        release: Time constant of a fall in seconds.
+        release: Time constant of a fall in seconds, above 0.
 
     Returns:
         The smoothed values, and the memory after the last frame.

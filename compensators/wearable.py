@@ -450,8 +450,8 @@ class Wearable(Aid):
 class Stream:
     """An aid for a signal that arrives in chunks: a function from a chunk to the next output.
 
-    Chunks may have any number of samples. The output has as many, and is delayed by ``aid.latency``
-    samples. It is that of the aid for the whole signal, without gradients.
+    Chunks may have any number of samples above 0. The output has as many, and is delayed by
+    ``aid.latency`` samples. It is that of the aid for the whole signal, without gradients.
 
     Sliders of the aid, such as ``noise_reduction``, may be set at any time. They take 0.1 s from 0
     to 1, so that nothing clicks. If the dimension before time is larger than eight, a chunk needs
@@ -548,7 +548,8 @@ class Stream:
         Shape: -> (..., latency), with the leading dimensions of the other outputs.
 
         Raises:
-            ValueError: A slider is outside 0 to 1, or does not broadcast to the items.
+            ValueError: A slider is outside 0 to 1, or does not broadcast to the items; or there was
+                no chunk yet, and a ``linked`` aid or a listener needs two channels.
         """
         rest = self(self._fitted.new_zeros(*self._shape, DELAY))
         self._state = {}
@@ -558,7 +559,8 @@ class Stream:
         """Read the sliders, and with the first chunk fit the aid to the ears and begin its state.
 
         Raises:
-            ValueError: The chunk has another shape than the first one.
+            ValueError: The leading dimensions are not those of the first chunk, or the ears or a
+                slider are not valid.
         """
         is_first = not self._state
         if is_first:

@@ -55,7 +55,7 @@ _NAMES = {
     "hlsim.neuro": "NeuroMSBG load_pretrained",
     "hlsim.shortcuts": "compensate example_speech info listen load_audio simulate",
 }
-"""Public names by the module that defines them."""
+"""Public names by the module from which they are imported."""
 
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -1,7 +1,7 @@
 """Reading, writing and listing of audio files.
 
-Recordings of any length are read by ``scan_audio`` and ``read_parts``, and written by
-``write_parts``, so that only a part of them is in memory.
+Long recordings are read by ``scan_audio`` and ``read_parts``, and written by ``write_parts``, so
+that only a part of them is in memory.
 """
 
 import math
@@ -20,7 +20,7 @@ import soundfile
 import torch
 from torch import Tensor
 
-from hlsim.checks import LOWEST_RATE, check_rate, check_waveform
+from hlsim.checks import LOWEST_RATE, check_number, check_rate, check_waveform
 from hlsim.files import atomic_path
 
 EXTENSIONS = tuple(
@@ -43,6 +43,9 @@ _SMALLEST_UNKNOWN_SIZE = 2**31 - 2**16
 _HEADER = struct.Struct("<4sI4s4sIHHIIHHH4sII4sI")
 """Header of a WAV file in 32-bit float: the chunks RIFF, fmt and fact, and the head of data."""
 
+_MOST_CHANNELS = 1024
+"""Largest number of channels that libsndfile reads."""
+
 _OTHER_EXTENSIONS = (".m4a", ".aac", ".wma", ".amr", ".ape", ".wv", ".shn")
 """Extensions of audio files that libsndfile does not read."""
 
@@ -50,7 +53,8 @@ _OTHER_EXTENSIONS = (".m4a", ".aac", ".wma", ".amr", ".ape", ".wv", ".shn")
 def read_audio(path: str | Path) -> tuple[Tensor, int]:
     """Read an audio file in any format that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
 
-    A truncated file is read up to its end, with a warning.
+    If libsndfile detects that a file is truncated, the file is read up to its end with a warning,
+    as WAV, or rejected, as FLAC.
 
     Args:
         path: Audio file with a sample rate of 16 kHz or more.
@@ -102,7 +106,7 @@ class AudioInfo:
 def scan_audio(path: str | Path) -> AudioInfo:
     """Read an audio file once, a part at a time, and return its ``AudioInfo``.
 
-    The samples are not kept in memory. A truncated file is read up to its end, with a warning.
+    The samples are not kept in memory. Truncated files are treated as by ``read_audio``.
 
     Args:
         path: Audio file with a sample rate of 16 kHz or more.
@@ -139,7 +143,7 @@ def read_parts(recording: AudioInfo, bounds: Iterable[tuple[int, int]]) -> Itera
         Samples in float32, (channels, time), where 1.0 is full scale.
 
     Raises:
-        ValueError: The file is missing, cannot be read, or is shorter than when it was scanned.
+        ValueError: The file is missing, cannot be read, or ends before one of the parts does.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> parts = read_parts(scan_audio(EXAMPLE_FILE), [(0, 1000), (900, 2000)])
@@ -218,9 +222,10 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
-        ValueError: The extension is not .wav, the shape or the sample rate is not supported, the
-            signal has no samples or is too long for a WAV file (4 GB), a sample is NaN, infinite or
-            above 1e9 in magnitude, or the file cannot be written.
+        ValueError: The extension is not .wav, the waveform is not a floating-point tensor, its
+            shape or the sample rate is not supported, the signal has no samples, more than 1024
+            channels, or is too long for a WAV file (4 GB), a sample is NaN, infinite or (on the
+            CPU) above 1e9 in magnitude, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -244,14 +249,14 @@ def write_parts(
     Args:
         path: File to write.
         parts: Consecutive parts of the signal, (channels, time), where 1.0 is full scale.
-        channels: Number of channels.
+        channels: Number of channels, at most 1024.
         samples: Number of samples per channel of all parts together.
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Raises:
-        ValueError: The extension is not .wav, the sample rate is not supported, the signal is too
-            long for a WAV file (4 GB), samples are NaN or infinite, the parts have another number
-            of channels or samples, or the file cannot be written.
+        ValueError: The extension is not .wav, the sample rate or the number of channels is not
+            supported, the signal is too long for a WAV file (4 GB), samples are NaN or infinite,
+            the parts have another number of channels or samples, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -262,6 +267,7 @@ def write_parts(
     if Path(path).suffix.lower() != ".wav":
         raise ValueError(f"{path}: expected the extension .wav; convert the file afterwards")
     rate = check_rate(sample_rate)
+    check_number("the number of channels", channels, 1, _MOST_CHANNELS, whole=True)
     frame_bytes = 4 * channels
     data_bytes = frame_bytes * samples
     riff_bytes = _HEADER.size - 8 + data_bytes
@@ -310,7 +316,7 @@ def find_audio(folder: str | Path, *, by_name: bool = False) -> list[Path]:
 
     Args:
         folder: Folder to search.
-        by_name: Whether to list a file under the names of all links to it. This is needed where
+        by_name: Whether to list a file also under the names of links to it. This is needed where
             names have a meaning, for example if the clean speech of two outputs is one file.
 
     Returns:

@@ -17,7 +17,7 @@ PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
 
 NEURO_RATE = 16000
-"""Sample rate in Hz at which the networks work, and default rate of all modules and functions."""
+"""Sample rate in Hz at which the networks work, and default rate of modules and functions."""
 
 LOWEST_SPL, HIGHEST_SPL = -20.0, 140.0
 """Range of levels in dB SPL of recordings: from inaudible to a level that damages ears at once."""

@@ -246,7 +246,7 @@ def save_checkpoint(
         kind: Kind of the checkpoint, such as ``hearing-aid``.
         model: Model whose state dict is saved.
         config: Settings with which the model can be built again, as JSON values.
-        about: Record of the training: data, seed, command, time, measures and version.
+        about: Record of the training, such as data, seed, command and time, as JSON values.
         card: Further metadata of the card, such as ``{"license": "mit"}``.
 
     Raises:
@@ -315,7 +315,7 @@ def _write_card(folder: Path, kind: str, about: Settings, metadata: Settings) ->
 
 
 def _digest(config: Any) -> str:
-    """Compute the SHA-256 of settings in JSON's types, in hexadecimal, whatever their order."""
+    """Compute the hexadecimal SHA-256 of settings in JSON's types, whatever the order of keys."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
@@ -354,14 +354,14 @@ class HubModel:
         """Save the model as a checkpoint, in place of an older one in the same folder.
 
         The sample rate, ``full_scale_spl`` and other arguments of the constructor beside ``config``
-        are not saved; pass them when the model is loaded. A warning names those that differ from
-        their default, because the loaded model has other outputs.
+        are not saved; pass them when the model is loaded. A warning names those, except ears, that
+        differ from their default, because the loaded model has other outputs.
 
         Args:
             folder: Folder to write.
             license: Licence of the weights, such as ``"mit"``, for the card.
             datasets: Names of the corpora on which the model was trained, for the card.
-            about: Record of the training for the card, such as ``{"seed": 0}``.
+            about: Record of the training for the card, such as ``{"seed": 0}``, as JSON values.
 
         Raises:
             ValueError: A weight is NaN or infinite, or the folder cannot be written.

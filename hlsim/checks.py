@@ -1,7 +1,8 @@
 """Validation of settings, sample rates, waveforms and lengths.
 
 Functions named ``check_...`` raise ValueError with what is wrong, what was expected and, where
-there is one, the fix. Those that return something return the validated value.
+there is one, the fix. Except for the decorator ``check_settings``, those that return something
+return the validated value.
 """
 
 import difflib
@@ -22,13 +23,13 @@ LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators accept."""
 
 HIGHEST_SAMPLE = 1e9
-"""Largest accepted sample. From 1e14 on, products of powers exceed the range of float32."""
+"""Largest accepted sample. From 4.3e9 on, products of two powers exceed the range of float32."""
 
 LOUDEST_SPL = 120.0
 """RMS level in dB SPL above which a warning is given, once per process."""
 
 MOST_CHANNELS = 8
-"""Largest last dimension that, behind a longer dimension, is taken as channels instead of time."""
+"""Largest last dimension that, behind one above this, is taken as channels instead of time."""
 
 P = ParamSpec("P")
 
@@ -214,7 +215,10 @@ def is_finite(value: Any) -> bool:
     >>> is_finite(1.5), is_finite(True), is_finite(math.nan)
     (True, False, False)
     """
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    number: Any = value
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    # Unlike ``math.isfinite``, the comparison takes integers that are too large for a float.
+    return is_number and bool(-math.inf < number < math.inf)
 
 
 def describe(value: Any) -> str:
@@ -258,8 +262,8 @@ def check_waveform(
 ) -> Tensor:
     """Validate that a tensor is a waveform, and return it.
 
-    NaN and infinity pass, and make the results of their item NaN. The values are not validated on a
-    GPU, because that would synchronise with the GPU, nor in a compiled program.
+    NaN and infinity pass, so that the results of their item contain NaN. The values are not
+    validated on a GPU, because that would synchronise with the GPU, nor in a compiled program.
 
     Args:
         waveform: Tensor of shape (..., time).
@@ -366,7 +370,7 @@ def check_device(module: nn.Module, device: torch.device | None = None) -> None:
 def loud_outputs() -> Iterator[None]:
     """Suppress, inside a ``with`` block, the warning of ``check_waveform`` that a signal is loud.
 
-    Outputs of aids may be loud on purpose. A loud waveform after the block still causes a warning.
+    Outputs of aids may be loud on purpose. A loud waveform after the block can still cause it.
 
     >>> with loud_outputs():
     ...     _ = check_waveform(torch.full((10,), 1000.0), full_scale_spl=94.0)
@@ -412,7 +416,8 @@ def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: floa
 def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
     """Raise ValueError unless a value is a floating-point tensor whose last dimension can be time.
 
-    A last dimension of up to eight values behind a longer one is taken as channels, and rejected.
+    A last dimension of up to eight values behind one of more than eight is taken as channels, and
+    rejected.
 
     Args:
         waveform: Value to validate.

@@ -79,8 +79,8 @@ def export_program(
     ``program.module()`` is a function of ``waveform`` (items, time), whose RMS of 1.0 is
     ``simulator.full_scale_spl`` dB SPL, and ``thresholds`` (items, 8) in dB HL. It returns a dict
     with ``perceived`` (items, time), the perceived signals on the scale of ``waveform``. The
-    program does not validate its inputs. All tensors have the dtype and device of the simulator's
-    weights.
+    program validates the shapes of its inputs, but not their values. All tensors have the dtype and
+    device of the simulator's weights.
 
     Args:
         simulator: Neuro-MSBG at 16 kHz.
@@ -160,7 +160,7 @@ def first_inputs(
     Args:
         aid: Aid at 16 kHz.
         audiogram: One ear for all items, or one per item.
-        items: Number of signals per call.
+        items: Number of signals per call, 2 if the aid is ``linked``.
         hops: Number of hops of 64 samples per call.
 
     Returns:

@@ -24,7 +24,7 @@ def require(module: str, extra: str) -> ModuleType:
         extra: Optional extra of hlsim that installs it, e.g. ``"eval"`` as in ``hlsim[eval]``.
 
     Raises:
-        MissingExtraError: The module, or one that it imports, is not installed.
+        MissingExtraError: The module, or one that it imports, cannot be imported.
 
     >>> require("json", extra="eval").dumps([1])
     '[1]'

@@ -66,7 +66,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         folder: Folder to lock, which is created if there is none.
 
     Raises:
-        ValueError: Another process has locked the folder, or the folder cannot be written.
+        ValueError: The folder is locked already, or cannot be written.
 
     >>> with tempfile.TemporaryDirectory() as folder, lock_folder(folder):
     ...     pass

@@ -41,8 +41,8 @@ def load_plugin(name: str, kind: str) -> Any:
         The function, module or other callable object.
 
     Raises:
-        ValueError: The name has another form, the import fails, or the object does not exist or
-            cannot be called.
+        ValueError: The name has another form, the import fails, the class cannot be called without
+            arguments, or the object does not exist or cannot be called.
 
     >>> load_plugin("math:sqrt", kind="measure")
     <built-in function sqrt>
@@ -197,7 +197,7 @@ def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
         name: Name of the plug-in.
         kind: Noun for the plug-in in error messages.
         number: Number of the original object. In a process, all copies of it are one object, as
-            long as it is one of the last 16 that were loaded.
+            long as it is one of the 16 that were last copied.
     """
     return WaveformPlugin(name, kind)
 

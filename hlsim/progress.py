@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import TextIO, TypeVar
 
 _LINE_INTERVAL = 10.0
-"""Longest time in seconds between two lines, if stderr is not a terminal."""
+"""Time in seconds after which another line is due, if stderr is not a terminal."""
 
 _TICK = 1.0
 """Time in seconds between two updates of the line."""
@@ -23,7 +23,7 @@ _active_lines: list[ProgressLine] = []
 
 
 class ProgressLine:
-    """Line about the progress of long work, which is shown on stderr at least every 10 seconds.
+    """Line about the progress of long work, which is shown on stderr about every 10 seconds.
 
     Use it in a ``with`` block, and call it after each unit of work with the number of finished
     units, their total number and, optionally, a text to append. A terminal shows one line, which is

@@ -58,8 +58,8 @@ def load_audio(
         their sample rate in Hz.
 
     Raises:
-        ValueError: The file cannot be read, is empty or silent, or contains NaN or infinity; or the
-            level or the sample rate is not valid.
+        ValueError: The file cannot be read, is empty or silent, contains NaN or infinity, or has a
+            sample rate below 16 kHz; or the level or the sample rate is not valid.
 
     Example:
         >>> import hlsim
@@ -114,13 +114,13 @@ def simulate(
         sample_rate: Sample rate in Hz, 16000 to 48000.
         simulator: ``"msbg"``, the exact model; ``"attenuation"``, a linear ear; the name or folder
             of a checkpoint such as ``"neuro-msbg"``; ``package.module:name``, a simulator of your
-            own; or a module that was built for this rate and level.
+            own; or a module that was built for this rate and level (see ``load_simulator``).
         full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0, by default 94, so that samples
             are in pascals.
 
     Returns:
-        The perceived signal, of the type and shape of ``audio``. For several ears and one signal,
-        ``(time,)``, one output per ear, ``(ears, time)``.
+        The perceived signal, of the type and shape of ``audio``. For a sequence of ears and one
+        signal, ``(time,)``, one output per ear, ``(ears, time)``.
 
     Raises:
         ValueError: The audio, the ear, the rate, the level or the simulator is not valid.
@@ -159,8 +159,10 @@ def compensate(
 
     Returns:
         The output of the aid, of the type of ``audio`` and time-aligned with it. Its shape is that
-        of ``audio``; for several ears and one signal, ``(time,)``, there is one output per ear,
-        ``(ears, time)``. It is as loud as the ear needs: turn the volume down before you play it.
+        of ``audio``; for a sequence of ears and one signal, ``(time,)``, there is one output per
+        ear, ``(ears, time)``, and an aid with several microphones returns ``(..., 2, time)`` for
+        ``(..., microphones, 2, time)``. It is as loud as the ear needs: turn the volume down before
+        you play it.
 
     Raises:
         ValueError: The audio, the ear, the rate, the level or the compensator is not valid.

@@ -61,7 +61,7 @@ class Attenuation(StoredEars, nn.Module):
             on the output, but on the warning about loud signals.
 
     Attributes:
-        reach: Number of input samples before and after an output sample that influence it.
+        reach: Number of input samples before and after an output sample that can influence it.
         thresholds: Thresholds of the constructor's ears in dB HL, (..., 8), or None.
 
     Raises:
@@ -91,7 +91,7 @@ class Attenuation(StoredEars, nn.Module):
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """Attenuate signals.
 
-        Shape: (..., time) -> (..., time).
+        Shape: (..., time), (..., 8) -> (..., time), where the leading dimensions broadcast.
 
         Args:
             waveform: Input signals.
@@ -101,7 +101,8 @@ class Attenuation(StoredEars, nn.Module):
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
-                not broadcast, or the waveform is not a floating-point signal with time last.
+                not broadcast, or the waveform is not a floating-point signal with time last, has no
+                samples or one above 1e9 in magnitude.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         ears = self.resolve_thresholds(waveform, audiogram)
@@ -141,9 +142,9 @@ class PluginSimulator(nn.Module):
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
-        ValueError: There is no such simulator, its attribute ``full_scale_spl`` is not 94, or its
-            output for half a second of noise has another shape, is shifted by more than 2 ms,
-            silent or not finite; or a rate or the level is out of range.
+        ValueError: There is no such simulator, its attribute ``full_scale_spl`` is not 94, it
+            fails, or its output for half a second of noise has another shape, is shifted by more
+            than 2 ms, silent or not finite; or a rate or the level is out of range.
 
     >>> simulator = PluginSimulator("hlsim:MSBG")
     >>> simulator(torch.randn(1, 16000), "N3").shape
@@ -188,7 +189,7 @@ class PluginSimulator(nn.Module):
     def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
         """Simulate what ears perceive.
 
-        Shape: (..., time) -> (..., time).
+        Shape: (..., time), (..., 8) -> (..., time), where the leading dimensions broadcast.
 
         Args:
             waveform: Input signals, where RMS 1.0 has the level ``full_scale_spl``.
@@ -197,8 +198,8 @@ class PluginSimulator(nn.Module):
 
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
-                not broadcast, the waveform is not a floating-point signal with time last, or your
-                simulator fails.
+                not broadcast, the waveform is not a floating-point signal with time last, has no
+                samples or one above 1e9 in magnitude, or your simulator fails.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         thresholds = resolve_thresholds(None, audiogram, waveform)
@@ -256,7 +257,7 @@ def load_simulator(
     Args:
         simulator: ``"msbg"``, the exact model; ``"msbg-unsmeared"``, the exact model without
             spectral smearing; ``"attenuation"``, a linear ear; the name of a checkpoint that ships
-            with hlsim, such as ``"neuro-msbg"``, or the folder of a checkpoint;
+            with hlsim, such as ``"neuro-msbg"``, or the folder of a checkpoint or training run;
             ``package.module:name`` or ``path/to/file.py:name``, a simulator of your own
             (``PluginSimulator``); or a module, which is set to evaluation mode. If a module has an
             attribute ``sample_rate``, ``full_scale_spl`` or ``aligned``, it is validated.
@@ -264,9 +265,9 @@ def load_simulator(
         full_scale_spl: Level in dB SPL of samples whose RMS is 1.0, 0 to 200.
 
     Raises:
-        ValueError: There is no such simulator, the rate or the level is out of range, the module
-            was built for another rate or level, or with ``aligned=False``, or a simulator of your
-            own is not valid (see ``PluginSimulator``).
+        ValueError: There is no such simulator, a checkpoint is damaged, the rate or the level is
+            out of range, the module was built for another rate or level, or with
+            ``aligned=False``, or a simulator of your own is not valid (see ``PluginSimulator``).
 
     >>> load_simulator("msbg")
     MSBG(sample_rate=16000, full_scale_spl=94, aligned=True, rescale_active=False, smearing=True)

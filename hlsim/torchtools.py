@@ -1,8 +1,8 @@
 """Tools around torch: constants, threads, conversion of arrays, batches, and copies on a GPU.
 
 A *constant* is a tensor that a function designs from its arguments, such as the taps of a filter.
-It is computed once for each type and device, and then comes from a store. Thresholds are copied
-once from the CPU to a GPU, or back.
+For each type and device, it is computed once, and then comes from a store of limited size.
+Thresholds are copied once from the CPU to a GPU, or back.
 """
 
 from collections import OrderedDict
@@ -152,16 +152,17 @@ def one_thread() -> Iterator[None]:
 def map_on_cores(
     function: Callable[[Argument], Result], arguments: Sequence[Argument], signal: Tensor
 ) -> list[Result]:
-    """Call a function for each of several arguments, in as many threads as torch uses.
+    """Call a function for each of several arguments, in up to as many threads as torch uses.
 
-    Each call computes on one core. Calls one after another, each on all cores, take longer, because
-    the cores wait for each other after every operation, and much longer while other programs run.
+    Each thread computes on one core. Calls one after another, each on all cores, take longer,
+    because the cores wait for each other after every operation, and much longer while other
+    programs run.
 
     Args:
         function: Function to call.
         arguments: Arguments of the calls.
-        signal: Tensor on which the function depends. If it is not on a CPU or requires a gradient,
-            the calls are made in this thread, to which the hooks of autograd belong.
+        signal: Tensor on which the function depends. If it is not on a CPU, or its gradient is
+            recorded, the calls are made in this thread, to which the hooks of autograd belong.
 
     Returns:
         Results in the order of the arguments.
@@ -299,7 +300,7 @@ def as_samples(signal: Samples) -> Tensor:
     """Convert samples to a tensor. Arrays are copied.
 
     Args:
-        signal: Tensor, which is returned as it is, or array of floating-point numbers.
+        signal: Tensor, which is returned as it is, or array (or list) of floating-point numbers.
 
     Raises:
         ValueError: The signal is neither a tensor nor such an array, or samples of it are masked.
@@ -331,7 +332,7 @@ def as_samples(signal: Samples) -> Tensor:
 
 
 def as_type_of(signal: Audio, result: Tensor) -> Audio:
-    """Convert a result to an array if the signal is an array, and otherwise return the tensor.
+    """Convert a result to an array or a NumPy number, unless the signal is a tensor.
 
     Args:
         signal: Signal from which the result was computed.

@@ -181,6 +181,14 @@ def test_a_part_that_is_not_finite_leaves_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_more_channels_than_can_be_read_are_rejected(tmp_path: Path) -> None:
+    write_audio(tmp_path / "out.wav", torch.ones(1024, 10), 16000)
+    assert len(read_audio(tmp_path / "out.wav")[0]) == 1024
+    for channels in (1025, 20000):
+        with pytest.raises(ValueError, match="channels to be a whole number from 1 to 1024"):
+            write_audio(tmp_path / "out.wav", torch.ones(channels, 10), 16000)
+
+
 def test_links_are_followed_unless_they_lead_nowhere(tmp_path: Path) -> None:
     corpus, elsewhere = tmp_path / "corpus", tmp_path / "elsewhere"
     for path in (corpus / "ann" / "1.wav", elsewhere / "deep" / "2.wav", elsewhere / "3.wav"):

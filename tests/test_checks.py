@@ -123,6 +123,11 @@ def test_loud_outputs_leave_the_warning_to_the_next_waveform(
         check_waveform(loud, full_scale_spl=94.0)
 
 
+def test_an_integer_that_is_too_large_for_a_float_is_out_of_range() -> None:
+    with pytest.raises(ValueError, match="expected seed"):
+        checks.check_seed(10**400)
+
+
 def test_a_number_of_another_type_is_to_be_converted() -> None:
     expected = r"a whole number from 0 to 4294967295, got .*3.*; convert it: 3"
     with pytest.raises(ValueError, match=expected):

@@ -31,7 +31,7 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
         points: Length of the transform, by default that of the signals.
 
     Raises:
-        ValueError: The signals are in half precision, for which there are no transforms.
+        ValueError: The signals are in half precision, or are integers of less than 32 bits.
 
     >>> rfft(torch.tensor([1.0, 0.0, -1.0, 0.0]))
     tensor([0.+0.j, 2.+0.j, 0.+0.j])
@@ -81,8 +81,9 @@ _ODD_FACTORS = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in 
 def fft_length(minimum: int, multiple: int = 1) -> int:
     """Return the smallest length from ``minimum`` on for which Fourier transforms are fast.
 
-    Apart from the factors of ``multiple``, the length is a product of factors 2, 3, 5 and at most
-    one 7. Factors 2 are added only up to the power ``MAX_POWER_OF_TWO``.
+    Apart from the factors of ``multiple``, the length is a product of factors 2, at most eight
+    factors 3, five factors 5 and one 7. Factors 2 are added only up to the power
+    ``MAX_POWER_OF_TWO``.
 
     Args:
         minimum: Smallest length allowed.

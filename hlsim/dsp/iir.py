@@ -51,7 +51,7 @@ def butterworth(order: int) -> ZerosPoles:
 
 
 def chebyshev2(order: int, attenuation_db: float) -> ZerosPoles:
-    """Return the prototype of a Chebyshev low-pass of the second type, flat below its cut-off.
+    """Return the prototype of a Chebyshev low-pass of type 2, with ripple above its cut-off.
 
     Args:
         order: Order of the filter.

@@ -43,9 +43,10 @@ class Block(NamedTuple):
     def cut_output(self, output: Tensor) -> Tensor:
         """Cut the part that is used out of the result for the samples from ``cut_input``.
 
-        Nothing is cut off the end of the last block, whose result may be longer than its input.
+        Nothing is cut off the end of a block without context after its output, such as the last
+        one, whose result may be longer than its input.
 
-        Shape: (..., time) -> (..., output_stop - output_start), or longer for the last block.
+        Shape: (..., time) -> (..., output_stop - output_start), or longer for such a block.
         """
         is_last = self.output_stop == self.input_stop
         stop = None if is_last else self.output_stop - self.input_start

@@ -80,7 +80,7 @@ class STFT:
 
         Args:
             spectrum: Spectra of the frames.
-            length: Number of samples of the result.
+            length: Number of samples of the result, that of the waveforms that were analysed.
         """
         window = _hann(self.window, like=spectrum)
         margin_before = (self.fft - self.window) // 2

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import hlsim
-from compensators import NALR, load_compensator, save_compensator
+from compensators import NALR, HearingAid, load_compensator, save_compensator
 from compensators.beamformer import AdaptiveBeamformer, BeamformingAid
 from compensators.config import BeamformerConfig
 from compensators.directional import (
@@ -155,6 +155,18 @@ def test_stream_is_the_whole_signal_delayed(build: Callable[[], FilterAndSum]) -
     torch.testing.assert_close(stream.flush(), whole[..., -latency:])
     with pytest.raises(ValueError, match="expected a chunk before flush"):
         stream.flush()
+
+
+def test_stream_without_look_ahead_ends_with_the_rest_of_the_aid() -> None:
+    front_end = FilterAndSum(torch.eye(2).reshape(2, 1, 2, 1).repeat(1, 2, 1, 1) / 2)
+    signals = torch.from_numpy(np.random.default_rng(1).normal(size=(2, 2, 1000))).float()
+    stream = front_end.stream()
+    stream(signals)
+    assert stream.flush().shape == (2, 0)
+    aid = DirectionalAid(front_end, HearingAid())
+    stream = aid.stream(["N2", "N4"])
+    output = torch.cat((stream(signals), stream.flush()), -1)[..., aid.latency :]
+    torch.testing.assert_close(output, aid(signals, ["N2", "N4"]))
 
 
 def test_a_directional_aid_has_a_stream_and_takes_arrays(noise: Tensor) -> None:
