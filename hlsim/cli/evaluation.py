@@ -385,16 +385,16 @@ def _run_study(
 
     The page also has the warnings of the evaluation, once each.
 
-    The notes of the evaluation are printed to stderr, and if scores are missing, their number and
-    the first reason.
+    The notes of the evaluation are printed to stderr, and if scores are missing, the number of
+    outputs without them and the first reason.
 
     Args:
         options: Options of the command. Each becomes an argument of ``evaluate`` under its name,
-            except ``names``, ``out``, ``limit_to_ear`` and ``ucl``; measures of ``--measure`` are
-            appended to ``measures``.
+            except ``run``, ``names``, ``out``, ``limit_to_ear`` and ``ucl``; measures of
+            ``--measure`` are appended to ``measures``.
         evaluate: Function that runs the study and returns its evaluation.
         make_page: Function from the evaluation to its page.
-        notes: Sentences with which the page begins, before those of the evaluation.
+        notes: Sentences for the page, before those of the evaluation.
         changes: Arguments of ``evaluate`` that replace options or are added to them.
     """
     from hlsim.files import check_output_folder

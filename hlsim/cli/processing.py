@@ -101,8 +101,8 @@ def _process(
 ) -> None:
     """Process one file, or each file of a folder, for each ear, and print one line per output.
 
-    A file of a folder that fails causes a warning, which names its output of an earlier run. The
-    others are processed.
+    A file of a folder that fails causes a warning, which names its output of an earlier run, if
+    there is one. The others are processed.
 
     Args:
         options: Options of the command.

@@ -369,7 +369,7 @@ def _aid_outputs(aid: Aid, signals: Iterable[Tensor], ear: Audiogram) -> Tensor:
         ear: Audiogram of the ear.
 
     Returns:
-        Outputs, cut to the length of the signals. Shape: (signals, time).
+        Outputs, cut to the length of the signals if they are longer. Shape: (signals, time).
 
     Raises:
         ValueError: An output is not valid, see ``cut_output``.

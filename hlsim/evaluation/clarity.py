@@ -130,10 +130,11 @@ def evaluate_scenes(
             rate of the first scene.
         scenes: Folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``) with two channels, and
             ``SCENE_target_anechoic_CH1.wav`` (or ``_target_anechoic``, ``_reference``) with one or
-            two. If there is a ``SCENE_target_CH1.wav``, the target in the room, each channel of the
-            reference gets the level of that file, unless the reference is ``_reference``.
-        listeners: Clarity's ``listeners.json``, or a CSV file, see ``read_listeners``. Only
-            listeners that are used are validated.
+            two. If there is a ``SCENE_target_CH1.wav``, or one with the first of ``microphones``
+            as its number, the target in the room, each channel of the reference gets the level of
+            that file, unless the reference is ``_reference``.
+        listeners: Clarity's ``listeners.json``, or a CSV file, see ``read_listeners``. With
+            ``scenes_listeners``, only the listeners in it are validated.
         out: Folder of the results.
         outputs: Folder of existing outputs of an aid, by the label of the aid in tables. The files
             have the challenges' names, see above, two channels, and the sample rate of the scenes.
@@ -149,13 +150,14 @@ def evaluate_scenes(
             challenges' small test.
         enhancers: ``package.module:name`` of functions ``(waveform, sample_rate) -> waveform`` that
             reduce noise, for signals in pascals with shape (..., time). Each adds a condition
-            before NAL-R and before each aid.
+            before NAL-R and before each of ``aids``.
         measures: Further measures: names of hlsim's own, or ``package.module:name`` of yours.
         precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
-        linked: Whether one level sets the gains of both ears. All aids must support it.
+        linked: Whether one level sets the gains of both ears. All ``aids`` must support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
-        listen: Number of scenes with sounds for the players of a page, as an ear perceives them.
+        listen: Number of pairs of scene and listener with sounds for the players of a page, as an
+            ear perceives them.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the
             address of a Dask scheduler; and ``progress``, a function of the numbers of finished
             and of all scores.
@@ -238,7 +240,7 @@ def evaluate_scenes(
 def _read_pairs(
     folder: Path, listeners: str | Path, scenes_listeners: str | Path | None
 ) -> list[_Pair]:
-    """Return the pairs of scene and listener: those of ``scenes_listeners``, or else all, sorted.
+    """Return the pairs of scene and listener: those of ``scenes_listeners``, or else all.
 
     See ``evaluate_scenes`` for the arguments.
 

@@ -38,7 +38,7 @@ class ConditionComparison:
         unit_means: The same statistics over the mean scores of each unit, because items of one
             listener are not independent; None if an item has no unit (an empty text, None or NaN),
             or with fewer than two units.
-        left_out: Number of items that lack one of the two scores.
+        left_out: Number of items that lack at least one of the two scores.
         p_t, p_w: P values of the t-test and of Wilcoxon's test that reports state, adjusted by Holm
             unless the comparison is planned; None if a test is not defined.
         planned: Whether the comparison was planned before the scores were known, so that its p

@@ -99,9 +99,9 @@ def evaluate_compensators(
     at the compensator's level by HASPI is planned, so that its p values are not adjusted for the
     number of comparisons.
 
-    Scores are stored as they become known. An interrupted run can be continued, and a run with one
-    more compensator, or with another simulator, computes only the scores that are missing. An item
-    that lacks a value under any condition is left out of all comparisons.
+    With ``store``, an interrupted run can be continued, and a run with one more compensator, or
+    with another simulator, computes only the scores that are missing. An item that lacks a value
+    under any condition is left out of all comparisons.
 
     Args:
         compensators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
@@ -131,7 +131,7 @@ def evaluate_compensators(
             is passed, they use this ear instead.
         srt: Whether to measure speech reception thresholds in noise by the digit test, too, one
             threshold per ear and aid. Each takes about five seconds, without the time of the aid.
-        seed: Seed of all random draws.
+        seed: Seed of the random draws.
         listen: Number of items with sounds for the players of a page, as the ear perceives them.
         rival: Prescription for the planned comparison: ``"nalr"``, ``"nalrp"``, ``"camfit"``, or
             ``"for-ear"``, which is NAL-RP for ears with a profound loss at 2 kHz, and otherwise
@@ -176,6 +176,8 @@ def evaluate_compensators(
         )
     if root is not None and manifest is None:
         raise ValueError("root (--root) has no effect without a manifest; leave it out")
+    if not compensators:
+        raise ValueError("expected one or more compensators, got none; pass them by their names")
     for name, aid in compensators.items():
         check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
@@ -296,7 +298,7 @@ def _read_scene_clips(manifest: str | Path, root: str | Path | None, seconds: fl
 
     Raises:
         ValueError: The manifest is not valid or has no scenes in these splits, a scene has no noisy
-            recording, its files are not valid, or scenes differ in their number of ears.
+            recording, the first one is not valid, or scenes differ in their number of ears.
     """
     folder = Path(manifest).parent if root is None else Path(root)
     rows = read_manifest(manifest, root)

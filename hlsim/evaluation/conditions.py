@@ -61,7 +61,8 @@ _LOWEST_GAIN_DB = -100.0
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
 """Gains in dB of the 24 bands of each equaliser for each ear, by equaliser and ear.
 
-Each task of a study gets a new copy of the equaliser, so the gains are kept in the process.
+In another process, each task of a study gets a new copy of the equaliser, so the gains are kept in
+the process.
 """
 
 
@@ -386,8 +387,8 @@ def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
         an earlier enhancer has the same part.
 
     Raises:
-        ValueError: An enhancer cannot be loaded, or its output for speech is not a waveform or not
-            time-aligned.
+        ValueError: An enhancer cannot be loaded, fails, or its output for speech has another shape,
+            or is silent, not finite or not time-aligned.
 
     >>> load_enhancers([])
     {}

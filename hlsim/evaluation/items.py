@@ -167,7 +167,7 @@ def draw_scene_items(
     seed: int,
     levels: Sequence[float] = INPUT_LEVELS,
 ) -> list[Item]:
-    """Draw items out of recorded scenes with several microphones, each for one of the ears.
+    """Draw items out of recorded scenes, each for one of the ears.
 
     The items cycle through the ears, and the clean speech at the item's ear through the levels. Of
     scenes for two ears, half of the items of an ear are mirrored, so that their ear, the first one,
@@ -182,7 +182,7 @@ def draw_scene_items(
         ``draw_aid_items``, with ``speech`` always noisy and an unknown SNR (NaN).
 
     Raises:
-        ValueError: A number is out of range, or a file cannot be used.
+        ValueError: A number is out of range, or no scene can be used.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
     >>> from hlsim.data.recorded_scenes import SceneFiles
@@ -241,9 +241,9 @@ def _warn_of_silence(items: Sequence[Item]) -> None:
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     """Return names and audiograms of the ears N2 to N6 and S1 to S3, and of those in a CSV file.
 
-    The name of an ear in the file consists of its columns ``listener`` and ``ear``, and of the
-    number of its row if another ear has this name, or if both columns are empty. A row with the
-    name and the thresholds of an earlier ear is left out.
+    The name of an ear in the file consists of its columns ``listener`` and ``ear``, and of its
+    number in the file, as ``row 3``, if an earlier ear has this name, or if both columns are empty.
+    An ear with the name and the thresholds of an earlier one is left out.
 
     Args:
         audiograms: CSV file of ears, see ``read_audiograms``, or None.
@@ -320,7 +320,8 @@ def apply_treatments(
     pairs = [*product(items, treatments)]
     for item, treatment in track(pairs, "inputs", len(pairs)):
         with torch.no_grad():
-            signal = functions[treatment](item.signal, item.ear)
+            # A compensator that changes its input in place must not change the item.
+            signal = functions[treatment](item.signal.clone(), item.ear)
         facts = {**item.facts, "treatment": treatment}
         treated.append(replace(item, signal=signal, facts=facts))
     return treated

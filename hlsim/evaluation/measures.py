@@ -1,7 +1,7 @@
 """Measures of a study: scores of speech for an ear, levels, loudness errors, and your own.
 
 A measure is a function of an ``Item`` and of the output of a condition. It returns a dict from
-columns of the study's table to numbers.
+columns of the study's table to values.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -204,8 +204,8 @@ def load_measure(name: str) -> Measure:
 
     The function is not tried: one that returns something else fails in the study. Its values are
     stored only if it has the attribute ``fingerprint``, such as a version, which you change with
-    its code. Those of a module (``nn.Module``) whose attributes can be hashed are
-    stored without it.
+    its code. Those of a module (``nn.Module``) with tensors or an attribute ``config`` are stored
+    without it if its attributes can be hashed.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.
@@ -322,8 +322,8 @@ minus the level that a normal ear perceives of the input with its noise. ``band_
 ``loss_msbg`` compare the perceived output with clean speech as a normal ear perceives it:
 ``band_error`` is the median absolute difference in level over those frames and bands (of 24) in
 which the normal ear hears the clean speech, ``loss_msbg`` the value of
-``HearingLossLoss(criterion="bands")``. ``peak`` is the largest magnitude of the output in dB
-relative to 20 micropascals.
+``HearingLossLoss(simulator="msbg", criterion="bands")``. ``peak`` is the largest magnitude of the
+output in dB relative to 20 micropascals.
 """
 
 

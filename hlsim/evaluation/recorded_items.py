@@ -206,7 +206,7 @@ class RecordedItem:
 def _file_hash(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal.
 
-    The file is read again only if its size or its times have changed.
+    A file whose size and times have not changed is not read again, for up to 65536 files.
     """
     state = path.stat()
     # Copying may set the time of modification, but not that of the change.
@@ -282,7 +282,8 @@ def read_folders(
 def read_named_ears(audiograms: Any) -> list[tuple[str, str, Audiogram]]:
     """Return name of the listener, name of the ear and audiogram of each ear of a table.
 
-    The listener of a row without a name is called ``row 3``, by the number of the row.
+    The listener of an ear without a name is called ``row 3``, by the number of the ear in the
+    table.
 
     Args:
         audiograms: Table of ears, see ``read_audiograms``, or Clarity's ``listeners.json``.
@@ -355,7 +356,7 @@ def read_recordings(
         ValueError: A file cannot be read, a required column is missing, there is a column ``spl``
             (pass the argument ``spl`` instead), the names of two listeners or conditions differ
             only in case, a listener is unknown, or a row is not valid; for a row, the message names
-            the line.
+            its place.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -434,7 +435,7 @@ def _read_row(
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recording.
 
     Raises:
-        ValueError: A value is missing or not understood, or the ear is given twice or not at all.
+        ValueError: A value is missing or not valid, or the ear is given twice or not at all.
     """
     for column in _REQUIRED_COLUMNS:
         if not row[column]:

@@ -100,16 +100,16 @@ def haspi_report(
             and of all scores.
 
     Returns:
-        The evaluation. The comparison of the last condition with the first, or with ``baseline``,
-        by the first measure counts as planned before the scores were known, so its p values are
-        not adjusted.
+        The evaluation. The comparison of the first condition, or ``baseline``, with the last of the
+        others by the first measure counts as planned before the scores were known, so its p values
+        are not adjusted.
 
     Raises:
         ValueError: Folders, manifest and ears do not go together, files do not match, a row of
             the manifest is not valid, ``better_ear`` is set and an utterance lacks an ear or has
-            other speech at it, there is no such measure, precision or baseline, or nothing could
-            be scored.
-        MissingExtraError: pandas, joblib or the package of a measure is not installed.
+            other speech at it, there is no such measure, precision or baseline, no scheduler
+            answers, the store cannot be written, or nothing could be scored.
+        MissingExtraError: A package is not installed.
         OSError: The store of scores cannot be read.
 
     >>> from hlsim.data.bundled import EXAMPLE_FILE
@@ -204,7 +204,7 @@ def score_recordings(
         ValueError: There is no such measure or precision, nothing could be scored, or
             ``better_ear`` is set and an utterance lacks an ear or has different speech for both
             ears.
-        MissingExtraError: pandas, joblib or the package of a measure is not installed.
+        MissingExtraError: A package is not installed.
         OSError: The store of scores cannot be read.
 
     >>> from hlsim import Audiogram
@@ -300,9 +300,9 @@ def _better_ears(table: DataFrame, utterances: Sequence[int], scores: Sequence[s
 
     Each score is the higher one of both ears, so different scores may come from different ears. A
     score is missing if one ear lacks it, because the other one may be the worse ear; the column
-    ``failure`` then has the reasons of both ears. All other values of the row come from one ear:
-    the better one by the first score that both ears have, or the left one if this score is equal or
-    there is none.
+    ``failure`` then has the reasons of both ears. Other values of the row that depend on the
+    condition come from one ear: the better one by the first score that both ears have, or the left
+    one if this score is equal or there is none.
 
     Args:
         table: Table of ``run_study`` for recordings of both ears of each utterance.
@@ -374,7 +374,7 @@ def _describe_lags(table: DataFrame) -> list[str]:
     ]
     return [
         f"{len(late)} of {len(table)} outputs are later (+) or earlier (-) than their clean speech "
-        f"by more than {LATE_MS:g} ms: {', '.join(counts)}. STOI, MBSTOI and losses fall with such "
-        "a lag; HASPI, HASQI and HAAQI align the signals themselves. Shift the files before "
-        "scores are compared. The lag is that of the largest cross-correlation."
+        f"by more than {LATE_MS:g} ms: {', '.join(counts)}. STOI and MBSTOI fall with such a lag, "
+        "and losses rise; HASPI, HASQI and HAAQI align the signals themselves. Shift the files "
+        "before scores are compared. The lag is that of the largest cross-correlation."
     ]

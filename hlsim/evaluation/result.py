@@ -56,9 +56,9 @@ class Evaluation:
         measures: Measures that score every output.
         table: Table with one row per item and condition, see ``run_study``.
         comparisons: Comparisons of two conditions by one measure each, see ``compare``.
-        settings: Settings on which the values depend, such as the seed, each under its name. They
-            are written to ``report.json``.
-        notes: Sentences with which the page of the evaluation begins.
+        settings: Settings of the study, such as the seed, each under its name. They are written to
+            ``report.json``.
+        notes: Sentences for the first section of the page.
         details: Further results for ``report.json`` and the page, such as gain curves, each under
             its name.
         groups: Evaluations of parts of the items, such as noisy speech, by the name of the part.
@@ -124,8 +124,8 @@ class Evaluation:
 
         Args:
             columns: Names of the columns. A column that the table lacks has no values.
-            predicate: Predicate of the sentence that begins with "none of the items". The message
-                also has the reason of the first failure.
+            predicate: Predicate of the sentence that begins with "none of 5 items", if there are
+                failures. The message also has the reason of the first one.
         """
         if not self.table.reindex(columns=columns).isna().all(axis=None):
             return
@@ -181,6 +181,9 @@ class Evaluation:
         """Return a column of the table, such as ``"haspi"``, with one column per condition.
 
         The result has one row per item, and NaN where a value is missing.
+
+        Raises:
+            KeyError: There is no such column.
         """
         table = self.table.pivot(index="item", columns="condition", values=column)
         return table.reindex(columns=self.names)
@@ -199,6 +202,7 @@ class Evaluation:
 
         Raises:
             ValueError: No item has both scores.
+            KeyError: The table lacks HASPI, or there is no such condition.
         """
         scores = self.wide("haspi").dropna(subset=[before, after]).clip(0.0, 1.0)
         return words_change(scores[before].to_numpy(), scores[after].to_numpy())

@@ -53,8 +53,8 @@ def evaluate_simulators(
 ) -> Evaluation:
     """Compare simulators with a teacher, whose output they should match: the exact MSBG by default.
 
-    Values are stored as they become known. An interrupted run can be continued, and a run with one
-    more simulator computes only its values.
+    With ``store``, an interrupted run can be continued, and a run with one more simulator computes
+    only its values.
 
     Args:
         simulators: Simulators by their label in tables: names, folders, or modules at 16 kHz and 94

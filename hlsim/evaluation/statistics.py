@@ -17,7 +17,7 @@ MIN_ITEMS_FOR_INTERVAL = 6
 """Smallest number of items with an interval. With fewer, Wilcoxon's p cannot fall below 0.05."""
 
 _RELATIVE_TOLERANCE = 1e-7
-"""Share of the largest score up to which differences count as zero, because scores are float32."""
+"""Share of the largest magnitude up to which differences are zero, because scores are float32."""
 
 _ROUNDING = {np.float32: 2.0**-24, np.float64: 2.0**-53}
 """Largest relative difference between a decimal number and its nearest float of each type."""
@@ -28,7 +28,7 @@ class PairedComparison:
     """Statistics of two scores per item, before and after a treatment.
 
     A difference is the score after minus the score before. Differences up to 1e-7 of the largest
-    score count as zero. Values that the data do not define are None: with one item, all but the
+    magnitude count as zero. Values that the data do not define are None: with one item, all but the
     counts, the means and ``delta``; with equal differences, ``t``, ``p_t`` and ``cohens_d``; and if
     all differences are zero, ``w`` and ``p_w``.
 

@@ -33,7 +33,7 @@ from hlsim.evaluation.running.parallel import (
     run_parallel,
 )
 from hlsim.evaluation.running.store import ScoreStore
-from hlsim.extras import require
+from hlsim.extras import MissingExtraError, require
 from hlsim.metrics.pair import common_length
 from hlsim.progress import track
 from hlsim.torchtools import one_thread
@@ -147,8 +147,8 @@ class Item:
 
         Args:
             name: Name of the value, such as ``"reference"``.
-            compute: Function without arguments that computes the value. Only the first call with a
-                name calls it, and the item stores the result.
+            compute: Function without arguments that computes the value. The item stores the result
+                for later calls with the name.
         """
         if name not in self._computed:
             self._computed[name] = compute()
@@ -199,8 +199,8 @@ class Condition:
             The output, (time,). It is not validated here, but by ``cut_output``.
 
         Raises:
-            ValueError: There is neither a function nor a recorded output, or its file cannot be
-                read. Functions of a user may raise other errors.
+            ValueError: There is neither a function nor a recorded output, or its file is not
+                valid. Functions of a user may raise other errors.
         """
         if self.process is None:
             if item.recorded is None:
@@ -249,10 +249,19 @@ class Measure:
         """Hash of the packages' versions and of ``settings``, or None if the settings are unknown.
 
         Values are stored only if it is known.
+
+        Raises:
+            MissingExtraError: A package is not installed.
         """
         if self.settings is None:
             return None
-        return value_hash([[metadata.version(name) for name in self.packages], self.settings])
+        try:
+            versions = [metadata.version(name) for name in self.packages]
+        except metadata.PackageNotFoundError as error:
+            raise MissingExtraError(
+                f"the measure {self.name} requires {error.name}, which is not installed; install it"
+            ) from error
+        return value_hash([versions, self.settings])
 
 
 class _Task(NamedTuple):
@@ -569,7 +578,7 @@ def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
         sample_rate: Sample rate in Hz.
 
     Raises:
-        ValueError: The output is complex or of whole numbers, has other leading dimensions, differs
+        ValueError: The output is no floating-point tensor, has other leading dimensions, differs
             in length by more than 0.1 s, or has samples that are not finite.
 
     >>> cut_output(torch.ones(1601), torch.ones(1600), 16000).shape

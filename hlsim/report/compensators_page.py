@@ -117,7 +117,7 @@ _DIGITS = (
 def compensators_page(evaluation: Evaluation) -> Page:
     """Return the page of ``evaluate-compensator``.
 
-    Its sections are scores, sounds, gains, digits in noise if their thresholds were measured,
+    Its sections are scores, sounds and digits in noise if there are any, gains,
     "Could it be worn?" and details. The players have items of the first group, which is clean
     speech if there is any.
 

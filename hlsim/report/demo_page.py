@@ -44,9 +44,9 @@ _ABOUT_PICTURES = (
 
 
 def demo_page(evaluation: Evaluation) -> Page:
-    """Return the page of ``hlsim demo``: verdict, sounds, pictures, details and three numbers.
+    """Return the page of ``hlsim demo``: verdict, sounds, pictures, scores, details and cards.
 
-    The numbers are HASPI, the share of words understood and the loudness error.
+    The cards are HASPI, the share of words understood and the loudness error.
 
     Args:
         evaluation: Evaluation of ``evaluate_trained_aid``.

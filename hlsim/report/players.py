@@ -24,7 +24,7 @@ from hlsim.report.page import (
 _PEAK = 0.9  # largest sample of the sounds of a group
 _VISIBLE_SPL = 10.0  # level of a bin above which its colour can be told from black
 _VISIBLE_SHARE = 0.005  # share of visible bins below which a spectrogram looks black
-_HIGHEST_HZ = 8000.0  # at which MSBG and HASPI end
+_HIGHEST_HZ = 8000.0  # at which audiograms and HASPI's filters end
 
 _EXPLANATION = (
     "What the impaired ear perceives, by MSBG. The goal is what a normal ear perceives of the "
@@ -39,7 +39,7 @@ def listening_sections(evaluation: Evaluation, about: str = _EXPLANATION) -> lis
         evaluation: Evaluation of the page, whose attribute ``sounds`` is played.
         about: Sentences about the sounds.
 
-    Returns: A list with the section, or an empty list if no item has sounds.
+    Returns: A list with the section, or an empty list if ``sounds`` is empty.
 
     >>> from hlsim import Audiogram
     >>> from hlsim.evaluation.result import ItemSounds
@@ -76,7 +76,7 @@ def make_player(groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int) ->
 
     All sounds of a group have one gain, so that their loudness can be compared. Groups have
     different gains, because the output of an aid is much louder than what the ear perceives of it.
-    If a group is played softer than the first one, its heading says by how many dB.
+    If a group is played over 0.5 dB softer than the first one, its heading says by how many dB.
 
     Args:
         groups: Signals in pascals, as a dict from the heading of a group, which may be empty, to a

@@ -83,7 +83,8 @@ def simulators_page(evaluation: Evaluation) -> Page:
     >>> simulators_page(evaluation).verdict[:48]
     'Speech as it is: exact has a median SNR of 200.0'
     """
-    sections, details = [], []
+    sections: list[Section] = []
+    details = []
     for treatment, group in evaluation.groups.items():
         title = _TREATMENTS[treatment]
         caption = "Simulators side by side"
@@ -92,7 +93,8 @@ def simulators_page(evaluation: Evaluation) -> Page:
         if group.comparisons:
             caption = "SNR compared with the first; p adjusted by Holm"
             comparisons.append(comparison_table(group.comparisons, caption))
-        sections.append(Section(title, tables=[table, *comparisons]))
+        notes = [] if sections else evaluation.notes
+        sections.append(Section(title, notes, [table, *comparisons]))
         details.append(Section(title, tables=fact_tables(group.table, COLUMNS, _FACTS)))
     sections += listening_sections(evaluation, _LISTEN)
     sections.append(detail_section(evaluation, details, [_about(evaluation)]))

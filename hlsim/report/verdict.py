@@ -17,11 +17,11 @@ _LEVEL_TOLERANCE_DB = 1.0
 def verdict(c: ConditionComparison, subject: str = "", rival: str = "", noun: str = "item") -> str:
     """Return a sentence that says which condition is better, with scores and p values.
 
-    If each test that is defined has a p value below 0.05, the condition ``after`` "is better" or
-    worse than ``before``; if only one of two tests has, it "may be". If none has, the conditions
-    "cannot be distinguished". If the output levels differ by 1 dB or more or are not known, the
-    sentence says that the condition "scores higher" or lower instead, because HASPI rises with
-    gain.
+    If each test that counts has a p value below 0.05, the condition ``after`` "is better" or worse
+    than ``before``; if only one of two tests has, it "may be". If none has, the conditions "cannot
+    be distinguished". A test counts if it is defined and its p value can be below 0.05. If the
+    output levels differ by 1 dB or more or are not known, the sentence says that the condition
+    "scores higher" or lower instead, because HASPI rises with gain.
 
     Args:
         c: Comparison of two conditions.

@@ -159,10 +159,10 @@ class TrainingData:
         )
 
     def identity(self) -> str:
-        """Compute a hash of all recordings and ears, in hexadecimal, for a training's record.
+        """Compute a hash of the recordings and ears, in hexadecimal, for a training's record.
 
         A training resumes only with the same hash. See ``hash_source`` for what is read of large
-        corpora.
+        corpora. The clean speech of scenes counts only as a part of ``speech``.
 
         Raises:
             ValueError: A folder does not exist or contains no audio, or a table is not valid.
@@ -273,9 +273,8 @@ class _CompensatorBatches(_RandomBatches):
     """Batches for a compensator: clean or noisy speech, tones and clicks.
 
     Raises:
-        ValueError: The recipe's network has other microphones than the scenes, or several
-            microphones for which there are no scenes, or a batch has no second voice for random
-            scenes.
+        ValueError: The recipe's network has several microphones, but the scenes have others or
+            there are none for them, or a batch has no second voice for random scenes.
     """
 
     recipe: CompensatorRecipe

@@ -179,6 +179,7 @@ def train_compensator(
     Raises:
         ValueError: The data, the recipe or the simulator is invalid, there is an ``audiogram``
             although the data have ears, or the training fails, see ``train_network``.
+        TypeError, KeyboardInterrupt: See ``train_network``.
 
     >>> def train_and_load(speech: str, out: str) -> nn.Module:
     ...     data, recipe = TrainingData(Path(speech)), CompensatorRecipe(steps=1000)

@@ -30,10 +30,10 @@ class TrainingRecipe:
             has the settings of the checkpoint. It is saved as the best network until training finds
             a better one.
         steps: Number of training steps, 1 or more. The learning rate falls over them.
-        batch: Number of clips per step, 1 or more.
+        batch: Number of clips per step and device, 1 or more.
         seconds: Duration of each clip in seconds, above 0 and at most 600.
         learning_rate: Highest learning rate of the optimiser, AdamW, above 0.
-        weights: Weight under the name of each criterion, 0 or more, of which one is above 0.
+        weights: Weight under the name of each criterion, 0 or more, at least one of them above 0.
         levels: Lowest and highest level of the speech in dB SPL.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1.
         validate_every: Number of steps between validations, 1 or more.
@@ -103,8 +103,8 @@ class SimulatorRecipe(TrainingRecipe):
         weights: Weights of ``snr``, ``log_spectrum`` and ``levels`` (of bands, where the input is
             audible), all in dB / 10; of ``gradient``, 1 minus the cosine of the gradients through
             the network and through the teacher; and of the paper's ``magnitude``, ``phase``,
-            ``complex`` and ``time``. Gradients are compared in every third step, and such a step
-            takes three to four times as long.
+            ``complex`` and ``time``. Gradients are compared in every third step (in all, without
+            another criterion), and such a step takes three to four times as long.
         unit_power: Signal that is scaled to unit power, ``truth`` or ``input``. Estimate and target
             are multiplied by the same factor before all criteria but ``levels`` and ``gradient``.
             ``truth`` is the target, with which soft items count as much as loud ones. ``input`` is
@@ -167,9 +167,9 @@ class CompensatorRecipe(TrainingRecipe):
             (``seconds``); ``denoising`` and ``intelligibility`` require noise or recorded scenes.
         sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
             them, a network learns that steady sounds are noise.
-        equalised: Share of clips of speech, and of noise, that are equalised at random by up to 15
-            dB, from 0 to 1. A few voices have few spectra, and the gains for other voices would be
-            up to 20 dB wrong.
+        equalised: Share of clips of speech, and of noise outside random scenes, that are equalised
+            at random by up to 15 dB, from 0 to 1. A few voices have few spectra, and the gains for
+            other voices would be up to 20 dB wrong.
         noisy: Share of noisy clips among those of speech, if there is noise, from 0 to 1. In random
             scenes it is that of all clips, and the others have an SNR of 60 dB.
         babble: Share of noisy clips whose noise consists of other voices of the batch, at most

@@ -61,10 +61,10 @@ class SimulatorTraining(TrainingModule):
     def compute_loss(self, batch: Batch) -> Tensor:
         """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria.
 
-        The criterion ``gradient`` takes part in every third step only.
+        The criterion ``gradient`` takes part in every third step only, unless it is the only one.
         """
         weights = {name: weight for name, weight in self.recipe.weights.items() if weight}
-        if self.global_step % _GRADIENT_INTERVAL:
+        if self.global_step % _GRADIENT_INTERVAL and len(weights) > 1:
             weights.pop("gradient", None)
         compares_gradients = "gradient" in weights
         signal = batch["signal"].detach().requires_grad_(compares_gradients)
@@ -143,6 +143,7 @@ def train_simulator(
     Raises:
         ValueError: The data, the recipe or the teacher is invalid, or the training fails, see
             ``train_network``.
+        TypeError, KeyboardInterrupt: See ``train_network``.
 
     >>> from hlsim import load_pretrained
     >>> def train_and_load(speech: str, out: str) -> NeuroMSBG:

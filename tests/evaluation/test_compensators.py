@@ -263,6 +263,7 @@ def test_the_gap_is_undefined_without_a_loss(options: dict[str, Any]) -> None:
 
 def test_invalid_settings_are_rejected(options: dict[str, Any]) -> None:
     for changes in (
+        {"compensators": {}},
         {"compensators": {"NAL-R": Unaided()}},
         {"compensators": {"mine": NALR(sample_rate=44100)}},
         {"compensators": {"mine": NALR(full_scale_spl=100.0)}},

@@ -145,6 +145,10 @@ def test_treatments(speech_dir: Path, ears_file: Path) -> None:
     as_is, louder, amplified, compressed, compensated = (item.signal for item in treated)
     assert torch.equal(as_is, drawn[0].signal) and torch.equal(compensated, 0.5 * as_is)
     assert float(level_spl(louder)) == pytest.approx(85.0, abs=0.01)
+    in_place = torch.nn.Module()
+    in_place.forward = lambda waveform, ear: waveform.mul_(0.5)  # type: ignore[method-assign]
+    apply_treatments(drawn, ["compensated"], in_place)
+    assert torch.equal(as_is, drawn[0].signal) and torch.equal(compensated, 0.5 * as_is)
     assert torch.equal(amplified, NALR(drawn[0].ear)(as_is))
     before, after = (
         signal.unfold(0, 400, 400).square().mean(-1).log10() for signal in (as_is, compressed)

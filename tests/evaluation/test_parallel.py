@@ -64,6 +64,16 @@ def test_a_process_that_ends_costs_only_its_task(
 
 
 @pytest.mark.slow  # as above
+def test_a_single_core_is_no_reason_to_run_in_this_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
+    results = list(run_parallel(process_of, [5, 7], in_processes=True))
+    assert [task for task, _ in results] == [5, 7]
+    assert all(process != os.getpid() for _, (_, process) in results)  # type: ignore[misc]
+
+
+@pytest.mark.slow  # as above
 def test_warnings_of_other_processes_are_repeated() -> None:
     with pytest.warns(UserWarning, match="the number is 7"):
         assert list(run_parallel(warn_of, [5, 7], jobs=2)) == [(5, 5), (7, 7)]

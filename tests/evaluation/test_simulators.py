@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,9 @@ def test_values_failures_and_page(options: dict[str, Any]) -> None:
     (comparison,) = study.groups["as-is"].comparisons
     assert (comparison.before, comparison.after) == ("light", "none")
     assert comparison.overall.delta < -10.0
-    page = simulators_page(study)
+    page = simulators_page(replace(study, notes=["3 items end in silence."]))
+    paragraphs = [section.paragraphs for section in page.sections[:2]]
+    assert paragraphs == [["3 items end in silence."], []]
     assert page.verdict.startswith("Speech as it is: light has a median SNR")
     titles = [section.title for section in page.sections[:3]]
     assert titles == ["Speech as it is", "20 dB louder", "Listen"]

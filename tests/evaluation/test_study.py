@@ -18,6 +18,7 @@ from hlsim import Audiogram
 from hlsim.evaluation import Condition, Item, Measure, ScoreStore, run_study
 from hlsim.evaluation.conditions import Enhanced, PluginAid, Unaided
 from hlsim.evaluation.measures import load_measure
+from hlsim.extras import MissingExtraError
 from hlsim.plugins import WaveformPlugin
 
 pytest.importorskip("pandas")
@@ -363,6 +364,12 @@ def test_scores_of_recorded_outputs_are_stored_by_the_output(items: list[Item]) 
         table = run_study([item], conditions, measures, store=store, jobs=1)
         assert table["peak"].tolist() == pytest.approx([0.1, 0.2, 0.8])
         assert CALLS.count("peak") == calls
+
+
+def test_a_measure_whose_package_is_missing_is_rejected(items: list[Item]) -> None:
+    measure = Measure("mine", lambda item, output: {"mine": 0.0}, ["no-such-package"])
+    with pytest.raises(MissingExtraError, match="measure mine requires no-such-package"):
+        run_study(items, [Condition("unaided", Unaided())], [measure], jobs=1)
 
 
 def test_a_condition_without_a_function_needs_recorded_outputs(items: list[Item]) -> None:

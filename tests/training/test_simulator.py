@@ -112,6 +112,14 @@ def test_the_cosine_of_gradients_is_one_for_the_teacher_and_trains_a_network(
     check_gradients(SimulatorTraining(recipe, MSBG()), batch)
 
 
+def test_gradients_alone_are_compared_in_every_step(
+    data: TrainingData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SimulatorTraining, "global_step", 1)
+    recipe = replace(SMALL, model={"channels": 4}, weights={"gradient": 1.0})
+    check_gradients(SimulatorTraining(recipe, MSBG()), training_batch(data, recipe))
+
+
 class Fixed(torch.nn.Module):
     """Teacher without a gradient."""
 

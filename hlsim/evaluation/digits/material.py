@@ -106,7 +106,7 @@ def present(triplets: Triplets, snr: Tensor, noise_spl: float | Tensor) -> Tenso
         noise_spl: Level of the noise in dB SPL, for all triplets or per triplet.
 
     Returns:
-        Samples in pascals at 16 kHz, of the shape of the digits.
+        Samples in pascals at 16 kHz, in the shape of ``triplets.speech``.
 
     >>> triplets = draw_triplets(1, torch.Generator().manual_seed(0))
     >>> present(triplets, torch.tensor([0.0]), 65.0).shape

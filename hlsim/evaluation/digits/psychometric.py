@@ -62,9 +62,9 @@ def estimate_threshold(snr: Array, right: Array) -> Estimate:
         right: Number of digits of each triplet that were recognised, (triplets,).
 
     Returns:
-        The threshold in dB, the mean of its posterior distribution over -27 to 37 dB, with its 95 %
-        interval. All three are infinite if the mean is above 32 dB, the highest signal-to-noise
-        ratio of the test.
+        The threshold in dB, the mean of its posterior distribution over -27 to 36.8 dB, with its
+        95 % interval. All three are infinite if the mean is above 32 dB, the highest
+        signal-to-noise ratio of the test.
 
     >>> snr = np.linspace(-20.0, 20.0, 200)
     >>> estimate = estimate_threshold(snr, np.where(snr > 0.0, 3.0, 0.0))

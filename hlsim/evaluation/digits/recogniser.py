@@ -53,8 +53,8 @@ class DigitListener(nn.Module, HubModel):
     """Recogniser of digits in what an ear perceives, which knows when each digit begins.
 
     It computes the level every 10 ms in frequency bands. The part of each digit, a picture of bands
-    by frames, loses its mean, so that the overall level has no influence. Three convolutions and a
-    linear layer compute from a picture one score for each of the ten digits.
+    by frames, loses its mean, so that the overall level has hardly any influence. Three
+    convolutions and a linear layer compute from a picture one score for each of the ten digits.
 
     Args:
         config: Sizes of the network; by default ``DigitListenerConfig()``.
@@ -125,7 +125,7 @@ class DigitListener(nn.Module, HubModel):
 def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
     """Load a trained listener, in evaluation mode and without gradients of its weights.
 
-    Later calls with the same name return the same object.
+    Later calls with the same argument return the same object.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.

@@ -171,8 +171,8 @@ class DigitTest:
             The threshold with its 95 % interval. All three are infinite above 32 dB.
 
         Raises:
-            ValueError: The output of the aid is no floating-point tensor, has another shape, or is
-                not finite.
+            ValueError: The simulator rejects the ear, or the output of the aid is no floating-point
+                tensor, has another shape, or is not finite.
         """
         count = len(self.material.digits)
         snr, right = np.zeros(count), np.zeros(count)
@@ -282,6 +282,7 @@ def reception_threshold(
             sliders without an aid, the aid was built for another rate or level or has several
             microphones, or its output is no floating-point tensor, has another shape or is not
             finite.
+        TypeError: The aid does not take one of the sliders.
 
     >>> import hlsim
     >>> result = hlsim.reception_threshold("N3", "nalr", simulator="attenuation", triplets=30)

@@ -2,11 +2,10 @@
 
 A score is computed again if its key is not in the store (``run_measures`` of ``study.py``).
 
-The fingerprint of a module covers everything on which its outputs depend: class names, settings and
-tensors and, for a class outside hlsim and torch, the file with its source code. The code of hlsim
-has a hash of its own, ``code_version``, which is part of the key of each stored score. Authors of
-modules outside hlsim may add an attribute ``fingerprint``, such as a version, which they change
-when the outputs change.
+The fingerprint of a module covers class names, settings and tensors and, for a class outside hlsim
+and torch, the file with its source code. The code of hlsim has a hash of its own, ``code_version``,
+which is part of the key of each stored score. Authors of modules outside hlsim may add an attribute
+``fingerprint``, such as a version, which they change when the outputs change.
 """
 
 import dataclasses
@@ -75,7 +74,7 @@ def fingerprint(processing: Any) -> str | None:
         for a function without the attribute ``fingerprint``, for a module outside hlsim with
         neither tensors nor an attribute ``config``, for a class without a source file, for a module
         with an attribute that cannot be hashed, such as a lambda, and for a module of hlsim that
-        contains one of these.
+        contains one of these, unless it is one of torch's or Python's own.
 
     >>> fingerprint(nn.Linear(2, 2)) == fingerprint(nn.Linear(2, 2))  # random weights
     False
@@ -117,10 +116,10 @@ def value_hash(value: Any) -> str:
     """Compute the SHA-256 of a value in hexadecimal, the same in every process.
 
     Args:
-        value: Text, number, list, or dict (in any order), nested as you like, with tensors, arrays,
-            dataclasses, modules with a fingerprint, and functions and classes. Of a function or
-            class of hlsim or torch, only the name counts; of another one, also its attribute
-            ``fingerprint`` or the file with its source code.
+        value: Text, number of Python, list, or dict (in any order), nested as you like, with
+            tensors, arrays, dataclasses, modules with a fingerprint, and functions and classes. Of
+            a function or class of hlsim or torch, only the name counts; of another one, also its
+            attribute ``fingerprint`` or the file with its source code.
 
     Raises:
         TypeError: The value contains something else, such as a lambda or another function within a

@@ -24,9 +24,9 @@ CRASH = "the process ended, after a crash in compiled code or because memory ran
 """Reason why a task has no result after a ``Crash``."""
 
 _TASKS_IN_FLIGHT = 8
-"""Number of tasks per process that are repeated one by one after a process has ended.
+"""Number of tasks per core that are repeated one by one after a process has ended.
 
-The task that ended it is among them.
+The task that ended it is usually among them.
 """
 
 
@@ -93,7 +93,9 @@ def run_parallel(
         call = joblib.delayed(partial(_call_and_record, function))
         calls = [call(task) for task in tasks]
         finished = 0
-        alone = len(tasks) if in_processes and jobs == 1 else 0
+        # With one process, such as on a single core, joblib computes in this one.
+        is_sequential = dask is None and joblib.effective_n_jobs(jobs or -1) == 1
+        alone = len(tasks) if in_processes and is_sequential else 0
         while finished < len(tasks):
             if not alone:
                 results = pool(calls[finished:])
