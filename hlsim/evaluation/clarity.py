@@ -411,10 +411,14 @@ def _make_conditions(
             conditions.append(Condition(f"{prefix} + {label}", process, "enhanced", label))
         kind = "prescription" if label == NAL_R else "aid"
         conditions.append(Condition(label, aid, kind))
-    names = [_folder_name(condition) for condition in conditions]
+    # Some file systems do not distinguish upper and lower case.
+    names = [_folder_name(condition).casefold() for condition in conditions]
     for folder in names:
         if names.count(folder) > 1:
-            raise ValueError(f"two labels would have the same folder, {folder}; rename one of them")
+            raise ValueError(
+                f"two labels would have the same folder, {folder}, where file names ignore case; "
+                "rename one of them"
+            )
     return [*conditions, *(Condition(label) for label in folders)]
 
 

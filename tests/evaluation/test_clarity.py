@@ -405,6 +405,7 @@ LEFT_EAR_ONLY = {"L0001": {**EAR, "audiogram_levels_r": None}}
         ({"scenes": "one output", "listeners": {"1": EAR, "L_1": EAR}}, "be the same file, S_L_1_"),
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "the same folder"),
+        ({"aids": {"mine": "wdrc", "Mine": "wdrc"}}, "the same folder, mine, where"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"aids": {"a": "torch:neg"}, "linked": True}, "torch:neg has no setting linked"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
