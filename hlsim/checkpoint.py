@@ -2,10 +2,10 @@
 
 A folder has three files: the weights (``model.safetensors``), the settings of the model with hashes
 (``config.json``) and a model card (``README.md``). A fourth file, ``model.older.safetensors``,
-exists while a model replaces an older one. The weights are those whose hash is in ``config.json``,
-so that one of the two models can be loaded at any time. No pickles are read or written, so that
-loading runs no code of the folder. The *kind* of a checkpoint, such as ``neuro-msbg`` or
-``hearing-aid``, names the class of the saved model.
+exists while a model replaces an older one, or after this was interrupted. The weights are those
+whose hash is in ``config.json``, so that one of the two models can be loaded at any time. No
+pickles are read or written, so that loading runs no code of the folder. The *kind* of a checkpoint,
+such as ``neuro-msbg`` or ``hearing-aid``, names the class of the saved model.
 """
 
 import hashlib

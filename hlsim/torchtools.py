@@ -34,7 +34,7 @@ Audio = TypeVar("Audio", Tensor, NDArray[Any])
 STORE_BYTES = 2**28
 """Largest size in bytes of the stored constants.
 
-For each severity, MSBG's take 2 to 4 MiB per second of signal.
+For each severity, MSBG's take 1.5 to 4 MiB per second of signal.
 """
 
 _HOST = torch.device("cpu")
@@ -197,7 +197,7 @@ class constant(Generic[P, Values]):
     returns the values as the function computes them.
 
     Args:
-        design: Function at the top level of a module, which returns an array or numbers.
+        design: Function at the top level of a module, which returns an array.
 
     >>> @constant
     ... def window(points):
@@ -283,7 +283,7 @@ def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Convert real or complex values to a tensor, complex values to a complex one.
 
     Args:
-        values: Array, tensor or numbers.
+        values: Array with one or more dimensions, or tensor.
         dtype: Type of real values, and of the real and imaginary parts of complex ones.
         device: Device of the tensor.
 

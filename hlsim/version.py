@@ -1,3 +1,3 @@
-"""The version of hlsim, for the package metadata and for checkpoints."""
+"""The version of hlsim, for the package metadata, checkpoints and the command line."""
 
 __version__ = "0.1.0"

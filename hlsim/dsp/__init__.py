@@ -1,1 +1,1 @@
-"""Signal processing that is independent of hearing: transforms, filters, blocks, rates, levels."""
+"""Signal processing: transforms, filters, blocks, rates, levels, ERB scale, spherical head."""
