@@ -240,8 +240,13 @@ class _SmearSpectrum(DifferentiableFunction):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
         spectrum, matrix, *outputs = ctx.saved_tensors
+        dtype = spectrum.dtype
         if torch.is_grad_enabled():
-            # This gradient is itself differentiated, so it must depend on the spectrum.
+            # This gradient is itself differentiated, so it must depend on the spectrum. Single
+            # precision cannot represent the squares of powers in the second derivative.
+            if spectrum.device.type != "mps":  # Apple's GPUs have no double precision.
+                spectrum, gradient = spectrum.to(torch.complex128), gradient.to(torch.complex128)
+                matrix = matrix.double()
             outputs = list(_smear_spectrum(spectrum, matrix)[1:])
         smeared_power, real, imaginary, spectrum_power = outputs
         eps = smeared_power.new_full((), _DIVISION_EPS)
@@ -260,7 +265,7 @@ class _SmearSpectrum(DifferentiableFunction):
             torch.addcmul(reduction * g_real, spectrum.real, weight),
             torch.addcmul(reduction * g_imag, spectrum.imag, weight),
         )
-        return spectrum_gradient, None
+        return spectrum_gradient.to(dtype), None
 
 
 @constant

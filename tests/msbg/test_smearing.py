@@ -65,6 +65,23 @@ def test_gradients_are_exact(severity: str) -> None:
     assert torch.autograd.gradgradcheck(lambda w: smear(w, matrix), wave, fast_mode=True)
 
 
+def test_second_derivatives_in_single_precision_are_finite_beside_silence() -> None:
+    generator = torch.Generator().manual_seed(0)
+    sound, *directions = 0.01 * torch.randn(3, 1280, generator=generator).double()
+    sound[640:] = 0.0
+
+    def compute_second_derivative(dtype: torch.dtype) -> torch.Tensor:
+        matrix = torch.from_numpy(smearing_matrix("moderate")).to(dtype)
+        wave = sound.to(dtype).requires_grad_()
+        value = smear(wave, matrix)[: len(wave)].square() @ directions[0].to(dtype)
+        (gradient,) = torch.autograd.grad(value, wave, create_graph=True)
+        return torch.autograd.grad(gradient @ directions[1].to(dtype), wave)[0].double()
+
+    expected = compute_second_derivative(torch.float64)
+    error = compute_second_derivative(torch.float32) - expected
+    assert error.norm() < 0.01 * expected.norm()
+
+
 def test_a_frequency_that_is_rounded_to_zero_does_not_decide_the_gradient(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
