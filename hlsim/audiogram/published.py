@@ -20,7 +20,8 @@ STANDARD = {name: tuple(levels) for name, levels in _TABLES["standard_audiograms
 """Thresholds of the standard audiograms in dB HL at the eight audiometric frequencies.
 
 The source is Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi
-10.1177/1084713810379609, tables 1 and 2. The tables end at 6 kHz; 8 kHz repeats that threshold.
+10.1177/1084713810379609, tables 1 and 2, except for NH. The tables end at 6 kHz; 8 kHz repeats that
+threshold.
 """
 
 SPEECH_SPECTRUM = _over_frequency("speech_spectrum")

@@ -101,7 +101,7 @@ def prepare(
 
     Returns:
         Text to print: the name of the layout, a table of the splits and, if files of noise were
-        left out, their number.
+        left out, their number and one of them.
 
     Raises:
         ValueError: The layout is unknown or contradictory, the CSV file is not a manifest, levels

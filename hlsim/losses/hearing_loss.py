@@ -69,8 +69,8 @@ class HearingLossLoss(StoredEars, nn.Module):
 
     In an autocast region, the loss computes in float32 (or float64). Call ``backward()`` outside of
     the region, as torch recommends, because gradients in float16 may be NaN. A compiled caller runs
-    the loss uncompiled, with a graph break. ``torch.func.grad`` works unless ``checkpoint`` is set
-    or the criterion is ``"haspi"`` or ``"hasqi"``.
+    the loss uncompiled, with a graph break. ``torch.func.grad`` works without ``checkpoint`` and
+    the criteria ``"haspi"`` and ``"hasqi"``.
 
     The criterion is one of
 

@@ -93,7 +93,7 @@ def haaqi(
             NAL-R or another prescription has amplified.
 
     Returns:
-        Scores, an array if ``output`` is one. Shape: (...).
+        Scores, of NumPy if ``output`` is an array. Shape: (...).
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, not

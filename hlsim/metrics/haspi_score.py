@@ -92,7 +92,7 @@ def haspi(
             mostly change by less than 0.01.
 
     Returns:
-        Scores, an array if ``output`` is one. Shape: (...).
+        Scores, of NumPy if ``output`` is an array. Shape: (...).
 
     Raises:
         ValueError: Signals of different shapes or on different devices, too short, not
@@ -229,7 +229,7 @@ class HaspiReference(Reference):
             seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 
         Returns:
-            Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
+            Scores, 0 to 1, of NumPy if ``output`` is an array. Shape: (...).
 
         Raises:
             ValueError: Outputs of another shape, not floating-point, not finite, above 1e9 or on

@@ -79,7 +79,7 @@ def mbstoi(output: Audio, clean: Samples, *, sample_rate: int = 16000) -> Audio:
         sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns:
-        Scores, an array if ``output`` is one. Shape: (...).
+        Scores, of NumPy if ``output`` is an array. Shape: (...).
 
     Raises:
         ValueError: Signals of different shapes, without two channels, on different devices, not
@@ -280,7 +280,7 @@ def _correlate(windows: Tensor, may_use_one_ear: Tensor) -> Tensor:
         is_silent = ~(clean.any(-1) & output.any(-1))
         ratio = torch.where(is_silent, 0.0, ratio)
         left, right = (clean[..., pair] / output[..., pair] for pair in (LEFT_PAIR, RIGHT_PAIR))
-        # The ratio of an ear where both signals are silent is NaN, which is not larger.
+        # If both signals are silent at an ear, its ratio is NaN, and no ear alone is used.
         one_ear_is_better = (torch.maximum(left, right) > ratio) & may_use_one_ear[:, None]
         better_ear = torch.where(left > right, LEFT_PAIR, RIGHT_PAIR).unsqueeze(-1)
     weights = grid[torch.arange(BANDS, device=index.device), :, index]

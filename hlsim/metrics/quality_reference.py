@@ -101,7 +101,7 @@ class QualityReference(Reference):
             seed: Seed of the drawn noise of each item, 0 to 2**32 - 1.
 
         Returns:
-            Scores, 0 to 1, an array if ``output`` is one. Shape: (...).
+            Scores, 0 to 1, of NumPy if ``output`` is an array. Shape: (...).
 
         Raises:
             ValueError: Outputs of another shape, not floating-point, not finite, above 1e9 or on
