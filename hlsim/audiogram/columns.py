@@ -70,10 +70,10 @@ def threshold_columns(columns: Iterable[str]) -> dict[str, ThresholdColumn]:
     ``hl_250_masked`` are remarks on ``hl_250``. Columns with another word before a frequency of
     audiometry, such as ``aided 250``, ``bone 250`` and ``masked left 250``, and those of
     extrapolated levels at such a frequency, are left out with a warning that names them. With
-    ``Hz``, as in ``masked 250 Hz``, they are remarks, and numbers in them are an error (except for
-    levels of bone conduction and extrapolated levels, which are left out). The same warning names
-    columns of uncomfortable levels without a frequency. Columns that do not look like thresholds
-    are left out without a warning.
+    ``Hz`` or a leading ``hl``, as in ``masked 250 Hz``, they are remarks, and numbers in them are
+    an error (except for levels of bone conduction and extrapolated levels, which are left out). The
+    same warning names columns of uncomfortable levels without a frequency. Columns that do not look
+    like thresholds are left out without a warning.
 
     Args:
         columns: Names of all columns.

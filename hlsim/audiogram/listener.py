@@ -14,8 +14,9 @@ from hlsim.audiogram.value import Audiogram, EarLike, as_audiogram
 class Listener:
     """The audiograms of both ears of a person, for waveforms (..., 2, time), left ear first.
 
-    A listener may be passed wherever an audiogram may, and so may a sequence with one listener per
-    item. ``haspi`` and ``hasqi`` return one score per ear; ``.amax(-1)`` is that of the better ear.
+    Models, losses and metrics accept a listener in place of an audiogram, and a sequence with one
+    listener per item. ``haspi`` and ``hasqi`` return one score per ear; ``.amax(-1)`` is that of
+    the better ear.
 
     Args:
         left: Audiogram of the left ear, in any form in which an ear is accepted (a name such as

@@ -247,7 +247,7 @@ def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
         weights: Weights, each under the name of its part. Parts without a weight are left out.
 
     Returns:
-        The sum, with the shape of one part.
+        The sum, with the shape of one part; () if no weight differs from 0.
 
     >>> weighted_sum({"time": torch.tensor(2.0), "phase": torch.tensor(1.0)}, {"time": 0.5})
     tensor(1.)

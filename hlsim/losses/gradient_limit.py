@@ -10,7 +10,7 @@ from torch.nn import functional
 from hlsim.torchtools import DifferentiableFunction, differentiable_once, silence_after
 
 MAX_GRADIENT_RATIO = 6.0
-"""Largest gradient of a block, as a multiple of the usual magnitude of the item's gradients.
+"""Largest gradient outside pauses, as a multiple of the usual magnitude of the item's gradients.
 
 The usual magnitude is the 90th percentile over samples outside pauses.
 """
@@ -22,7 +22,7 @@ SOUNDING = 1e-3
 """Power of a block, relative to that of the loudest block, from which it is not a pause."""
 
 LIMITER_SAMPLES = 4096
-"""Approximate number of an item's samples from which the percentile is computed."""
+"""Smallest number of samples of a longer item from which the percentile is computed."""
 
 
 def limit_gradient_spikes(
@@ -103,7 +103,7 @@ class _GradientLimiter(DifferentiableFunction):
 
 
 def _usual_sizes(candidates: Tensor, time: int, lengths: Tensor | None) -> Tensor:
-    """Compute the 90th percentile of magnitudes, from about ``LIMITER_SAMPLES`` of each item.
+    """Compute the 90th percentile of magnitudes, from ``LIMITER_SAMPLES`` or more of a longer item.
 
     Shape: (..., n) -> (..., 1).
 

@@ -224,10 +224,11 @@ class HearingLossLoss(StoredEars, nn.Module):
 
         Raises:
             ValueError: There is no audiogram, or one of two ears is missing; a signal is not a
-                floating-point tensor with time last, shapes do not fit, thresholds are outside -10
-                to 100 dB HL, lengths are outside 1 to time, a simulator, normal ear or criterion
-                returns another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, an item
-                is shorter than 0.7 s, or its clean speech has NaN or infinity.
+                floating-point tensor with time last or has a sample above 1e9, shapes or devices do
+                not fit, thresholds are outside -10 to 100 dB HL, lengths are outside 1 to time, a
+                simulator, normal ear or criterion returns another shape than it should, or, with
+                ``"haspi"`` or ``"hasqi"``, an item is shorter than 0.7 s, or its clean speech has
+                NaN or infinity.
         """
         parts = self.parts(output, clean, audiogram, lengths)
         return weighted_sum(parts, self.weights)

@@ -11,7 +11,7 @@ from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.torchtools import Samples, as_samples
 
 SHORTEST_SECONDS = 0.7
-"""Shortest duration of a signal in seconds for which a score can be trusted."""
+"""Shortest duration in seconds of a signal that HASPI, HASQI and HAAQI score."""
 
 LARGEST_LENGTH_DIFFERENCE = 0.1
 """Largest difference in seconds for which the longer of two signals is cut instead of rejected."""
@@ -20,7 +20,7 @@ Equalisation = Literal[1, 2]
 """Mode of HASQI and HAAQI: 1 amplifies the clean signal by NAL-R, 2 takes an amplified one."""
 
 Noise = Literal["expected", "seeded", "none"]
-"""Internal noise of the ear: its mean effect, the noise that pyclarity draws, or none."""
+"""Internal noise of the ear: the same every time, the noise that pyclarity draws, or none."""
 
 
 def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, str]) -> int:
