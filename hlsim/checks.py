@@ -279,7 +279,7 @@ def check_waveform(
     torch.Size([2, 16000])
     """
     check_time_last(waveform, name)
-    if waveform.ndim == 0 or waveform.numel() == 0:
+    if waveform.numel() == 0:
         raise ValueError(
             f"expected {name} to have the shape (..., time) with at least one sample, "
             f"got {tuple(waveform.shape)}"
@@ -438,6 +438,8 @@ def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
             f"expected {name} to be a floating-point tensor with time last, got {kind}{fix}"
         )
     shape = tuple(waveform.shape)
+    if not shape:
+        raise ValueError(f"expected {name} with time last, got a tensor without dimensions")
     if len(shape) > 1 and shape[-1] <= MOST_CHANNELS < shape[-2]:
         fix = "x.T" if len(shape) == 2 else "x.mT"
         raise ValueError(f"expected {name} with time last, got shape {shape}; transpose it: {fix}")

@@ -15,6 +15,7 @@ from compensators import NALR, WDRC
 from hlsim import checks
 from hlsim.calibration import level_spl, set_level
 from hlsim.checks import check_lengths, check_rate, check_waveform
+from hlsim.dsp.resample import resample
 from hlsim.metrics import HASPI, haspi, hasqi, mbstoi
 from tests.helpers import mostly_slow
 
@@ -138,6 +139,15 @@ def test_a_number_of_another_type_is_to_be_converted() -> None:
 def test_measures_reject_time_first(call: Callable[[Tensor], object]) -> None:
     with pytest.raises(ValueError, match=r"transpose it: x\.T"):
         call(torch.zeros(16000, 2))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [level_spl, lambda wave: set_level(wave, 65.0), lambda wave: resample(wave, 48000, 16000)],
+)
+def test_a_tensor_without_dimensions_has_no_time(call: Callable[[Tensor], object]) -> None:
+    with pytest.raises(ValueError, match="got a tensor without dimensions"):
+        call(torch.tensor(1.0))
 
 
 def test_a_batch_of_few_samples_is_no_time_first_array() -> None:
