@@ -255,7 +255,7 @@ def clarity(parser: Parser) -> None:
     text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1, dest="stride")
     _declare_precision(parser)
-    parser.enhancers("waveforms with shape (2, time) in pascals")
+    parser.enhancers("time-aligned waveforms with shape (..., time) in pascals")
     parser.linked("")
     text = "level in dB SPL of a file whose RMS is 1.0"
     option("--full-scale-spl", full_scale, text, 100.0)

@@ -584,10 +584,12 @@ def cut_output(output: Tensor, signal: Tensor, sample_rate: int) -> Tensor:
     >>> cut_output(torch.ones(1601), torch.ones(1600), 16000).shape
     torch.Size([1600])
     """
-    if output.shape[:-1] != signal.shape[:-1] or not output.is_floating_point():
+    is_real = isinstance(output, Tensor) and output.is_floating_point()
+    if not is_real or output.shape[:-1] != signal.shape[:-1]:
+        kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
         raise ValueError(
-            f"expected a floating-point output of shape {tuple(signal.shape)}, got {output.dtype} "
-            f"of shape {tuple(output.shape)}; return a signal of the input's shape and type"
+            f"expected a floating-point output of shape {tuple(signal.shape)}, got {kind} of shape "
+            f"{tuple(getattr(output, 'shape', ()))}; return a tensor of the input's shape and type"
         )
     check_finite(output, "the output")
     lengths = signal.shape[-1], output.shape[-1]

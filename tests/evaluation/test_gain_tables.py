@@ -9,7 +9,7 @@ import pytest
 import scipy
 from numpy.typing import NDArray
 
-from compensators import WDRC, load_compensator
+from compensators import NALR, WDRC, load_compensator
 from compensators.filter_bank import speech_density
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import PASCAL_SPL
@@ -159,6 +159,8 @@ def test_other_formats_several_ears_and_low_rates_are_refused() -> None:
     for rate in (8000, 44100.5):
         with pytest.raises(ValueError, match="sample_rate to be a whole number from 16000"):
             export_gains(WDRC(), "N3", "camilladsp", sample_rate=rate)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="level to be a number from 0 to 120, got 130"):
+        export_gains(NALR(), "N3", "equalizer-apo", level=130.0)
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,7 @@ def resize(samples: int) -> Callable[[Tensor, Audiogram], Tensor]:
     [
         (Gain(0), "RuntimeError: no battery"),
         (lambda signal, ear: signal / 0.0, "NaN or infinite"),
+        (lambda signal, ear: signal.numpy(), "floating-point output of shape (8,), got ndarray"),
         (resize(1601), "a difference of 0.1 s"),
     ],
 )

@@ -95,6 +95,8 @@ def export_gains(
             )
         settings[name] = value
     check_number("sample_rate", settings.get("sample_rate", RATE), RATE, 192000, whole=True)
+    # A linear aid accepts any level.
+    check_number("level", settings.get("level", 65.0), 0.0, 120.0)
     levels = [settings["level"]] if "level" in settings else LEVELS
     gains = np.stack([aid.gains(ear, level).double().cpu().numpy() for level in levels])
     if gains.ndim != 2:
