@@ -336,11 +336,12 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
         One utterance per clean file. Files of noise are left out.
 
     Raises:
-        ValueError: A file does not match the pattern, two folders are for the same split, two files
-            have the same place in a pair, or, in a layout with pairs, a file lacks its counterpart.
+        ValueError: A file does not match the pattern, a split has two names or two sample rates,
+            two files have the same place in a pair, or, in a layout with pairs, a file lacks its
+            counterpart.
     """
     parts: dict[str, dict[str, Utterance]] = {"clean": {}, "noisy": {}}  # by condition and key
-    folder_of: dict[str, str] = {}  # by split
+    folder_of: dict[str, tuple[str, str]] = {}  # by split, with a file
     for file in files:
         match = re.fullmatch(pattern, file, re.IGNORECASE)
         if match is None:
@@ -354,10 +355,11 @@ def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Ut
         folder = groups.get("split", "train").lower()
         split = _SPLIT_OF[folder]
         folder += groups.get("rate", "").lower()  # copies of one corpus at two rates
-        if folder_of.setdefault(split, folder) != folder:
+        first_folder, first_file = folder_of.setdefault(split, (folder, file))
+        if first_folder != folder:
             raise ValueError(
-                f"the folders {folder_of[split]} and {folder} are both for the split {split}; "
-                "remove one of them, or rename it, for example to test"
+                f"{first_file} and {file} are in two folders for the split {split}; remove one of "
+                "the folders, or rename it, for example to test"
             )
         if condition not in parts:
             continue

@@ -163,11 +163,11 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         utterances: Rows of the manifest.
 
     Raises:
-        ValueError: There are no rows, a file is both clean and noisy, a noisy file or a clean file
-            without a noisy one is listed twice, a clean file is in a folder of noises, mixtures or
-            impulse responses by its name, a file or a speaker is in two splits, a microphone is in
-            a row twice, or a reference is not valid, lacks a noisy file, is missing for several
-            noisy files, or has not the same number of channels in all rows.
+        ValueError: There are no rows, a file is both clean and noisy, two rows have the same noisy
+            files, or the same clean file and none noisy, a clean file is in a folder of noises,
+            mixtures or impulse responses by its name, a clean file or a speaker is in two splits, a
+            microphone is in a row twice, or a reference is not valid, lacks a noisy file, is
+            missing for several noisy files, or has not the same number of channels in all rows.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):
