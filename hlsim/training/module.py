@@ -168,9 +168,10 @@ def initial_network(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         network: Any = build()
-    if not recipe.start:
-        return network
-    start: Any = load(recipe.start)
+        if not recipe.start:
+            return network
+        torch.manual_seed(recipe.seed)  # ``load`` may add an untrained part, such as a front end
+        start: Any = load(recipe.start)
     is_kind = getattr(start, "kind", None) == network.kind
     if not is_kind or (recipe.model and start.config != network.config):
         raise ValueError(

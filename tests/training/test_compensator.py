@@ -281,6 +281,20 @@ def test_a_front_end_is_trained_in_scenes_before_an_aid(
         replace(recipe, kind="hearing-aid")
 
 
+def test_the_seed_decides_the_weights_of_a_new_front_end_before_a_start() -> None:
+    recipe = CompensatorRecipe(
+        kind="beamforming-aid", model={"hidden": 8}, start="hearing-aid", weights={"bands": 1.0}
+    )
+    weights = []
+    for seed in (0, 0, 1):
+        torch.rand(1)
+        state = torch.random.get_rng_state()
+        module = CompensatorTraining(replace(recipe, seed=seed), simulator="attenuation")
+        assert torch.equal(torch.random.get_rng_state(), state)
+        weights.append(module.network.front_end.decide[0].weight)
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+
+
 @pytest.fixture
 def scenes(tmp_path: Path) -> TrainingData:
     """Recorded scenes with three microphones at each of two ears."""
