@@ -77,7 +77,7 @@ class Aid(StoredEars, nn.Module):
         raise NotImplementedError
 
     def stream(self, audiogram: AudiogramLike | None = None, **sliders: Any) -> Any:
-        """Raise ValueError, because only a ``Wearable`` aid processes a signal in chunks."""
+        """Raise ValueError, because the aid processes whole signals; see ``Wearable.stream``."""
         raise ValueError(
             f"{type(self).__name__} processes whole signals only; load wdrc or hearing-aid for a "
             "signal that arrives in chunks"

@@ -133,7 +133,7 @@ def _filter_taps(bands: int) -> NDArray[np.float64]:
 def filter_leakage(bands: int) -> NDArray[np.float64]:
     """Return the share of the power of a sound that passes the filter of another band.
 
-    A filter attenuates sounds in distant bands by 30 to 120 dB. An aid that amplifies its band by
+    A filter attenuates sounds in distant bands by 45 dB or more. An aid that amplifies its band by
     as much makes them audible again.
 
     Args:
