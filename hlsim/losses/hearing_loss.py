@@ -26,9 +26,11 @@ from hlsim.calibration import (
 from hlsim.checks import (
     Lengths,
     check_choice,
+    check_flag,
     check_lengths,
     check_rate,
     check_waveform,
+    describe,
 )
 from hlsim.losses.criteria import Comparison, CriterionLike, read_criterion, weighted_sum
 from hlsim.losses.frozen_simulator import FrozenSimulator, NormalEar, ReferenceKind, ReferenceName
@@ -175,6 +177,12 @@ class HearingLossLoss(StoredEars, nn.Module):
             check_choice("reference", reference, ReferenceName)
         check_choice("reduction", reduction, _Reduction)
         check_choice("ears", ears, _EarsName)
+        check_flag("checkpoint", checkpoint)
+        if not (normal is None or callable(normal)):
+            raise ValueError(
+                f"expected normal to be a module or a function, got {describe(normal)}; for a "
+                "simulator, write: lambda x: simulator(x, 'NH')"
+            )
         self.reduction = reduction
         self.ears = ears
         self.criteria, self.weights = read_criterion(criterion, weights)
@@ -453,10 +461,11 @@ class HASPILoss(HearingLossLoss):
     ``noise="expected"``, which makes them deterministic. An item whose clean speech is inaudible
     has a HASPI term of 0.
 
-    It is called as ``loss(output, clean, audiogram=None, lengths=None)``, with waveforms of
-    shape (..., time) in pascals, and returns a scalar; ``HearingLossLoss`` describes the details.
-    Items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. On one core, a step costs
-    8 to 18 times that of the default loss, with HASQI 20 to 41 times, the more items the more.
+    It is called as ``loss(output, clean, audiogram=None, lengths=None)``, with waveforms of shape
+    (..., time) in pascals, and returns a scalar by default; ``HearingLossLoss`` describes the
+    details. Items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. On one core, a
+    step costs 8 to 18 times that of the default loss, with HASQI 20 to 41 times, the more items the
+    more.
 
     Args:
         audiogram: Ear or ears, as in ``HearingLossLoss``.

@@ -580,6 +580,8 @@ BAD_SETTINGS: Options = {
     "reference": ["noisy"],
     "reduction": ["sum"],
     "ears": ["left"],
+    "checkpoint": ["msbg"],
+    "normal": ["msbg"],
     "criterion": ["l1", ["paper"], {}, {"l1": 1.0}, {"bands": -1.0}, {"bands": 0.0}],
     "weights": [1.0, {"pitch": 1.0}, {"levels": float("nan")}, {}],
     "audiogram": [N7, torch.zeros(7)],
