@@ -4,13 +4,13 @@ They compare an estimate with its target. In the paper, they train simulators. A
 an aid in ``HearingLossLoss``, they have faults:
 
 - They are not balanced. The gradient on eight band gains that start at 0 dB is 6.9e-3 for N1,
-  2.0e-3 for N3 and 3.5e-6 for N5, and 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for
-  mild ears and loud speech. The weights come from a paper that scales its speech to unit power,
-  which would balance the levels of the speech, but not the ears.
-- Of their value for unprocessed speech and N3, 0.67 of 0.86 is phase, whose gradient is faded out
+  2.0e-3 for N3 and 3.5e-6 for N5, and for N3 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch
+  trains for mild ears and loud speech. The weights come from a paper that scales its speech to unit
+  power, which would balance the levels of the speech, but not the ears.
+- Of their value for ``example_speech`` and N3, 0.63 of 0.80 is phase, whose gradient is faded out
   in faint frequencies: value and gradient disagree, and when Adam optimises the samples of a
-  waveform, the value rises. Speech with inverted polarity costs as much as noise at -5 dB SNR (1.34
-  both).
+  waveform, the value rises. For N3, inverted polarity costs as much as white noise at -5 dB SNR
+  (1.3 both).
 - Their rank correlations with HASPI and HASQI over 17 degradations are .33 and .59 (``python
   docs/figures/validity.py hlsim/data/speech/valid``). A filter bank trained by them from zero has a
   HASPI of .877, where the prescription NAL-R has .950, and learns no compression.
