@@ -109,6 +109,21 @@ def test_the_source_and_private_attributes_of_a_module_of_a_user_count(tmp_path:
     assert fingerprints[0] == fingerprints[1] != fingerprints[2], "the place of a file is ignored"
 
 
+def test_files_that_a_module_of_a_user_imports_count(tmp_path: Path) -> None:
+    """A helper may change while the weights and the file of a network do not."""
+    package = tmp_path / "helpers_of_an_aid"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "gains.py").write_text("from .constants import GAIN")
+    attempt = "try:\n    from .gains import GAIN\nexcept ImportError:\n    GAIN = 1.0\n"
+    (tmp_path / "aid.py").write_text(f"{attempt}from helpers_of_an_aid import gains\n{MODULE}")
+    fingerprints = []
+    for gain in (1.0, 1.0, 2.0):
+        (package / "constants.py").write_text(f"GAIN = {gain}")
+        fingerprints.append(fingerprint(load_plugin(f"{tmp_path}/aid.py:Aid", "aid")))
+    assert None is not fingerprints[0] == fingerprints[1] != fingerprints[2]
+
+
 def test_functions_of_one_name_in_two_files_have_two_fingerprints(tmp_path: Path) -> None:
     fingerprints = set()
     for name in ("a.py", "b.py"):

@@ -3,28 +3,37 @@
 A score is computed again if its key is not in the store (``run_measures`` of ``study.py``).
 
 The fingerprint of a module covers class names, settings and tensors and, for a class outside hlsim
-and torch, the file with its source code. The code of hlsim has a hash of its own, ``code_version``,
-which is part of the key of each stored score. Authors of modules outside hlsim may add an attribute
-``fingerprint``, such as a version, which they change when the outputs change.
+and torch, the file with its source code and the files of the user that this file imports. The code
+of hlsim has a hash of its own, ``code_version``, which is part of the key of each stored score.
+Authors of modules outside hlsim may add an attribute ``fingerprint``, such as a version, which they
+change when the outputs change.
 """
 
+import ast
 import dataclasses
 import hashlib
+import importlib.util
 import json
+import os
+import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 from torch import Tensor, nn
 
 import compensators
-from hlsim.files import source_hash
+from hlsim.files import sha256, source_hash
 from hlsim.plugins import WaveformPlugin
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 """Attributes that every ``nn.Module`` has, which do not describe its outputs."""
+
+_KNOWN_PACKAGES = frozenset({"hlsim", "compensators", "torch", "builtins"})
+"""Packages whose code counts by its name alone, because it is part of no user's code."""
 
 _ROOMS_WITHOUT_SCORES = frozenset({"cli", "report", "training"})
 """Packages of hlsim that no score depends on: commands, pages and training."""
@@ -67,7 +76,7 @@ def fingerprint(processing: Any) -> str | None:
         processing: Function or ``torch.nn.Module``. If it has an attribute ``fingerprint``, its
             name and this attribute are hashed. Otherwise, the classes, the attributes and the
             tensors of a module and its submodules are, without private attributes of modules of
-            hlsim and torch, and for other classes their source files.
+            hlsim and torch, and for other classes their source files and those that these import.
 
     Returns:
         The SHA-256 in hexadecimal, or None if the outputs could change while the hash does not:
@@ -119,7 +128,8 @@ def value_hash(value: Any) -> str:
         value: Text, number of Python, list, or dict (in any order), nested as you like, with
             tensors, arrays, dataclasses, modules with a fingerprint, and functions and classes. Of
             a function or class of hlsim or torch, only the name counts; of another one, also its
-            attribute ``fingerprint`` or the file with its source code.
+            attribute ``fingerprint`` or the file with its source code and the user's files that it
+            imports.
 
     Raises:
         TypeError: The value contains something else, such as a lambda or another function within a
@@ -143,7 +153,7 @@ def _is_known(code: Any) -> bool:
     Those of Python's library, such as ``abc.ABC``, are not known.
     """
     package = (code.__module__ or "builtins").split(".")[0]
-    return package in ("hlsim", "compensators", "torch", "builtins")
+    return package in _KNOWN_PACKAGES
 
 
 def _parts(module: nn.Module) -> list[Any]:
@@ -156,7 +166,48 @@ def _code(thing: Any) -> Any:
     return thing if hasattr(thing, "__qualname__") else type(thing)
 
 
-_hash_source = cache(source_hash)
+@cache
+def _hash_source(code: Any) -> str | None:
+    """Return the hash of the source file of a class or function, and of the files it imports.
+
+    Files of installed packages, Python and hlsim are left out. It is None without a source file.
+    """
+    file_hash = source_hash(code)
+    module = sys.modules.get(str(code.__module__))
+    if file_hash is None or module is None:
+        return file_hash
+    modules, hashes = [module], {module.__name__: file_hash}
+    while modules:
+        for name in _imported_names(modules.pop()):
+            imported = sys.modules.get(name)
+            if name not in hashes and imported is not None and _is_written_by_user(imported):
+                hashes[name] = sha256(Path(str(imported.__file__)))
+                modules.append(imported)
+    return value_hash(sorted(hashes.values()))
+
+
+def _imported_names(module: ModuleType) -> Iterator[str]:
+    """Yield the full names that the source of a module imports, of which some are modules."""
+    file = Path(module.__file__ or "")
+    if file.suffix != ".py":
+        return
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and (module.__package__ or not node.level):
+            relative_name = "." * node.level + (node.module or "")
+            parent = importlib.util.resolve_name(relative_name, module.__package__)
+            yield parent
+            yield from (f"{parent}.{alias.name}" for alias in node.names)
+
+
+def _is_written_by_user(module: ModuleType) -> bool:
+    """Return whether the file of a module belongs to neither Python, a package nor hlsim."""
+    if not getattr(module, "__file__", None) or module.__name__.split(".")[0] in _KNOWN_PACKAGES:
+        return False
+    file = Path(str(module.__file__)).resolve()
+    is_installed = {"site-packages", "dist-packages"}.intersection(file.parts)
+    return not is_installed and not file.is_relative_to(Path(os.__file__).resolve().parent)
 
 
 def _attributes(module: nn.Module) -> dict[str, Any]:
