@@ -32,7 +32,7 @@ def _named(page: Path) -> str:
 
 
 def test_examples_of_the_readme_simulate_and_train(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
@@ -44,7 +44,11 @@ def test_examples_of_the_readme_simulate_and_train(
     unaided, aided, original = levels
     assert unaided < original - 30.0
     assert aided == pytest.approx(original, abs=1.0)
-    assert float(names["value"]) > 0
+    losses = re.findall(r"loss ([\d.]+)$", capsys.readouterr().out, re.MULTILINE)
+    stated = re.search(r"# from ([\d.]+) to about ([\d.]+)$", text, re.MULTILINE)
+    assert stated is not None and len(losses) == 20
+    assert float(losses[0]) == pytest.approx(float(stated[1]), abs=0.002)
+    assert float(losses[-1]) == pytest.approx(float(stated[2]), abs=0.01)
     gradients = [parameter.grad for parameter in names["network"].parameters()]
     assert all(bool(gradient.abs().sum() > 0) for gradient in gradients)
 
