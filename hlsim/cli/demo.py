@@ -5,7 +5,6 @@ from pathlib import Path
 
 from hlsim.cli.inputs import check_extras, use_one_thread
 from hlsim.cli.options import Parser, count
-from hlsim.progress import ProgressLine
 
 
 def demo(parser: Parser) -> None:
@@ -23,6 +22,4 @@ def _demo(options: argparse.Namespace) -> None:
     from hlsim.cli.demo_run import run_demo
 
     ear = as_audiogram(options.audiogram)
-    with ProgressLine("scores", "training", "drawing the page") as progress:
-        text = run_demo(options.out, ear, steps=options.steps, progress=progress)
-    print(text)
+    print(run_demo(options.out, ear, steps=options.steps))

@@ -12,6 +12,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.data import bundled
 from hlsim.evaluation.demo import evaluate_trained_aid
 from hlsim.evaluation.items import ear_name
+from hlsim.progress import ProgressLine
 from hlsim.report.demo_page import demo_page, result_table
 from hlsim.report.writing import write_results
 from hlsim.training.batches import TrainingData
@@ -51,7 +52,7 @@ def run_demo(out: str | Path, audiogram: Audiogram, *, steps: int = 1000, **runn
         out: Folder of the page, the scores and the training, which resumes if it was interrupted.
         audiogram: Audiogram of the ear.
         steps: Number of training steps.
-        running: Arguments ``jobs`` and ``progress`` of ``run_study``.
+        running: Arguments ``jobs`` and ``dask`` of ``run_study``.
 
     Returns:
         Text for a terminal: the verdict, the table of results, and the address of the page.
@@ -72,7 +73,10 @@ def run_demo(out: str | Path, audiogram: Audiogram, *, steps: int = 1000, **runn
     )
     print("Scoring other utterances without an aid, with NAL-R and with the aid")
     aid = load_compensator(checkpoint)
-    evaluation = evaluate_trained_aid(aid, audiogram, ear_name=ear, training_steps=steps, **running)
-    page = demo_page(evaluation)
-    path = write_results(page, evaluation, out)
+    with ProgressLine("scores", "reading the utterances", "drawing the page") as progress:
+        evaluation = evaluate_trained_aid(
+            aid, audiogram, ear_name=ear, training_steps=steps, progress=progress, **running
+        )
+        page = demo_page(evaluation)
+        path = write_results(page, evaluation, out)
     return f"\n{page.verdict}\n\n{result_table(evaluation).text()}\n\n{path.as_uri()}"

@@ -21,7 +21,7 @@ from hlsim.report.tables import (
     statistic,
     summary_table,
 )
-from hlsim.report.verdict import verdict
+from hlsim.report.verdict import count_items, verdict
 
 _COMPARISON = (
     "HASPI rewards any gain. The trained aid is therefore compared with NAL-R, the prescription "
@@ -66,7 +66,8 @@ def demo_page(evaluation: Evaluation) -> Page:
         score_details(evaluation),
     ]
     title = f"A hearing aid trained for one ear: {settings['ear']}"
-    first_sentence = verdict(headline, "The trained aid", "NAL-R at the same level", "voice")
+    subject = f"By the means of {count_items(voices, 'voice')}, the trained aid"
+    first_sentence = verdict(headline, subject, "NAL-R at the same level", "voice")
     return Page(title, first_sentence, sections, _cards(evaluation))
 
 

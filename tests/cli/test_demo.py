@@ -58,7 +58,7 @@ def test_demo_writes_a_page_that_agrees_with_the_table(
         )
     )
     page = (out / "report.html").read_text()
-    assert text.startswith("\nThe trained aid ")
+    assert text.startswith("\nBy the means of 3 voices, the trained aid ")
     assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 10
     evidence = text.splitlines()[1].rpartition(" (")[2]
     assert f"({evidence}</small>" in page and page.count("t-test p = ") == 1
