@@ -179,11 +179,11 @@ def _process_file(
     level, gain_db = level_and_gain(recording.power, options)
     model = build(recording.sample_rate)
     gain = 10.0 ** (gain_db / 20.0)
+    scale_spl = options.full_scale_spl + gain_db
     channels = model.ears if getattr(model, "takes_microphones", False) else recording.channels
     size = channels, recording.samples, recording.sample_rate
     limit_spl = getattr(behind_front_end(model), "limit_spl", math.inf)
-    limit_dbfs = limit_spl - options.full_scale_spl - gain_db
-    meter = Meter(LIMITED * 10.0 ** (limit_dbfs / 20.0))
+    meter = Meter(LIMITED * 10.0 ** ((limit_spl - scale_spl) / 20.0))
     with torch.no_grad():
         outputs = process_recording(model, recording, gain, ear, **sliders)
         write_parts(target, meter.measure(outputs, recording.samples, show), *size)
@@ -198,6 +198,7 @@ def _process_file(
     if meter.peak > 1.0 and options.no_clipping:
         factor = PLAYED_PEAK / meter.peak
         write_parts(target, (factor * part for part in read_all(scan_audio(target))), *size)
+        scale_spl -= 20.0 * math.log10(factor)
         text += (
             f"; the file is {-20.0 * math.log10(factor):.1f} dB softer, so that it does not clip"
         )
@@ -206,6 +207,8 @@ def _process_file(
     highest_hz = getattr(model, "highest_frequency", math.inf)
     if highest_hz < recording.sample_rate / 2:
         text += f"; the output has no band above {highest_hz / 1000.0:g} kHz"
+    if scale_spl != options.full_scale_spl:
+        text += f"; --full-scale-spl {scale_spl:.2f} reads the file at this level"
     return text
 
 

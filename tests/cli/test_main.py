@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -471,6 +472,24 @@ def test_notes_about_clipping_and_a_missing_upper_band(
     text = capsys.readouterr().out
     for note in ("players will clip", "no band above 8 kHz"):
         assert (note in text) == (note == expected)
+
+
+@pytest.mark.parametrize("more", [(), ("--no-clipping",)], ids=["", "softer"])
+def test_the_line_says_how_to_read_an_output_at_its_level(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...]
+) -> None:
+    """An output of ``--spl`` keeps the scale of the file, so its samples are not pascals."""
+    aided = tmp_path / "aided.wav"
+    call = ("--audiogram", "N4", "--spl", "65")
+    assert run("compensate", utterance, aided, *call, *more) == 0
+    text = capsys.readouterr().out
+    output_level = re.search(r"output ([\d.]+) dB SPL", text)
+    scale = re.search(r"; (--full-scale-spl [\d.]+) reads the file at this level$", text.strip())
+    assert output_level is not None and scale is not None
+    perceived = tmp_path / "perceived.wav"
+    assert run("simulate", aided, perceived, "--audiogram", "N4", *scale[1].split()) == 0
+    text = capsys.readouterr().out
+    assert f"input {output_level[1]} dB SPL" in text and "reads the file" not in text
 
 
 def test_an_output_that_the_limit_of_the_aid_distorts_is_named(
