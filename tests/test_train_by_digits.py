@@ -59,3 +59,27 @@ def test_a_training_changes_all_weights_and_records_its_settings(script: ModuleT
     assert about["start_sha256"] == read_record(tmp_path / "start")["sha256"]
     assert (about["steps"], about["recipe"]["seed"]) == (2, 4)
     assert about["simulator"] == ["attenuation"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (["--steps", "0"], "argument --steps: got '0', expected a whole number, 1 or more"),
+        (["--start", "nobody"], "no checkpoint 'nobody'"),
+        (["--audiograms", "nowhere.csv"], "nowhere.csv: cannot read audiograms"),
+        (["--simulators", "nobody"], "no checkpoint 'nobody'"),
+        ([], "nowhere: there is no such folder; correct the path"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(
+    script: ModuleType, tmp_path, capsys: pytest.CaptureFixture[str], changed, message
+):
+    table = tmp_path / "ears.csv"
+    table.write_text("name,500,1000,2000,4000\nA,30,50,60,60\n")
+    folders = [str(SPEECH), str(SPEECH) if changed else "nowhere"]
+    arguments = [*folders, "--audiograms", str(table), "--out", str(tmp_path / "trained"), *changed]
+    with pytest.raises(SystemExit, match=r"^2$"):
+        script.main(arguments)
+    *usage, last = capsys.readouterr().err.splitlines()
+    assert usage[0].startswith("usage: ") and message in last
+    assert not (tmp_path / "trained").exists()

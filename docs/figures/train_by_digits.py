@@ -26,6 +26,7 @@ from hlsim.audiogram.table import read_audiograms
 from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.calibration import NEURO_RATE, level_spl, set_level
 from hlsim.checkpoint import read_record
+from hlsim.cli.options import count, seed
 from hlsim.data.augment import draw_uniform
 from hlsim.data.clips import Clips
 from hlsim.data.ears import draw_thresholds
@@ -126,18 +127,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--audiograms", required=True, help="CSV file of measured ears")
     parser.add_argument("--simulators", nargs="+", default=["msbg", "attenuation"])
     parser.add_argument("--start", default="hearing-aid", help="checkpoint that is trained further")
-    parser.add_argument("--steps", type=int, default=450, help="number of training steps")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers")
+    parser.add_argument("--steps", type=count, default=450, help="number of training steps")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of all random numbers")
     parser.add_argument("--out", required=True, help="folder of the checkpoint that is written")
     options = parser.parse_args(arguments)
     start_time = time.monotonic()
-    aid, start = load_compensator(options.start), read_record(options.start)
-    speech = Clips(options.speech, sample_rate=NEURO_RATE, seconds=SPEECH_SECONDS)
-    triplet_seconds = TRIPLET_SAMPLES / NEURO_RATE
-    noise = Clips(options.noise, sample_rate=NEURO_RATE, seconds=triplet_seconds, repeat=True)
-    ears = as_thresholds([ear for _, ear in read_audiograms(options.audiograms, simulated=True)])
-    untrained = copy.deepcopy(aid).eval().requires_grad_(False)
-    lessons = Lessons(speech, noise, ears, options.simulators, untrained)
+    try:
+        aid, start = load_compensator(options.start), read_record(options.start)
+        table = read_audiograms(options.audiograms, simulated=True)
+        speech = Clips(options.speech, sample_rate=NEURO_RATE, seconds=SPEECH_SECONDS)
+        triplet_seconds = TRIPLET_SAMPLES / NEURO_RATE
+        noise = Clips(options.noise, sample_rate=NEURO_RATE, seconds=triplet_seconds, repeat=True)
+        ears = as_thresholds([ear for _, ear in table])
+        untrained = copy.deepcopy(aid).eval().requires_grad_(False)
+        lessons = Lessons(speech, noise, ears, options.simulators, untrained)
+    except ValueError as error:
+        parser.error(str(error))
     generator = torch.Generator().manual_seed(options.seed)
     draw_terms = partial(lessons.loss_terms, aid, generator)
     minimise(aid, draw_terms, WEIGHTS, LEARNING_RATE, options.steps, REPORT_STEPS)

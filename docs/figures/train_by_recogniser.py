@@ -42,6 +42,7 @@ from hlsim import MSBG
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.checkpoint import read_record
+from hlsim.cli.options import count
 from hlsim.data.augment import draw_uniform
 from hlsim.data.clips import Clips
 from hlsim.data.ears import draw_thresholds
@@ -284,7 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--model", required=True, help="folder of a Whisper model")
     parser.add_argument("--start", default="hearing-aid", help="checkpoint that is trained further")
     parser.add_argument("--clips", type=int, default=1500, help="number of clips of 3 s")
-    parser.add_argument("--steps", type=int, default=950, help="number of training steps")
+    parser.add_argument("--steps", type=count, default=950, help="number of training steps")
     parser.add_argument("--batch", type=int, default=32, help="number of items per step")
     parser.add_argument("--seed", type=int, default=3, help="seed of all random numbers")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
