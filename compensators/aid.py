@@ -110,12 +110,13 @@ class Aid(StoredEars, nn.Module):
         thresholds = thresholds.to(next(self.parameters(), thresholds))
         ears = thresholds.reshape(-1, len(FREQUENCIES))
         noise = _speech_noise(like=ears) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
-        # The first second, in which gains settle, is left out.
-        output = self._amplify(noise.repeat(len(ears), 2), ears)[:, RATE:]
         in_third = thirds_of_octave(like=ears)
-        output_power, noise_power = (
-            power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
-        )
+        with torch.autocast(ears.device.type, enabled=False):
+            # The first second, in which gains settle, is left out.
+            output = self._amplify(noise.repeat(len(ears), 2), ears)[:, RATE:]
+            output_power, noise_power = (
+                power(torch.fft.rfft(signal)) @ in_third for signal in (output, noise)
+            )
         return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
 
     def find_thresholds(self, audiogram: AudiogramLike | None) -> Tensor:

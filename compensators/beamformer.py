@@ -112,8 +112,9 @@ class AdaptiveBeamformer(FilterAndSum):
         if self.sample_rate == NEURO_RATE:
             return super().delayed_output(waveform)
         self.check_microphones(waveform)
-        delayed = super().delayed_output(resample(waveform, self.sample_rate, NEURO_RATE))
-        output = resample(delayed[..., self.latency :], NEURO_RATE, self.sample_rate)
+        with torch.autocast(waveform.device.type, enabled=False):
+            delayed = super().delayed_output(resample(waveform, self.sample_rate, NEURO_RATE))
+            output = resample(delayed[..., self.latency :], NEURO_RATE, self.sample_rate)
         # The latency at 16 kHz need not be a whole number of samples at another rate.
         samples = look_ahead_samples(self.sample_rate)
         return functional.pad(output[..., : waveform.shape[-1]], (samples, 0))

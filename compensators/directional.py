@@ -136,7 +136,8 @@ class FilterAndSum(nn.Module):
         """
         self.check_microphones(waveform)
         padded = functional.pad(waveform, (0, self.latency))
-        return self.process(padded, self.initial_state(waveform))[0]
+        with torch.autocast(waveform.device.type, enabled=False):
+            return self.process(padded, self.initial_state(waveform))[0]
 
     def check_microphones(self, waveform: Tensor) -> None:
         """Raise ValueError unless a waveform has as many microphones and ears as the filters."""
@@ -250,7 +251,8 @@ class MicrophoneStream:
                 f"expected a chunk of shape {(*shape, 'time')} as before, got "
                 f"{tuple(signals.shape)}; call flush before a signal of another shape"
             )
-        output, self._state = self._front_end.process(signals, self._state)
+        with torch.autocast(signals.device.type, enabled=False):
+            output, self._state = self._front_end.process(signals, self._state)
         return as_type_of(chunk, output if self.aid is None else self.aid(output))
 
     def flush(self) -> Tensor:

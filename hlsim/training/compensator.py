@@ -83,7 +83,8 @@ class CompensatorTraining(TrainingModule):
             network.noise_reduction_network.requires_grad_(False)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        self.measured_values.append(self.compute_loss(batch)[None])
+        with torch.autocast(self.device.type, enabled=False):
+            self.measured_values.append(self.compute_loss(batch)[None])
 
     def compute_loss(self, batch: Batch) -> Tensor:
         """Compute the loss of a batch, a scalar: the weighted sum of the recipe's criteria."""

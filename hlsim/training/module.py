@@ -76,7 +76,9 @@ class TrainingModule(L.LightningModule):
         Raises:
             ValueError: The loss is not finite.
         """
-        loss = self.compute_loss(batch)
+        # Networks and losses leave autocast by themselves, but not every criterion does.
+        with torch.autocast(self.device.type, enabled=False):
+            loss = self.compute_loss(batch)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ValueError(

@@ -247,6 +247,21 @@ def test_a_mirrored_scene_has_the_mirrored_output(speech: Tensor, noise: Tensor)
         assert mirror_error(trained, scene, "N2", "N4") < 0.2
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_autocast_does_not_change_a_front_end(noise: Tensor, dtype: torch.dtype) -> None:
+    signals = 0.02 * noise[:8000].reshape(2, 2, 2000)
+    for front_end in (AdaptiveDifferentialMicrophone(), AdaptiveBeamformer()):
+        whole, part = front_end(signals), front_end.stream()(signals)
+        with torch.autocast("cpu", dtype):
+            assert torch.equal(front_end(signals), whole)
+            assert torch.equal(front_end.stream()(signals), part)
+    fast = AdaptiveBeamformer(sample_rate=32000)
+    whole = fast(signals)
+    with torch.autocast("cpu", dtype):
+        assert torch.equal(fast(signals), whole)
+
+
 def test_silence_gives_silence_and_finite_gradients() -> None:
     signals = torch.zeros(2, 2, 100, requires_grad=True)
     output = AdaptiveDifferentialMicrophone()(signals)

@@ -72,6 +72,18 @@ def test_scale_and_precision_are_those_of_the_caller(
     assert build()(signal.half(), EAR).dtype == torch.float16
 
 
+@every_aid
+@torch.no_grad()
+def test_autocast_changes_neither_outputs_nor_gains(
+    build: Callable[..., Any], utterance: Tensor
+) -> None:
+    aid = build()
+    output, gains = aid(utterance[:5000], EAR), aid.gains(EAR)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(aid(utterance[:5000], EAR), output)
+        assert torch.equal(aid.gains(EAR), gains)
+
+
 @pytest.mark.parametrize("kind", [NALR, WDRC, HearingAid, MappingCompensator])
 def test_an_aid_may_have_an_ear_of_its_own(kind: Callable[..., Any], utterance: Tensor) -> None:
     settings = {"config": SMALL} if kind is MappingCompensator else {}

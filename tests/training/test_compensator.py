@@ -17,7 +17,7 @@ from compensators.config import BeamformerConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import write_audio
 from hlsim.calibration import level_spl, set_level
-from hlsim.checkpoint import read_record, save_checkpoint
+from hlsim.checkpoint import read_record, read_weights, save_checkpoint
 from hlsim.data.manifest import Utterance, write_manifest
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.simulators import BUILT_IN
@@ -192,6 +192,17 @@ def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_p
 def test_networks_that_cannot_be_trained(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         CompensatorTraining(replace(SMALL, **settings), simulator="msbg")
+
+
+def test_mixed_precision_does_not_change_a_training(noisy: TrainingData, tmp_path: Path) -> None:
+    recipe = replace(SMALL_AID, weights={"denoising": 1.0})
+    records = [
+        train(noisy, recipe, tmp_path / precision, precision=precision)
+        for precision in ("32-true", "bf16-mixed")
+    ]
+    assert records[0]["start_validation"] == records[1]["start_validation"]
+    weights = [read_weights(tmp_path / name / "checkpoint") for name in ("32-true", "bf16-mixed")]
+    assert weights[0] == weights[1]
 
 
 def test_a_general_compensator_draws_ears_and_noise(noisy: TrainingData, tmp_path: Path) -> None:
