@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
@@ -347,7 +348,8 @@ def read_recordings(
             known.
         root: Folder to which the paths are relative; by default that of the manifest, or the
             current folder for a DataFrame.
-        audiogram: The ear of rows without an audiogram, if ``audiograms`` is not passed.
+        audiogram: The ear of rows without an audiogram, if ``audiograms`` is not passed. If no row
+            uses it, there is a warning.
         audiograms: File of listeners, see ``read_listeners``. It must have the listeners of all
             rows, and the ear of each row that has no audiogram of its own.
         settings: Arguments ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
@@ -394,6 +396,12 @@ def read_recordings(
         if key in recordings:
             recording = convert_at(place, _merge, recordings[key], recording)
         recordings[key] = recording
+    if audiogram is not None and all(r.audiogram is not audiogram for r in recordings.values()):
+        warnings.warn(
+            "audiogram (--audiogram) is not used, because every row of the manifest has an ear, in "
+            "its columns or in the file of audiograms; leave it out, or remove these",
+            stacklevel=2,
+        )
     # The first recording may lack a condition, so its outputs do not have the order of the rows.
     conditions = dict.fromkeys(row["condition"] for _, row in rows)
     return list(recordings.values()), list(conditions)

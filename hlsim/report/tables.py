@@ -120,8 +120,8 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     Args:
         table: Table of the study.
         fact: Column with a property of the items, such as ``"snr"`` or ``"severity"``, by whose
-            values the rows are split, too, in ascending order; rows without a value, None or NaN,
-            are left out. Empty for conditions alone.
+            values, rounded to six digits, the rows are split, too, in ascending order; rows without
+            a value, None or NaN, are left out. Empty for conditions alone.
 
     Returns:
         Rows of the table by the name of the condition, such as "aid", or with ``fact`` by value
@@ -134,13 +134,15 @@ def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     """
     if not fact:
         return dict(iter(table.groupby("condition", sort=False)))
+    known = table.dropna(subset=fact)
+    # Values that differ only by rounding have one heading, and are one part.
+    headings = known[fact].map(lambda value: value if isinstance(value, str) else f"{value:g}")
+    places = {name: place for place, name in enumerate(SEVERITIES)}
+    parts = [(part[fact].iloc[0], heading, part) for heading, part in known.groupby(headings)]
     rows = {}
-    degrees = {name: place for place, name in enumerate(SEVERITIES)}
-    values = dict(iter(table.groupby(fact, sort=False)))
-    for value in sorted(values, key=lambda value: degrees.get(value, value)):
-        heading = value if isinstance(value, str) else f"{value:g}"
-        for name, part in split_rows(values[value]).items():
-            rows[f"{heading}, {name}"] = part
+    for _, heading, part in sorted(parts, key=lambda entry: places.get(entry[0], entry[0])):
+        for name, rows_of_condition in split_rows(part).items():
+            rows[f"{heading}, {name}"] = rows_of_condition
     return rows
 
 

@@ -496,7 +496,8 @@ def test_both_channels_of_a_file_have_one_gain(tmp_path: Path) -> None:
 def test_thresholds_of_a_manifest_have_the_names_of_a_table_of_ears(tmp_path: Path) -> None:
     path = tmp_path / "study.csv"
     path.write_text("Condition,CLEAN,Processed,500 Hz,4k\naid,c.wav,p.wav,60,80\n")
-    ((recording,), _) = read_recordings(path, audiogram=N4)
+    with pytest.warns(UserWarning, match="--audiogram.* is not used"):
+        ((recording,), _) = read_recordings(path, audiogram=N4)
     assert recording.audiogram == Audiogram([60, 80], [500, 4000])
 
 

@@ -17,6 +17,7 @@ from hlsim.evaluation.recorded_items import RecordedItem
 from hlsim.evaluation.sounds import perceive_items
 from hlsim.report.plots import means_pictures
 from hlsim.report.recordings_page import report_page
+from hlsim.report.tables import statistic, summary_table
 from hlsim.report.verdict import verdict
 from hlsim.report.writing import write_results
 
@@ -158,3 +159,13 @@ def test_the_reference_of_hasqi_and_both_scales_of_loss_are_stated(tmp_path: Pat
     table = study.table.assign(hasqi=study.table.haspi)
     both = replace(study, table=table, measures=[*study.measures, MEASURES["hasqi"]])
     assert "amplified by NAL-R" in " ".join(report_page(both).sections[0].paragraphs)
+
+
+def test_ratios_that_differ_by_rounding_are_one_row_of_a_table() -> None:
+    """Ratios that were measured, such as 4.9999998 dB, have the heading of nominal ones."""
+    ratios = [5.0, 4.9999998, 5.0000001, 0.0]
+    rows = [("aid", snr, 0.1 * number) for number, snr in enumerate(ratios)]
+    table = pandas.DataFrame(rows, columns=["condition", "snr", "haspi"])
+    columns = {"n": (statistic("haspi", "count"), "d"), "HASPI": (statistic("haspi"), ".2f")}
+    parts = summary_table("By SNR", table, columns, "snr").rows
+    assert parts == [["0, aid", "1", "0.30"], ["5, aid", "3", "0.10"]]
