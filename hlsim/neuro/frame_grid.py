@@ -38,6 +38,9 @@ FFT_POINTS = 192
 FRAME_PERIOD = 20480
 """Samples at 16 kHz after which frames, and pairs of frames, begin on a whole sample again."""
 
+FRAMES_PER_PERIOD = 882
+"""Number of frames that begin in a ``FRAME_PERIOD``."""
+
 _LOWPASS_HALF_LENGTH = 1383
 """Samples at 44.1 kHz on each side of the middle of the low-pass of both conversions."""
 

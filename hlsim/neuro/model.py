@@ -1,5 +1,6 @@
 """Neuro-MSBG, a neural network that emulates MSBG, and a function that loads trained networks."""
 
+import math
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -28,6 +29,7 @@ from hlsim.neuro.frame_grid import (
     FILTERS_FIELD,
     FRAME_PERIOD,
     FRAME_RATE,
+    FRAMES_PER_PERIOD,
     analyse_frames,
     from_frame_rate,
     synthesise_frames,
@@ -38,7 +40,7 @@ from hlsim.neuro.prior import BandGains, Prior
 from hlsim.torchtools import built_in_float32
 
 POWER_FLOOR = 1e-11
-"""Power in Pa^2 that is added to powers before square roots, so that gradients are finite."""
+"""Number that is added to powers before square roots, so that gradients are finite."""
 
 MIN_LOG_MASK = -12.0
 """Smallest natural logarithm of the network's factor on a magnitude."""
@@ -66,7 +68,7 @@ class NeuroMSBG(EarNetwork, HubModel):
     derivatives with ``cnn`` blocks and, on a CPU, with ``lstm`` blocks. Where there is no second
     derivative, computing one raises RuntimeError.
 
-    Source: the Neuro-MSBG paper, Section III and Equation 1.
+    Source: the Neuro-MSBG paper, Section II-A and Equation 1.
 
     Args:
         config: Sizes and choices, by default ``NeuroConfig()``.
@@ -155,7 +157,10 @@ class BandNeuroMSBG(NeuroMSBG):
     @property
     def receptive_field(self) -> tuple[int, int] | None:
         field = super().receptive_field
-        return field and (FRAME_PERIOD, field[1])
+        # A part of a signal begins with a step of the network, not only with a frame.
+        frames = self.config.stride[0]
+        periods = frames // math.gcd(frames, FRAMES_PER_PERIOD)
+        return field and (periods * FRAME_PERIOD, field[1])
 
     def _build_prior(self, compute: bool) -> BandGains:
         return BandGains(self.stft, FRAME_RATE, compute)

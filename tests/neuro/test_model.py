@@ -94,6 +94,19 @@ def test_items_and_blocks_one_by_one_equal_processing_at_once(
         assert float((result - expected_result).norm() / expected_result.norm()) < 1e-12
 
 
+def test_blocks_begin_with_a_step_where_1_28_s_are_no_whole_number_of_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = NeuroMSBG(NeuroConfig(channels=4, stride=(4, 1))).double()
+    waveform = 0.02 * torch.randn(110_000, dtype=torch.float64)
+    with torch.no_grad():
+        expected = model(waveform, "N4")
+        monkeypatch.setattr(network, "_CPU_SAMPLES", 40_960)
+        output = model(waveform, "N4")
+    assert not torch.equal(output, expected)  # so it was computed in blocks
+    assert float((output - expected).norm() / expected.norm()) < 1e-12
+
+
 def test_some_networks_depend_on_the_whole_signal() -> None:
     blocks = [{"block": block} for block in ("lstm", "mamba", "transformer")]
     for change in (*blocks, {"level_aware": False}):
