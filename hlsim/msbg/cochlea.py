@@ -34,11 +34,11 @@ _TAIL = 3200
 """Samples of zero-padding behind a signal, 73 ms.
 
 This is more than the longest advance (485 samples) and the time in which the narrowest channel
-decays by 80 dB (about 2500 samples) together.
+decays by 80 dB (about 2300 samples) together.
 """
 
 _END_SAMPLES = 4096
-"""Number of last samples of an unaligned output for which all channels run at 44.1 kHz."""
+"""Number of last samples of a long unaligned output for which all channels run at 44.1 kHz."""
 
 _END_LEAD_SAMPLES = 7296
 """Number of samples before the last ``_END_SAMPLES`` that influence them."""
@@ -73,7 +73,7 @@ def cochlea_fft_length(length: int, rate: int, rate_divisor: int = 1) -> int:
 
 
 def common_period(rate: int, rate_divisor: int = 1) -> int:
-    """Return the shortest time that is a whole number of samples at a rate and of envelope steps.
+    """Return a time that is a whole number of samples at a rate and of envelope steps.
 
     If a Fourier transform spans a multiple of this time, its spectrum can be converted to that
     rate. An envelope step is the time between two computed values of an envelope. In samples at
@@ -122,7 +122,7 @@ def simulate_cochlea(
 
     A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
     each channel by a gain that follows its envelope, and the channels are added up. Each channel is
-    computed at the lowest sample rate that its band allows.
+    computed at a sample rate that its band allows, and channels far above ``highest`` as one.
 
     Shape: (items, time), (items, channels) -> complex (items, points // (2 * rate_divisor) + 1).
 
@@ -180,9 +180,9 @@ def simulate_cochlea(
 def _filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tensor]:
     """Compute the channels of a rate band, and the sums from which ``smooth`` gets envelopes.
 
-    The channels are not in Pa: their Fourier transforms have the scale of ``spectrum``, at fewer
-    points. The three sums per step, in Pa, are parts of three neighbouring envelopes, see
-    ``partial_means``.
+    Channels at a reduced rate are not in Pa: their Fourier transforms have the scale of
+    ``spectrum``, at fewer points. The three sums per step, in Pa, are parts of three neighbouring
+    envelopes, see ``partial_means``.
 
     Shape: complex (items, bins) -> (items, channels, time), (items, channels, 3, steps), where time
         is ``band.points``, or twice as many for the detector ``"modulus"``, whose channels are
@@ -209,7 +209,7 @@ def simulate_delayed_cochlea(
 ) -> Tensor:
     """Simulate the cochlea so that each sample is close to pyclarity's, for output with its delay.
 
-    The delay of the middle ear's filters and of smearing is already in the input, and stays there.
+    The delay of the outer and middle ear and of smearing is already in the input, and stays there.
     If the signals end here, their last samples (or all, if they are short or have not been smeared)
     are computed with all channels at 44.1 kHz and with pyclarity's treatment of the end.
 

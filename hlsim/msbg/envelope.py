@@ -1,9 +1,10 @@
 """Envelopes of the channels: rectified signals after a low-pass of at most 75 Hz.
 
-Envelopes vary so slowly that they are computed once per *step* of 24 samples only, in three stages:
+Envelopes vary so slowly that they are computed only once per *step* of 24 samples at 44.1 kHz (24.5
+if signals run at 22.05 kHz), in three stages:
 
-1. Rectify each channel. For channels at reduced rates, ``detect`` computes the rectified channel
-   without the harmonics that would alias.
+1. Rectify each channel. For most channels at reduced rates, ``detect`` computes the rectified
+   channel without the harmonics that would alias.
 2. Average the rectified samples of each step with three running means, so that few frequencies
    alias. ``partial_means`` computes the contributions of each step to its own average and to those
    of its two neighbours.
@@ -26,7 +27,7 @@ from hlsim.msbg.filter_bank import FilterBank
 from hlsim.torchtools import DifferentiableFunction, constant
 
 STEP = 24
-"""Number of samples at 44.1 kHz from one value of an envelope, and of a gain, to the next."""
+"""Samples per step where signals run at 44.1 kHz: from one value of an envelope to the next."""
 
 HALF_RATE_STEP = 24.5
 """Samples at 44.1 kHz per step where signals run at 22.05 kHz: 1800 steps per second.
@@ -41,7 +42,7 @@ Together they have zeros of third order at the frequencies that alias to 0 Hz.
 """
 
 POWER_FLOOR = 1e-30
-"""Power in Pa^2 that is added to powers, which keeps the gradients of silence finite."""
+"""Number that is added to squared moduli, which keeps the gradients of silence finite."""
 
 
 def detect(signals: Tensor, harmonics: bool) -> Tensor:
@@ -75,7 +76,7 @@ def _modulus_with_harmonics(signals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Shape: complex (...) -> (...), (...), (...).
 
     Returns:
-        The result and the modulus in Pa, and the squared cosine of the phase.
+        The result, the modulus, and the squared cosine of the phase.
     """
     squared_modulus = power(signals).add_(POWER_FLOOR)
     squared_cosine = signals.real.square() / squared_modulus

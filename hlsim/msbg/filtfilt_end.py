@@ -7,8 +7,8 @@ starts the backward pass as if the signal had been constant after them. The Four
 
 The two envelopes differ by a *free oscillation* of the low-pass, which rings like a struck string.
 The low-pass is of second order, so that two amplitudes per channel describe the oscillation. They
-are weighted sums of the last samples of the channel. With a severe loss, the oscillation changes
-the last 50 ms by up to 1e-2 of the whole signal.
+are weighted sums of the last samples of the rectified channel. With a severe loss, the oscillation
+changes the last 50 ms by up to 1e-2 of the whole signal.
 """
 
 import numpy as np

@@ -46,16 +46,16 @@ that back, less at high frequencies and with more loss: without a loss 186 at 20
 """
 
 _POWER_FLOOR = 1e-30
-"""Smallest power in Pa^2 by which powers are divided."""
+"""Smallest power by which powers are divided, where 1 is 120 dB SPL."""
 
 HALF_RATE_HZ = 20000
 """Highest sample rate in Hz at which aligned signals run at 22.05 kHz inside the model."""
 
 _CPU_SAMPLES = 384_000
-"""Largest number of samples that are processed at once on a CPU, or with checkpointing."""
+"""Largest number of samples of several items at once on a CPU, or with checkpointing."""
 
 _DEVICE_SAMPLES = 12_000_000
-"""Largest number of samples that are processed at once on another device."""
+"""Largest number of samples of several items at once on another device."""
 
 
 class _Group(NamedTuple):
@@ -164,8 +164,8 @@ class MSBG(StoredEars, nn.Module):
         Raises:
             ValueError: There is no audiogram or an invalid one, a threshold is outside -10 to 100
                 dB HL (as in the standard audiogram ``"N7"``), the shapes do not fit, or the
-                waveform is not a floating-point tensor with time last, or has no samples or one
-                above 1e9 in magnitude.
+                waveform is not a floating-point tensor with time last, or has no samples or, on a
+                CPU, one above 1e9 in magnitude.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)
@@ -335,7 +335,7 @@ def estimate_delay(
 
     The input is an impulse: one second of zeros, except for one sample in the middle. The delay is
     the time from the impulse to the largest magnitude of the output. The delay depends on the ear
-    and on the level, because MSBG delays low frequencies more than high ones: at 44.1 kHz it is
+    and on the level, because MSBG delays low frequencies less than high ones: at 44.1 kHz it is
     1078 samples without a hearing loss and 1237 to 1271 samples with one. To align signals, use
     ``MSBG.delay``, in samples at 44.1 kHz, which depends only on the severity of the loss and on
     the argument ``smearing``.

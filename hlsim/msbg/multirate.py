@@ -1,16 +1,16 @@
 """The filter bank with each channel at a sample rate that its band needs.
 
-A gammatone channel passes a band of frequencies. It is kept up to five bandwidths above its centre
-frequency, where its gain is -40 to -49 dB, or up to the highest frequency of interest. Neighbouring
-channels form a *rate band* with a common sample rate and a common *detector*, the signal from which
-their envelopes are computed:
+A gammatone channel passes a band of frequencies. It is kept at least up to five bandwidths above
+its centre frequency, where its gain is -40 to -49 dB, or up to the highest frequency of interest.
+Neighbouring channels form a *rate band* with a common sample rate and a common *detector*, the
+signal from which their envelopes are computed:
 
 - ``"modulus"``: Narrow channels are analytic signals (complex signals without negative frequencies)
   at about 5.5 kHz, or at 9 to 13 kHz, depending on the highest frequency of interest. The modulus
   of an analytic signal is its envelope. Rectifying the channel would add harmonics, but the
   low-pass of the envelope removes them.
 - ``"harmonics"``: With severe losses, channels are so wide for their centre frequency that
-  harmonics reach down to 0 Hz. Two harmonics complete the modulus of these channels.
+  harmonics reach down to 0 Hz. Two harmonics complete the modulus of those below about 5.5 kHz.
 - ``"itself"``: The lowest channels, and the widest ones at 44.1 kHz, are rectified as in pyclarity.
 
 Channels whose centre frequency is far above the highest frequency of interest respond only with the
@@ -99,7 +99,7 @@ class RateBand:
 
 @dataclass(frozen=True)
 class MultirateBank:
-    """Filter bank for signals of one length, with each channel at its own sample rate.
+    """Filter bank for signals of one length, in bands of channels that share a sample rate.
 
     Attributes:
         bands: Rate bands, from the lowest channels up.

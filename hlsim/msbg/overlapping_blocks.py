@@ -1,7 +1,7 @@
-"""Processing of long signals in overlapping blocks of 8 s, which bounds the memory.
+"""Processing of long signals in overlapping blocks of about 8 s, which bounds the memory.
 
 Gradients of long signals use gradient checkpointing: each block is computed again in the backward
-pass, and its activations are not stored.
+pass, and its activations are not stored (except inside transforms such as ``torch.func.grad``).
 """
 
 import math
@@ -17,7 +17,7 @@ from hlsim.msbg.smearing import HOP
 from hlsim.torchtools import checkpointed
 
 _BLOCK_SECONDS = 8.0
-"""Duration of the output of a block."""
+"""Approximate duration of the output of a block."""
 
 # The output of a block depends on samples around it by the filters, the delay, and the low-pass
 # filters down to 1e-6.
@@ -40,7 +40,7 @@ def in_blocks(
 
     The overlap, 0.75 s before and 0.55 s after each block, covers the memory of MSBG, so the joined
     output equals that for the whole signal to about 1e-6. If a gradient is needed, blocks of long
-    signals use gradient checkpointing.
+    signals use gradient checkpointing, except inside transforms such as ``torch.func.grad``.
 
     Args:
         process: Function of the signals of a block, of the ears, and of whether the signals end
@@ -78,17 +78,17 @@ def block_bounds(samples: int, rate: int, seconds: float | None = None) -> list[
 
     Each block contributes about ``seconds`` to the output, and the last one half to one and a half
     times as much. The exact duration is a multiple of 16 s / gcd(rate, 75), and at least once this
-    value, which is 0.64 s at 16 kHz and 16 s at 16384 Hz. The input of a block begins at least
-    0.75 s earlier than its output and ends at least 0.55 s later, because MSBG's filters make the
-    output depend on these margins; the result for the margins is discarded. A signal of up to one
-    and a half blocks and the first margin is not divided, nor is the input of a block. Each
-    block begins where the frames of smearing and the steps of envelopes lie at the same samples as
-    in the whole signal.
+    value, which is 0.64 s at 16 kHz and 16 s at 16384 Hz. Inside the signal, the input of a block
+    begins at least 0.75 s earlier than its output and ends at least 0.55 s later, because MSBG's
+    filters make the output depend on these margins; the result for the margins is discarded. A
+    signal of up to one and a half blocks and the first margin is not divided. Each block begins
+    where the frames of smearing and the steps of envelopes lie at the same samples as in the whole
+    signal.
 
     Args:
         samples: Length of the signal in samples.
         rate: Sample rate in Hz.
-        seconds: Duration of the output of a block, by default 8 s.
+        seconds: Approximate duration of the output of a block, by default 8 s.
 
     Returns:
         Bounds of the input and the output of each block, as indices of half-open ranges.

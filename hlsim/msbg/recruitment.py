@@ -6,8 +6,8 @@ this growth: it is 1 at 105 dB SPL and falls towards soft sounds. (With a thresh
 it rises towards soft sounds.)
 
 The envelope varies so slowly that it and the gain are computed once per *step* of 24 samples at
-44.1 kHz. The gain is interpolated between steps. Where a small envelope makes the gain change fast,
-the envelope is interpolated instead.
+44.1 kHz (24.5 if signals run at 22.05 kHz). The gain is interpolated between steps. Where a small
+envelope makes the gain of a slight loss change fast, the envelope can be interpolated instead.
 
 Source: Moore and Glasberg (1993), Journal of the Acoustical Society of America 94, 2050-2062.
 """
@@ -39,7 +39,7 @@ AHEAD = _TAPS // 2
 """Number of the ``_TAPS`` steps that come after the sample."""
 
 _SLIGHT_RATIO = 1.3
-"""Expansion ratio at 24 dB HL, below which sudden changes of the gain are audible."""
+"""Expansion ratio at about 24 dB HL, below which sudden changes of the gain are audible."""
 
 _DIP_RATIO = 0.3
 """Value of an envelope relative to its neighbours below which it counts as a dip."""
@@ -129,17 +129,18 @@ def apply_gains(
     There is one gain per step, a group of neighbouring samples; the gains between are interpolated.
     Where the envelope goes through zero, because its low-pass overshoots, the gain changes
     suddenly. After a slight loss this is audible, because the inverse of the middle ear amplifies
-    high frequencies by more than 40 dB. There, the envelope is interpolated instead of the gain.
+    high frequencies by more than 40 dB. There, with the argument ``slight``, the envelope is
+    interpolated instead of the gain.
 
     Shape: (..., channels, time), (..., channels, steps), (rows, columns) -> (..., time), where time
-    is the number of steps times that of the samples in a step.
+    is the number of steps times ``columns / (rows - 5)``.
 
     Args:
-        channels: Band-pass signals in pascals.
+        channels: Band-pass signals, real, or analytic with alternating real and imaginary parts.
         gains: Gain of each channel and step, from ``recruitment_gains``.
         kernel: Weights from ``interpolation_kernel``.
         slight: Envelopes in pascals, (..., channels, steps), and expansion ratios, (...,
-            channels). They are needed if some ears have a slight loss.
+            channels), with which the gains of slight losses are corrected.
 
     >>> kernel = torch.from_numpy(interpolation_kernel()).float()
     >>> gains = torch.full((2, 8), 0.5)
@@ -213,9 +214,9 @@ def _pad_periodically(values: Tensor) -> Tensor:
 
 
 def _find_dips(envelopes: Tensor) -> Tensor:
-    """Find the steps where an envelope in Pa goes through or close to zero.
+    """Find the steps where an envelope in Pa is far smaller than close by, such as near zero.
 
-    Between such a step and the next, the envelope is below 0.3 times a neighbouring value.
+    At such a step or the next, it is below 0.3 times a value up to one step before or after both.
 
     Shape: (..., steps) -> bool (..., steps).
     """

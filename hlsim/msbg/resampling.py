@@ -186,7 +186,8 @@ def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
     Args:
         points: FFT length at 44.1 kHz.
         bins: Number of frequencies.
-        rate: Outer rate in Hz, that of input or output. The other rate is 44.1 kHz.
+        rate: Outer rate in Hz, that of input or output. The other rate is 44.1 kHz, or 22.05 kHz
+            if this one is at most 20 kHz.
 
     Returns:
         Weights from 0 to 1, (bins,).

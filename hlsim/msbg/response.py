@@ -1,10 +1,10 @@
 """MSBG as a linear filter: its effect on a signal where the gains of all channels are 1.
 
 This is all that MSBG does for a normal ear. The channels of its filter bank add up to a flat
-magnitude within a few decibels, but they shift the phase: at 1 to 2 kHz the output resembles the
-input with opposite sign more than the input. The phase depends on the filter bank, and so on the
-severity of the loss. Waveforms, phases and complex spectra of the output of MSBG can therefore only
-be compared with signals whose phase was shifted by the same filter bank.
+magnitude within a few decibels, but they shift the phase: at 1 to 2 kHz a normal ear's output
+resembles the input with opposite sign more than the input. The phase depends on the filter bank,
+and so on the severity of the loss. Waveforms, phases and complex spectra of the output of MSBG can
+therefore only be compared with signals whose phase was shifted by the same filter bank.
 """
 
 import math
@@ -38,8 +38,8 @@ _MIN_RELATIVE_MAGNITUDE = 0.1
 def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.complex128]:
     """Compute the frequency response of MSBG for sounds that it does not make softer.
 
-    MSBG is linear where the gains of all channels of its filter bank are 1, as for a normal ear.
-    The response is that of aligned MSBG, without a delay.
+    MSBG without smearing is linear where the gains of all channels of its filter bank are 1, as for
+    a normal ear. The response is that of aligned MSBG, without a delay.
 
     Args:
         bank: Filter bank of a severity, a value of ``hlsim.msbg.filter_bank.BANKS``.

@@ -1,8 +1,8 @@
 """Spectral smearing: what the wider auditory filters of an impaired ear do to a spectrum.
 
 The signal is cut into frames of 5.8 ms, one every 1.5 ms (a *hop*). The power spectrum of each
-frame is multiplied by a matrix that spreads it over neighbouring frequencies, and the phase is
-kept.
+frame is multiplied by a matrix that spreads it over neighbouring frequencies, and the phase is kept
+(or turned by 90 degrees where the product is negative).
 
 Source: Baer and Moore (1993), Journal of the Acoustical Society of America 94, 1229-1241.
 """
@@ -36,7 +36,7 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Factors by which the lower and the upper sides of the auditory filters are wider than normal.
 
-Without a hearing loss, nothing is smeared. The values are those of pyclarity 0.9.0.
+With the severity ``"none"``, nothing is smeared. The values are those of pyclarity 0.9.0.
 """
 
 SKIRT_HZ = 800.0
@@ -66,7 +66,8 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
 
     The filters are rounded exponentials, (1 + g) exp(-g), divided by their bandwidths relative to
     that of a normal filter at 0 Hz. g is the distance from the centre frequency in quarters of the
-    filter's equivalent rectangular bandwidth, which ``lower`` or ``upper`` widens.
+    filter's equivalent rectangular bandwidth, which ``lower`` or ``upper`` widens. The filter at
+    0 Hz passes this frequency only.
 
     Args:
         lower: Factor by which the lower sides of the filters are wider than normal.
@@ -186,10 +187,10 @@ def smear(waveform: Tensor, matrix: Tensor, rate_divisor: int = 1) -> Tensor:
 def _smear_spectrum(
     spectrum: Tensor, matrix: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Spread the power of spectra over neighbouring frequencies, and keep their phase.
+    """Spread the power of spectra over neighbouring frequencies.
 
-    Smearing can give a negative power. Its square root is imaginary, so that the phase turns by 90
-    degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is.
+    The phase is kept, unless smearing gives a negative power. Its square root is imaginary, so that
+    the phase turns by 90 degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is.
 
     Shape: complex (..., bins), (bins, bins) -> complex (..., bins), then (..., bins) each.
 

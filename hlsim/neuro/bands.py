@@ -25,8 +25,8 @@ class BandCorrection(nn.Module):
     The spectrogram is smeared and multiplied by the corrected gains of MSBG's channels. The inputs
     of the network are the fluctuation of each channel's log level about its log envelope (the
     smoothed level), and the difference between the log envelopes of neighbouring channels. Neither
-    changes with the level of the signal. The network predicts a correction of each channel's
-    envelope, and a factor for its gain.
+    changes with the level of a signal far above silence. The network predicts a correction of each
+    channel's envelope, and a factor for its gain.
 
     The degrees of hearing loss, or severities, have different filter banks in MSBG. Each severity
     has its own weights. Before training the last layer is 0, and the gains are those of the prior.

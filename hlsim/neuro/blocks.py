@@ -18,7 +18,7 @@ class ConvPath(nn.Module):
     transposed convolution of length 1 back to the number of channels. The output of the last layer
     is added to the input.
 
-    Source: the Neuro-MSBG paper, Section III.
+    Source: the Neuro-MSBG paper, Section II-A.
 
     Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 

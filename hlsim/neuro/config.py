@@ -103,9 +103,10 @@ class ModelConfig:
 class NetworkConfig(ModelConfig):
     """Sizes of the networks on spectrograms: Neuro-MSBG and ``MappingCompensator``.
 
-    Such a network encodes the spectrogram of its input on a coarser grid, processes it in
-    *dual-path blocks* (layers along time, then layers along frequency), and decodes it again. All
-    numbers are from 1 to 1024; ``dense_depth`` may also be 0.
+    Such a network, unless ``NeuroConfig.structure`` is another one, encodes the spectrogram of its
+    input on a coarser grid, processes it in *dual-path blocks* (layers along time, then layers
+    along frequency), and decodes it again. All numbers are from 1 to 1024; ``dense_depth`` may also
+    be 0.
 
     Attributes:
         fft: Length of the Fourier transform in samples at 16 kHz, an even number.
@@ -188,7 +189,7 @@ class NetworkConfig(ModelConfig):
 
     @property
     def receptive_field(self) -> int | None:
-        """Number of input samples at 16 kHz on each side of an output sample that influence it.
+        """Number of input samples at 16 kHz on each side of an output sample that can influence it.
 
         None if the output depends on the whole signal, as with layers other than convolutions.
         ``EarNetwork.receptive_field`` includes the prior.
@@ -228,7 +229,7 @@ class NeuroConfig(NetworkConfig):
         level_aware: Use the log magnitude and no normalisation, so that the gain depends on the
             level as it does in an ear. Otherwise the gain does not depend on the level, as in
             MP-SENet: each signal is scaled to an RMS of 1 and back, and instance normalisation
-            follows the convolutions.
+            follows the convolutions of encoder and decoders.
 
     Raises:
         ValueError: A value is out of range, or values do not fit together.

@@ -56,7 +56,8 @@ class Decoder(nn.Module):
             size: Number of frames and of frequencies of the spectrogram.
         """
         patches = self.leave(self.dense(features).permute(0, 2, 3, 1))
-        # (items, time, frequency, outputs * steps) -> (items, outputs, time, step, frequency, step)
+        # (items, time, frequency, outputs * step * step)
+        # -> (items, outputs, time, step, frequency, step)
         grid = patches.unflatten(-1, (-1, *self.stride)).permute(0, 3, 1, 4, 2, 5)
         return grid.flatten(4, 5).flatten(2, 3)[..., : size[0], : size[1]]
 

@@ -14,10 +14,10 @@ from hlsim.torchtools import checkpointed, pair_items
 # On a CPU, larger feature maps take time because the C library returns their memory to the system
 # after each operation.
 _CPU_SAMPLES = 128_000
-"""Number of samples at 16 kHz that run at once on a CPU."""
+"""Approximate number of samples at 16 kHz that run at once on a CPU."""
 
 _DEVICE_SAMPLES = 960_000
-"""Number of samples at 16 kHz that run at once on a GPU.
+"""Approximate number of samples at 16 kHz that run at once on a GPU.
 
 It applies to each item, or with ``checkpoint`` to all items together.
 """
@@ -30,8 +30,9 @@ class EarNetwork(nn.Module):
     Subclasses set ``config`` and implement ``process_items``.
 
     On a CPU, a few items run at a time. Long signals run in overlapping parts if a sample of the
-    output depends on a limited part of the input (``cnn`` blocks). The parts change the output by
-    rounding errors only, and limit the memory for long signals if no gradient is computed.
+    output depends on a limited part of the input (``cnn`` blocks, no normalisation). The parts
+    change the output by rounding errors only, and limit the memory for long signals if no gradient
+    is computed, or with ``checkpoint``.
 
     Args:
         sample_rate: Sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
@@ -78,7 +79,8 @@ class EarNetwork(nn.Module):
         Raises:
             ValueError: There is no audiogram, a threshold is outside -10 to 100 dB HL, shapes do
                 not broadcast, or the waveform is not a floating-point tensor with time last, has no
-                samples or one above 1e9 in magnitude, or is on another device than the weights.
+                samples or one above 1e9 in magnitude, or is on another device than the weights. The
+                values of tensors on a GPU are not validated.
         """
         check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         weight = next(self.parameters())
@@ -125,7 +127,7 @@ class EarNetwork(nn.Module):
         """Step and receptive field in samples at 16 kHz; None if the field is the whole signal.
 
         Parts of a signal must start at multiples of the step. The receptive field is the number of
-        input samples before and after an output sample that influence it.
+        input samples before and after an output sample that can influence it.
         """
         field = self.config.receptive_field
         return None if field is None else (self.config.step, field + self._additional_field)

@@ -3,7 +3,7 @@
 A network that starts from it has to learn corrections only. The steps are those of MSBG, on short
 frames instead of single samples:
 
-1. ``filter`` applies to the waveform the fixed filter that MSBG is for a normal ear.
+1. ``filter`` applies to the waveform the fixed filter that MSBG is where all gains are 1.
 2. *Smearing* spreads the power of each frame over neighbouring frequencies, as the broad filters of
    an impaired ear do.
 3. The power in each *channel* of MSBG's filter bank gives a level, and the level, smoothed over
@@ -67,7 +67,7 @@ measured in the channels of 32 clips to about 0.5 dB.
 """
 
 _GRID_RATIO = 160
-"""Number of points of the frequency grid for responses per frequency of the transform.
+"""Number of points of the frequency grid for responses per frequency of a transform at 16 kHz.
 
 44.1 kHz is 441 / 160 times 16 kHz, so that both rates share this grid.
 """
@@ -156,8 +156,8 @@ class BandGains(nn.Module):
         """Return the matrices that smear power spectra, with their learned correction.
 
         Returns:
-            Matrices, (severities, frequencies, frequencies). The first one, for ears without a
-            loss, is the identity.
+            Matrices, (severities, frequencies, frequencies). The first one, for the severity 0, is
+            the identity.
         """
         smearing = self._corrected("smearing")
         identity = torch.eye(smearing.shape[-1], dtype=smearing.dtype, device=smearing.device)
@@ -172,7 +172,7 @@ class BandGains(nn.Module):
         return self._corrected("excitation")
 
     def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
-        """Compute the RMS pressure of each channel of MSBG's filter bank in each frame.
+        """Compute the level of each channel of MSBG's bank: its mean magnitude in each frame.
 
         Shape: (items, frames, frequencies), (items,) -> (items, channels, frames) in Pa.
 

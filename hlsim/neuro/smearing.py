@@ -81,7 +81,8 @@ def smear_and_amplify(
 
     Args:
         spectrum: Spectrum of each frame in Pa, (items, frames, frequencies).
-        smeared_power: Power of the smeared spectrum in Pa^2, (items, frames, frequencies).
+        smeared_power: Power of the smeared spectrum in Pa^2, which may be negative, (items, frames,
+            frequencies).
         gains: Gain of each channel at the first frame of each step, and at the end of the last
             step, (items, steps + 1, channels). Between them, gains are linear.
         matrices: Matrices by which ``gains`` are multiplied for the real and for the imaginary

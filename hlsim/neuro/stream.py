@@ -66,8 +66,9 @@ class SimulatedStream:
             Perceived samples of the same shape.
 
         Raises:
-            ValueError: The number of samples is no multiple of ``block``, the chunk is no waveform,
-                it has another number of signals than the first chunk, or an ear is not valid.
+            ValueError: The number of samples is no multiple of ``block``, the chunk is no waveform
+                of this shape or has another number of signals than the first chunk, or an ear is
+                not valid.
         """
         signals = as_samples(chunk)
         check_waveform(signals, "chunk")

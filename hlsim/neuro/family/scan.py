@@ -1,4 +1,4 @@
-"""The selective scan, the recurrence of the Mamba layer, in torch alone and parallel over time.
+"""The selective scan, the recurrence of the Mamba layer, parallel over time.
 
 Each channel of a signal has several *states*, which remember its past: h[t] = decay[t] h[t - 1] +
 drive[t], where drive is the weighted input. In the order of Mamba's names: decay[t] = exp(delta[t]
@@ -19,10 +19,10 @@ from torch.nn import functional
 from hlsim.torchtools import DifferentiableFunction, differentiable_once
 
 _STATES_AT_ONCE_CPU = 2**18
-"""Number of states computed at once on a CPU, few enough for the cache of a core."""
+"""Number of states of several items at once on a CPU, few enough for the cache of a core."""
 
 _STATES_AT_ONCE_GPU = 2**26
-"""Number of states computed at once on a GPU, enough to keep it busy."""
+"""Number of states of several items at once on a GPU, enough to keep it busy."""
 
 
 def selective_scan(
