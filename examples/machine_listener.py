@@ -71,6 +71,7 @@ from hlsim.evaluation.digits.material import INTERNAL_NOISE_DB, INTERNAL_NOISE_H
 from hlsim.evaluation.running.fingerprint import fingerprint, value_hash
 from hlsim.evaluation.running.store import ScoreStore
 from hlsim.evaluation.study import Condition, Item, Measure, run_study
+from hlsim.extras import is_installed
 from hlsim.files import read_table, sha256
 from hlsim.plugins import load_plugin
 from hlsim.progress import ProgressLine
@@ -273,8 +274,18 @@ class Moonshine:
 
 
 def load_recogniser(name: str) -> Callable[[NDArray[np.float32]], str]:
-    """Return Moonshine for the name ``moonshine-tiny``, and Whisper for a folder."""
-    return Moonshine() if name == "moonshine-tiny" else Whisper(name)
+    """Return Moonshine for the name ``moonshine-tiny``, and Whisper for a folder.
+
+    Raises:
+        ModuleNotFoundError: The package of Moonshine is not installed.
+    """
+    if name != "moonshine-tiny":
+        return Whisper(name)
+    if not is_installed("moonshine_voice"):
+        raise ModuleNotFoundError(
+            "moonshine_voice is not installed; install it with: pip install moonshine_voice==0.0.48"
+        )
+    return Moonshine()
 
 
 class WordsCorrect:

@@ -91,6 +91,14 @@ def test_more_loss_costs_words_and_an_aid_returns_them(example: ModuleType) -> N
     assert shares["N4"]["aided"] > shares["N4"]["unaided"]
 
 
+def test_the_package_of_moonshine_is_named_where_it_is_missing(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(example, "is_installed", lambda module: False)
+    with pytest.raises(ModuleNotFoundError, match="pip install moonshine_voice=="):
+        example.load_recogniser("moonshine-tiny")
+
+
 def test_measure_is_loaded_by_its_name_and_finds_sentences(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
