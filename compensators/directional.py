@@ -135,9 +135,12 @@ class FilterAndSum(nn.Module):
             ValueError: See ``forward``.
         """
         self.check_microphones(waveform)
-        padded = functional.pad(waveform, (0, self.latency))
+        # Powers of soft sounds are 0 in half precision.
+        signals = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
+        padded = functional.pad(signals, (0, self.latency))
         with torch.autocast(waveform.device.type, enabled=False):
-            return self.process(padded, self.initial_state(waveform))[0]
+            output = self.process(padded, self.initial_state(signals))[0]
+        return output.to(waveform.dtype)
 
     def check_microphones(self, waveform: Tensor) -> None:
         """Raise ValueError unless a waveform has as many microphones and ears as the filters."""
@@ -187,11 +190,10 @@ class FilterAndSum(nn.Module):
             -> (..., ears, time).
         """
         points = fft_length(samples.shape[-1])
-        precise = samples.to(torch.promote_types(samples.dtype, torch.float32))
-        spectra = torch.fft.rfft(precise, points).unsqueeze(-4)
-        products = spectra * torch.fft.rfft(taps.to(precise), points)
+        spectra = torch.fft.rfft(samples, points).unsqueeze(-4)
+        products = spectra * torch.fft.rfft(taps.to(samples), points)
         output = torch.fft.irfft(products.sum((-3, -2)), points)
-        return output[..., taps.shape[-1] - 1 : samples.shape[-1]].to(samples.dtype)
+        return output[..., taps.shape[-1] - 1 : samples.shape[-1]]
 
     def stream(self, audiogram: AudiogramLike | None = None) -> MicrophoneStream:
         """Return a stream, which processes signals that arrive in chunks.
@@ -239,13 +241,14 @@ class MicrophoneStream:
                 sample that is NaN, infinite or above 1e9 in magnitude; or the aid rejects an ear or
                 a slider.
         """
-        signals = as_samples(chunk)
-        self._front_end.check_microphones(signals)
-        check_finite(signals, "the chunk")  # It would stay in the averages of powers.
+        samples = as_samples(chunk)
+        self._front_end.check_microphones(samples)
+        check_finite(samples, "the chunk")  # It would stay in the averages of powers.
+        signals = samples.to(torch.promote_types(samples.dtype, torch.float32))
         shape: torch.Size = self._zero.shape[:-1]
         if self._state is None:
             self._state = self._front_end.initial_state(signals)
-            self._zero = torch.zeros_like(signals[..., :1])
+            self._zero = torch.zeros_like(samples[..., :1])
         elif signals.shape[:-1] != shape:
             raise ValueError(
                 f"expected a chunk of shape {(*shape, 'time')} as before, got "
@@ -253,6 +256,7 @@ class MicrophoneStream:
             )
         with torch.autocast(signals.device.type, enabled=False):
             output, self._state = self._front_end.process(signals, self._state)
+        output = output.to(samples.dtype)
         return as_type_of(chunk, output if self.aid is None else self.aid(output))
 
     def flush(self) -> Tensor:

@@ -262,6 +262,21 @@ def test_autocast_does_not_change_a_front_end(noise: Tensor, dtype: torch.dtype)
         assert torch.equal(fast(signals), whole)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("build", FRONT_ENDS)
+def test_half_precision_is_that_of_the_samples_alone(
+    build: Callable[[], FilterAndSum], noise: Tensor
+) -> None:
+    samples = (1e-4 * noise[:8000].reshape(2, 2, 2000)).half()
+    front_end = build()
+    expected = front_end(samples.float()).half()
+    assert torch.equal(front_end(samples), expected)
+    stream = front_end.stream()
+    output = torch.cat((stream(samples[..., :900]), stream(samples[..., 900:]), stream.flush()), -1)
+    assert output.dtype == torch.float16
+    torch.testing.assert_close(output[..., front_end.latency :], expected, rtol=2e-3, atol=1e-7)
+
+
 def test_silence_gives_silence_and_finite_gradients() -> None:
     signals = torch.zeros(2, 2, 100, requires_grad=True)
     output = AdaptiveDifferentialMicrophone()(signals)
