@@ -46,7 +46,7 @@ from hlsim.evaluation.running.parallel import (
     run_parallel,
 )
 from hlsim.evaluation.study import Condition, cut_output
-from hlsim.files import read_json
+from hlsim.files import lock_folder, read_json
 from hlsim.progress import track
 from hlsim.torchtools import one_thread
 
@@ -171,7 +171,7 @@ def evaluate_scenes(
     Raises:
         ValueError: A file is missing, broken or contradicts another, a listener lacks an ear, an
             aid, enhancer or measure does not exist, a number is out of range, two conditions have
-            one name, or nothing could be scored.
+            one name, nothing could be scored, or another process evaluates scenes in ``out``.
         MissingExtraError: A package is not installed.
         OSError: The file of scores cannot be read.
     """
@@ -195,39 +195,40 @@ def evaluate_scenes(
         c.name: _measure_look_ahead(c, pairs[0], rate, microphones)
         for c in track(conditions, "conditions", len(conditions))
     }
-    write = partial(_write_signals, Path(out), conditions, folders, microphones, rate)
-    written = run_parallel(write, pairs, jobs=running.get("jobs"), dask=running.get("dask"))
-    recordings = []
-    for pair, files in track(written, "pairs of scene and listener", len(pairs)):
-        if isinstance(files, Crash):
-            files = {condition.name: ValueError(CRASH) for condition in conditions}
-        for side, ear in pair.listener.ears().items():
-            recordings.append(
-                RecordedItem(
-                    pair.scene,
-                    _reference_file(Path(out), pair),
-                    files,
-                    ear,
-                    pair.name,
-                    side,
-                    full_scale_spl=full_scale_spl,
-                    seed=seed,
+    with lock_folder(out):  # Scores would be those of the signals that another run writes.
+        write = partial(_write_signals, Path(out), conditions, folders, microphones, rate)
+        written = run_parallel(write, pairs, jobs=running.get("jobs"), dask=running.get("dask"))
+        recordings = []
+        for pair, files in track(written, "pairs of scene and listener", len(pairs)):
+            if isinstance(files, Crash):
+                files = {condition.name: ValueError(CRASH) for condition in conditions}
+            for side, ear in pair.listener.ears().items():
+                recordings.append(
+                    RecordedItem(
+                        pair.scene,
+                        _reference_file(Path(out), pair),
+                        files,
+                        ear,
+                        pair.name,
+                        side,
+                        full_scale_spl=full_scale_spl,
+                        seed=seed,
+                    )
                 )
-            )
-    aid_names = [condition.name for condition in conditions if condition.kind == "aid"]
-    evaluation = score_recordings(
-        recordings,
-        [replace(condition, process=None) for condition in conditions],
-        names,
-        precision=precision,
-        better_ear=True,
-        planned=[("haspi", NAL_R, name) for name in aid_names],
-        listen=listen,
-        played=[UNAIDED, NAL_R, *aid_names],
-        store=Path(out) / "scores.jsonl",
-        required=["haspi", "hasqi"],
-        **running,
-    )
+        aid_names = [condition.name for condition in conditions if condition.kind == "aid"]
+        evaluation = score_recordings(
+            recordings,
+            [replace(condition, process=None) for condition in conditions],
+            names,
+            precision=precision,
+            better_ear=True,
+            planned=[("haspi", NAL_R, name) for name in aid_names],
+            listen=listen,
+            played=[UNAIDED, NAL_R, *aid_names],
+            store=Path(out) / "scores.jsonl",
+            required=["haspi", "hasqi"],
+            **running,
+        )
     combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
     return replace(
         evaluation,

@@ -23,6 +23,7 @@ from hlsim.cli.main import main
 from hlsim.data import bundled
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import evaluate_scenes
+from hlsim.files import lock_folder
 from hlsim.report.recordings_page import _conditions_table
 
 RATE = 44100
@@ -428,3 +429,15 @@ def test_invalid_settings_are_rejected_before_anything_is_written(
     with pytest.raises(ValueError, match=message):
         evaluate_scenes(settings.pop("aids"), out=tmp_path / "out", **settings)
     assert not (tmp_path / "out").exists()
+
+
+def test_another_evaluation_in_one_folder_is_rejected(clarity: Path, tmp_path: Path) -> None:
+    """The first evaluation would score the outputs of the second one as its own."""
+    with (
+        lock_folder(tmp_path / "out"),
+        pytest.raises(ValueError, match="another process is writing to this folder"),
+    ):
+        settings = options(clarity)
+        settings["scenes"] = clarity / settings["scenes"]
+        evaluate_scenes({"aid": "nalr"}, out=tmp_path / "out", **settings)
+    assert not (tmp_path / "out" / "signals").exists()
