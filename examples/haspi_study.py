@@ -33,7 +33,7 @@ LISTENERS = 4
 
 
 def read_pair(clean_path: Path, noisy_path: Path) -> tuple[Tensor, Tensor, int]:
-    """Read clean and noisy speech, with the clean speech at 65 dB SPL.
+    """Read up to 3 s of clean and noisy speech, with the clean speech at 65 dB SPL.
 
     Both get the same gain, so that the signal-to-noise ratio does not change.
 

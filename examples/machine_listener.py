@@ -294,8 +294,8 @@ class WordsCorrect:
     The text is the item's fact ``text``, or that of its fact ``utterance`` in the file of sentences.
 
     Args:
-        recognise: Function of samples at 16 kHz, (time,), that returns a text; by default Whisper
-            from the folder in the environment variable ``WHISPER_MODEL``.
+        recognise: Function of samples at 16 kHz, (time,), that returns a text; by default the
+            recogniser that the environment variable ``WHISPER_MODEL`` names.
         sentences: Texts by utterance; by default those of the CSV file in ``WHISPER_SENTENCES``.
         simulator: Name of the simulated ear, as in ``load_simulator``.
     """
@@ -676,7 +676,7 @@ def print_report(table: DataFrame, normal: DataFrame, baseline: str) -> None:
 
 
 def choose_ears(audiograms: str | Path) -> dict[str, Audiogram]:
-    """Return four standard ears and four measured ones, at equal steps through a CSV file."""
+    """Return four standard ears and up to four measured ones, at equal steps through a CSV file."""
     ears = {name: Audiogram.standard(name) for name in STANDARD_EARS}
     measured = read_audiograms(audiograms, simulated=True)
     step = max(1, len(measured) // MEASURED_EARS)

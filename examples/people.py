@@ -16,8 +16,8 @@ It prints the tables of docs/people.md and draws its figures to the folder OUT, 
 - ``clarity_responses.csv``: see ``docs/figures/fit_words.py``.
 
 It takes about ten minutes on one core. Simulated values are kept in OUT and used again for the same
-ears; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers
-only, and the tables show the others, unless they say otherwise.
+ears; delete them after a change of a simulator. Numbers are fitted to persons with odd numbers, and
+the tables that use them show the others, unless they say otherwise.
 """
 
 import sys
@@ -257,7 +257,7 @@ def compare_recruitment(path: Path, out: Path) -> None:
 
 
 def draw_recruitment(rows: pd.DataFrame, path: Path) -> None:
-    """Draw UCL over the threshold: people as means of groups, simulated ears as lines."""
+    """Draw UCL over the threshold: people as dots and a line, simulated ears as means."""
     figure = Figure(figsize=(9.2, 6.4), layout="constrained")
     places = figure.subplots(2, 2).ravel()
     random = np.random.default_rng(0)

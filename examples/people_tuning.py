@@ -54,8 +54,8 @@ WINDOW = ((0.83, 0.0046), (0.17, 0.0166))
 BROADENING_LOSSES = (7.5, 25.0, 45.5, 66.0)
 """Losses in dB HL of no, mild, moderate and severe broadening, between which it is interpolated.
 
-They are the middles of MSBG's severities. The last one has no upper limit; 66 dB HL is as far above
-its lower limit as the middle of the moderate losses is above theirs.
+They are the middles of MSBG's severities. The last one has no upper limit; 66 dB HL is about as far
+above its lower limit as the middle of the moderate losses is above theirs.
 """
 
 _START_SECONDS, _SECONDS = 0.01, 0.18
@@ -64,10 +64,10 @@ _MASKER_OVER_PROBE_DB = np.arange(-20.0, 81.0, 10.0)
 
 
 def read_tuning(path: str | Path) -> pd.DataFrame:
-    """Read one row per ear and frequency: ear, group, audiogram, hz, threshold and depth.
+    """Read one row per ear and frequency: ear, group, audiogram, hz, thresholds and depth.
 
-    The thresholds are dB SPL at the headphone, and become dB HL by the mean thresholds of the
-    group of normal ears.
+    The column threshold has dB SPL at the headphone, and hearing_level dB HL, relative to the mean
+    thresholds of the group of normal ears.
     """
     table = pd.read_csv(path)
     table["hz"] = table.frequency_hz.astype(int)
@@ -133,7 +133,7 @@ def _detectability(with_probe: Tensor, without_probe: Tensor, hz: int) -> Array:
 
 
 def _threshold(levels: Array, detectability: Array) -> float:
-    """Return the first level at which the probe is no longer detected, or NaN without one."""
+    """Return the level where detection ends, or NaN if it ends at no level or before the first."""
     masked = np.flatnonzero(detectability < 0.0)
     if not len(masked) or masked[0] == 0:
         return float("nan")
@@ -152,7 +152,8 @@ def tuning_depth(simulator: nn.Module, ear: Audiogram, hz: int) -> float:
 
     Returns:
         Mean level in dB of the maskers at 0.7 and 1.3 times the frequency of the probe, minus that
-        of the masker at its frequency. NaN if no masker up to 80 dB above the probe masks it.
+        of the masker at its frequency. NaN if a masker masks the probe at none or at the lowest of
+        its levels, -20 to 80 dB relative to the probe.
     """
     probe_start = _START_SECONDS + MASKER_SECONDS + GAP_SECONDS
     probes = simulator(_tone(hz, probe_start, PROBE_SECONDS, _PROBE_SPL), ear)

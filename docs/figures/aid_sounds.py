@@ -9,7 +9,7 @@
   third octaves the ear hears the sound. They are those within 20 dB of the loudest that a normal
   ear hears, and in which the loss is below 80 dB HL. A third octave is heard if its level, the 95th
   percentile over 125 ms, exceeds the internal noise (ANSI S3.5-1997) plus the hearing loss.
-- Music, chords of decaying harmonic tones: HAAQI.
+- Music, chords of decaying harmonic tones: HAAQI, but for N5.
 """
 
 import argparse

@@ -5,11 +5,11 @@
 
 The model by Bruce, Erfani and Zilany (2018, Hearing Research 360) is independent of MSBG and HASPI.
 Two thirds of each loss are assigned to outer hair cells, or as much as they can cause, and the rest
-to inner hair cells (Bruce et al. 2003, JASA 113). For each ear, every aid processes one second of
-speech at 65 dB SPL, clean and with 7.5 dB SNR. The mean firing rates of 16 places from 200 to 7000
-Hz are compared with the response of a normal, unaided ear to the clean speech. The measures are
-NSIM (Hines and Harte 2012, Speech Communication 54), where 1 means equality, and the mean
-difference in spikes per second.
+to inner hair cells (Bruce et al. 2003, JASA 113). For each ear, every aid processes 3 s of speech
+at 65 dB SPL, clean and with 7.5 dB SNR. For the second in the middle, the mean firing rates of 16
+places from 200 to 7000 Hz are compared with the response of a normal, unaided ear to the clean
+speech. The measures are NSIM (Hines and Harte 2012, Speech Communication 54), where 1 means
+equality, and the mean difference in spikes per second.
 """
 
 import sys

@@ -8,7 +8,7 @@
 
 Every round times all rows of a table in turn, so that a ratio compares calls within seconds of each
 other. The first round is not counted. Tables show the median (minimum to maximum) of the other
-rounds.
+rounds, that of ``parts`` the median alone.
 """
 
 import argparse

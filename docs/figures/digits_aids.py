@@ -3,7 +3,8 @@
     python docs/figures/digits_aids.py [--ears N3 N4] [--simulator msbg] [--triplets 120]
         [--listener FOLDER]
 
-Each cell is the unaided minus the aided threshold in dB, with its interval of 95 %.
+The first row has the unaided thresholds. Each cell below is the unaided minus the aided threshold
+in dB, with its interval of 95 %.
 """
 
 import argparse

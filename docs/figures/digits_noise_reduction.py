@@ -4,11 +4,11 @@
         [--steady FOLDER]
 
 The sounds are the digit triplets of ``hlsim srt`` in their steady noise, and in recorded noises
-from the subfolders of a folder. The first table has the change of the signal-to-noise ratio (SNR)
-by the noise reduction of ``hearing-aid``. Its gains are computed from the mixture, and applied to
-the digits and to the noise alone. The second table has the share of digits that listeners recognise
-without noise reduction behind the exact MSBG of four aided ears, and its changes by noise reduction
-with 95 % intervals (bootstrap over triplets).
+from the subfolders of a folder. The first table has the changes of the signal-to-noise ratio (SNR)
+and of the digits' level by the noise reduction of ``hearing-aid``. Its gains are computed from the
+mixture, and applied to the digits and to the noise alone. The second table has the share of digits
+that listeners recognise without noise reduction behind the exact MSBG of four aided ears, and its
+changes by noise reduction with 95 % intervals (bootstrap over triplets).
 
 ``--steady`` writes steady noise to a folder, from which examples/machine_listener.py can take it.
 """

@@ -71,7 +71,7 @@ def read_responses(path: str | Path) -> pd.DataFrame:
 def count_words(percentages: pd.Series) -> int:
     """Return the smallest number of words of a sentence that the shares of its words allow.
 
-    Where nobody, or everybody, understood each word, it is 8, near the mean.
+    Where each response has all words or none, it is 8, near the mean.
     """
     shares = percentages.to_numpy() / 100.0
     if set(shares) <= {0.0, 1.0}:

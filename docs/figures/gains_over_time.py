@@ -35,7 +35,7 @@ POWER_FLOOR = 1e-12
 """Power that is added to those of bands, so that silence has a gain of 0 dB."""
 
 LIMIT_SPL = 110.0
-"""Largest sample in pascals, as for both aids: 110 dB SPL."""
+"""Level of the largest sample in dB relative to 20 micropascals, as for both aids."""
 
 
 class PromptGains(nn.Module):

@@ -11,7 +11,7 @@ Signals are seeded noise with the spectrum and the syllable rhythm of speech at 
 no audio file is read. TF32 rounds factors to 10 bits. By torch's defaults convolutions and cuDNN's
 LSTM use it (``torch.backends.cudnn.allow_tf32`` is true), and matrix products do not
 (``torch.backends.cuda.matmul.allow_tf32`` is false). The section "equality" measures these defaults
-and both extremes; every other section uses the defaults.
+and both extremes, and "machine" both extremes of matrix products; the others use the defaults.
 
 Predictions, made before the first run on a GPU
 -----------------------------------------------
@@ -83,7 +83,7 @@ Row = dict[str, Any]
 Step = Callable[[], Any]
 
 EARS = ("N1", "N3", "S2", "NH")
-"""Ears of the items of a batch, in turns: every severity, and no loss."""
+"""Ears of the items of a batch, in turns: a mild loss, two severe ones, and none."""
 
 PRECISIONS = {"default": (False, True), "ieee": (False, False), "tf32": (True, True)}
 """Whether matrix products and whether convolutions may use TF32."""
@@ -633,7 +633,7 @@ def calling_line() -> str:
 
 
 def capture(run: Run) -> None:
-    """CUDA graphs: of simulators and compensators forward, and of the loss with its gradient."""
+    """CUDA graphs: of simulators, aids and HASPI forward, and of the loss with its gradient."""
     items = 1 if run.sizes is SMALL else 4
     chosen = {"MSBG 16 kHz", "neuro-msbg", "neuro-msbg-cnn-narrow", "neuro-msbg-mamba", "HASPI"}
     for subject in speed_subjects():

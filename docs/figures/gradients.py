@@ -3,9 +3,9 @@
     python docs/figures/gradients.py SPEECH_DIR NOISE_DIR AUDIOGRAMS.csv [ITEMS]
 
 It prints the cosine between the gradients of ``HearingLossLoss`` with respect to the output of an
-aid, through a network and through the exact MSBG, as the median over the items. The last row
-compares the exact MSBG with itself, for the same signals shifted by half a hop of its frames (0.7
-ms). A simulator on other frames can hardly be closer.
+aid, through a network and through the exact MSBG, as the median over the items. The last row of a
+criterion compares the exact MSBG with itself, for the same signals shifted by half a hop of its
+frames (0.7 ms). A simulator on other frames can hardly be closer.
 """
 
 import sys

@@ -2,8 +2,8 @@
 
     python docs/figures/memory.py [--items 16] [--seconds 4]
 
-The items are white noise at 65 dB SPL for an N3 ear, and three times as loud before the loss. Each
-case runs in a process of its own. Prints a Markdown table in MB (10^6 bytes) with
+The clean items are white noise at 65 dB SPL for an N3 ear, and the outputs are three times as
+large. Each case runs in a process of its own. Prints a Markdown table in MB (10^6 bytes) with
 
 - activations: what autograd stores in the forward pass, where each storage counts once
 - peak: how much the largest resident memory of the process grows in forward and backward pass

@@ -271,7 +271,7 @@ class SavedNetwork(nn.Module):
 
 
 def judge(options: argparse.Namespace) -> None:
-    """Print HASPI and words correct of saved networks and NAL-R, and differences from both."""
+    """Print HASPI and words correct of saved networks and NAL-R, and their differences."""
     from examples import machine_listener as listener
 
     nalr, ears = NALR(), {options.ear: Audiogram.standard(options.ear)}

@@ -2,8 +2,8 @@
 FOLDER]
 
 The sounds are steady tones, white noise and a click at 50, 65 and 80 dB SPL. The table shows
-differences from the exact MSBG in dB. Tones that the exact MSBG attenuates below 0 dB SPL are
-ignored.
+differences in level from the exact MSBG, and for noise and click the SNR, in dB. Tones that the
+exact MSBG attenuates below 0 dB SPL are ignored.
 """
 
 import sys

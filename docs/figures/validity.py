@@ -1,9 +1,9 @@
 """Rank correlation of criteria with HASPI and HASQI: python docs/figures/validity.py SPEECH [NOISE]
 
 The signals are clean speech and seventeen degradations of it: 3 s at 65 dB SPL by four talkers, for
-the ears N2, N3 and N4. Each passes one of two fixed equalisers. With one, the ear perceives the
-bands of the clean speech at the levels of a normal ear. The other has half of its gain in dB. The
-noise has the spectrum of the speech, or is drawn from recordings in NOISE.
+the ears N2, N3 and N4. Each is scored behind each of two fixed equalisers. With one, the ear
+perceives the bands of the clean speech at the levels of a normal ear. The other has half of its
+gain in dB. The noise has the spectrum of the speech, or is drawn from recordings in NOISE.
 
 For each pair of talker and ear, the rank correlation of the negative loss with the scores is
 computed over the 18 signals. The table shows its mean and minimum over the pairs, the number of

@@ -2,11 +2,11 @@
 
     python docs/figures/whole_commands.py [ROUNDS]
 
-Two scenes of 4 s at 44.1 kHz, of bundled speech in babble, are scored for two listeners. The output
-is that of pyclarity's NAL-R. Each command runs as a process of its own. The times are those of all
-its processes, with one thread each; the commands run in turn, and the table has the median of the
-rounds. A first round, which is not counted, compiles the packages to bytecode, as pip does when it
-installs them.
+Two scenes of 4 s at 44.1 kHz, of bundled speech in babble, are scored for two listeners, with the
+output of pyclarity's NAL-R; the rows of 3 s have the noisy or clean speech itself. Each command
+runs as a process of its own. The times are those of all its processes, with one thread each; the
+commands run in turn, and the table has the median of the rounds. A first round, which is not
+counted, compiles the packages to bytecode, as pip does when it installs them.
 """
 
 import json
