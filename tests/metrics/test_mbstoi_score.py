@@ -82,11 +82,11 @@ def test_equals_pyclarity(
 def test_equals_pyclarity_of_silence(
     scenes: tuple[Tensor, Tensor], pyclarity: PyclarityOutputs, case: str
 ) -> None:
-    x, y = (signal[1].clone() for signal in scenes)
+    x, y = (signal[1, :, :14400].clone() for signal in scenes)
     if case == "clean pauses":
-        x[:, 6000:14000] = 0.0
+        x[:, 4000:10000] = 0.0
     elif case == "one ear pauses":
-        y[0, 6000:14000] = 0.0
+        y[0, 4000:10000] = 0.0
     elif case == "deaf in one ear":
         x[1] = y[1] = 0.0
     elif case == "nothing":

@@ -107,9 +107,9 @@ def signals_of(key: str) -> tuple[Tensor, Tensor]:
     """Return the clean signal and the output of a case of ``PARITY``."""
     _, rate, change = PARITY[key]
     if "music" in key:
-        clean = noisy = example_music(rate)
+        clean = noisy = example_music(rate)[: round(0.8 * rate)]
     elif "speech" in key:
-        clean = noisy = at_rate(hlsim.example_speech()[None, 8000:27200], rate)
+        clean = noisy = at_rate(hlsim.example_speech()[None, 8000:20800], rate)
     else:
         clips = pair(3, 0.3) if "hasqi" in key else pair()
         clean, noisy = (at_rate(signal, rate) for signal in clips)
@@ -152,7 +152,7 @@ def test_reference_that_is_amplified_already(pyclarity: PyclarityOutputs, key: s
     """Cadenza's later challenges score so, with NAL-R of 221 taps or with a compressor."""
     name, rate = key.partition(",")[0], 44100
     ear = N3 if name == "hasqi" else N4
-    clean = example_music(rate)
+    clean = example_music(rate)[: round(0.8 * rate)]
     aid = {"NAL-R": NALR(sample_rate=rate), "compressed": WDRC(sample_rate=rate)}
     amplified = {kind: module(clean, ear) for kind, module in aid.items()}[key.partition(", ")[2]]
     output = degrade(amplified)
@@ -188,16 +188,22 @@ def test_amplifying_the_reference_twice_changes_the_score(name: str) -> None:
 def test_identical_music_has_pyclaritys_score_below_1(
     pyclarity: PyclarityOutputs, name: str, unaided: float, amplified: float
 ) -> None:
-    """The module's docstring and the guide for Cadenza state these scores."""
+    """The module's docstring and the guide for Cadenza state these scores.
+
+    Pyclarity reproduces the stored score of one output for each ear.
+    """
     clean, ear = example_music(24000), Audiogram.standard(name)
     taps = nalr_taps(ear)
     by_nalr = functional.conv1d(clean[None], taps[None, None], padding="same")[0]
-    prepared = HaaqiReference(clean, ear, sample_rate=24000)
-    for kind, output, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
+    cases = {"clean": (clean, unaided), "NAL-R": (by_nalr, amplified)}
+    if pyclarity.computed and pyclarity.new_outputs is None:
+        del cases["NAL-R" if name == "N2" else "clean"]
+    for kind, (output, score) in cases.items():
         arguments = clean.numpy(), output.numpy(), ear, 24000, 7
         expected = float(pyclarity(f"haaqi, {kind}, {name}", reference.haaqi, *arguments)[0])
         if pyclarity.computed:
             continue  # as above
+        prepared = HaaqiReference(clean, ear, sample_rate=24000)
         result = prepared.score(output, noise="seeded", seed=7)
         assert float(result) == pytest.approx(expected, abs=1e-6)
         assert expected == pytest.approx(score, abs=0.005)
