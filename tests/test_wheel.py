@@ -58,14 +58,14 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     What the wheel requires is linked from this environment, because a copy takes gigabytes.
     """
     folder = tmp_path_factory.mktemp("environment")
-    run(sys.executable, "-m", "venv", folder, cwd=folder)
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder)
     [site] = folder.glob("lib/python*/site-packages")
     for name in requirements("hlsim"):
         for file in distribution(name).files or []:
             link = site / file.parts[0]
             if file.parts[0] not in ("..", "__pycache__") and not link.exists():
                 link.symlink_to(distribution(name).locate_file(file.parts[0]))
-    pip = (folder / "bin" / "python", "-m", "pip")
+    pip = (sys.executable, "-m", "pip", "--python", folder)
     run(*pip, "install", "--no-deps", wheel, cwd=folder)
     run(*pip, "check", cwd=folder)
     return folder
