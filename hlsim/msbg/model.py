@@ -147,6 +147,10 @@ class MSBG(StoredEars, nn.Module):
         self.smearing = smearing
         self.checkpoint = False
         self.store_ears(audiogram)
+
+    def store_ears(self, audiogram: AudiogramLike | None) -> None:
+        """Store ears as ``StoredEars`` does, and the frequencies at which they were measured."""
+        super().store_ears(audiogram)
         self._other_grids = ears_on_other_grids(audiogram)
 
     @not_compiled  # it depends on the values of the ears, and numpy designs its filters

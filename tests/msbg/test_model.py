@@ -307,6 +307,18 @@ def test_silence_gives_silence_with_finite_gradients(rate: int, dtype: torch.dty
         assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
 
 
+def test_stored_ears_replace_earlier_ones_at_other_frequencies() -> None:
+    waveform = 0.02 * torch.randn(2000)
+    ears = ({500: 20, 1500: 35, 4000: 80}, "N5", {500: 60, 4000: 60})
+    model = MSBG()
+    for ear in (*ears, None):
+        model.store_ears(ear)
+        if ear is not None:
+            assert torch.equal(model(waveform), model(waveform, ear))
+    with pytest.raises(ValueError, match="expected an audiogram"):
+        model(waveform)
+
+
 def test_autocast_has_no_effect_inside(speech: Speech) -> None:
     wave = speech_at(speech, seconds=0.2)
     model = fast_model(Audiogram.standard("N3"))
