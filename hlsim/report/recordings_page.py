@@ -1,5 +1,6 @@
 """The pages about recordings: those of ``haspi-report`` and of ``clarity``."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from hlsim.evaluation.clarity import RULE_MS
@@ -133,7 +134,7 @@ def scenes_page(evaluation: Evaluation) -> Page:
         f"No pair of aids could be compared with {NAL_R}."
     ]
     texts = [*evaluation.notes, *further_verdicts, _ABOUT_SCENES, HASQI_NOTE]
-    pictures = [*means_pictures(evaluation), *scores_pictures(evaluation)]
+    pictures = [*means_pictures(_shared_pairs(evaluation)), *scores_pictures(evaluation)]
     tables = [_conditions_table(evaluation)]
     sections = [
         Section("Conditions", texts, tables, pictures),
@@ -148,14 +149,12 @@ def _conditions_table(evaluation: Evaluation) -> Table:
     """Return a table with one row per condition.
 
     The columns are mean scores, the output level in dB SPL, and the look-ahead in ms. Means are
-    over the pairs of scene and listener that have scores under all conditions. A condition without
-    any score does not count for this.
+    over the pairs of ``_shared_pairs``.
     """
-    combined = evaluation.wide("combined").dropna(axis=1, how="all")
-    scored = combined.notna().all(axis=1)
-    table = evaluation.table[evaluation.table["item"].map(scored)]
-    shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
-    caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
+    table = _shared_pairs(evaluation).table
+    count, total = table["item"].nunique(), evaluation.table["item"].nunique()
+    shared = "" if count == total else f"the {count} that all conditions have scores of, of "
+    caption = f"Means of {shared}{total} pairs of scene and listener"
     look_ahead = evaluation.details["look_ahead_ms"]
     columns: Columns = {
         "HASPI": (statistic("haspi"), ".3f"),
@@ -165,3 +164,13 @@ def _conditions_table(evaluation: Evaluation) -> Table:
         "Look-ahead (ms)": (lambda rows: look_ahead[rows["condition"].iloc[0]], ".1f"),
     }
     return summary_table(caption, table, columns)
+
+
+def _shared_pairs(evaluation: Evaluation) -> Evaluation:
+    """Return the evaluation of the pairs of scene and listener with scores under all conditions.
+
+    A condition without any score does not count for this.
+    """
+    combined = evaluation.wide("combined").dropna(axis=1, how="all")
+    scored = combined.notna().all(axis=1)
+    return replace(evaluation, table=evaluation.table[evaluation.table["item"].map(scored)])

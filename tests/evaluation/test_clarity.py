@@ -23,8 +23,10 @@ from hlsim.cli.main import main
 from hlsim.data import bundled
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import evaluate_scenes
+from hlsim.evaluation.result import Evaluation
 from hlsim.files import lock_folder
-from hlsim.report.recordings_page import _conditions_table
+from hlsim.report import recordings_page
+from hlsim.report.recordings_page import _conditions_table, scenes_page
 
 RATE = 44100
 LOW_RATE = 16000
@@ -235,7 +237,9 @@ HIGHEST_PEAK = [np.inf]
 
 
 @pytest.mark.usefixtures("quick_scores")
-def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_path: Path) -> None:
+def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(
+    clarity: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mixes = [clarity / "scenes" / f"{name}_mix_CH1.wav" for name in PAIRS]
     peaks = [np.abs(soundfile.read(mix)[0]).max() for mix in mixes]
     HIGHEST_PEAK[0] = sum(peaks) / 2
@@ -248,6 +252,10 @@ def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_pat
     assert table.caption == caption
     scored = study.table[study.table.item != failure.item]
     assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in scored.haspi]
+    drawn: list[Evaluation] = []
+    monkeypatch.setattr(recordings_page, "means_pictures", lambda part: drawn.append(part) or [])
+    scenes_page(study)
+    assert drawn[0].wide("haspi").index.tolist() == scored.item.unique().tolist()
     assert (study.details["look_ahead_ms"]["choosy"] is None) == (peaks[0] > peaks[1])
     signals = tmp_path / "out" / "signals" / "choosy"
     assert len([*signals.iterdir()]) == 1
