@@ -154,7 +154,9 @@ def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) 
     """Return the sounds of the last utterance for the page.
 
     The first group has what a normal ear perceives of clean speech and what the impaired ear
-    perceives under each condition; the second one has clean speech and the outputs of the aids.
+    perceives under each condition but NAL-R at the level of the aid, which is the second group; the
+    third one has clean speech and the outputs of the aids. In a group with one gain for all, the
+    peaks of NAL-R at that level would make the other sounds too soft to be heard.
 
     Args:
         items: Items of the study.
@@ -164,10 +166,11 @@ def _last_sounds(items: Sequence[Item], outputs: _Signals, perceived: _Signals) 
     """
     item = items[-1]
     aided = {name: signals[-1] for name, signals in outputs.items() if name != UNAIDED}
+    last_perceived = {name: signals[-1] for name, signals in perceived.items()}
+    loud = {NAL_R_AT_LEVEL: last_perceived.pop(NAL_R_AT_LEVEL)}
     groups = {
-        "Perceived by this ear, beside a normal ear": {
-            name: signals[-1] for name, signals in perceived.items()
-        },
+        "Perceived by this ear, beside a normal ear": last_perceived,
+        "Perceived of NAL-R at the level of the trained aid": loud,
         "Output of the aids": {"original speech": item.clean, **aided},
     }
     return ItemSounds(item.name, item.ear, item.sample_rate, groups)

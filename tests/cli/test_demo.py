@@ -63,6 +63,10 @@ def test_demo_writes_a_page_that_agrees_with_the_table(
     evidence = text.splitlines()[1].rpartition(" (")[2]
     assert f"({evidence}</small>" in page and page.count("t-test p = ") == 1
     assert page.count("<audio") == 9 and "N4 (pure-tone average" in page
+    # NAL-R at the level of the aid has a row, and so a gain, of its own: other sounds can be heard
+    rows_of_sounds = ("Perceived by this ear", "Perceived of NAL-R at the", "Output of the aids")
+    first, loud, outputs = (page.index(heading) for heading in rows_of_sounds)
+    assert first < loud < outputs and page[loud:outputs].count("<audio") == 1
     for name in names:
         assert f">{means[name]:.3f}</td>" in page
     assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0
