@@ -98,7 +98,7 @@ def test_differences_of_equal_size_share_a_rank(scale: float) -> None:
     assert c.p_w == pytest.approx(2 * 56 / 1024, abs=0.005)
 
 
-SCORES = draw(12)[0].tolist()
+SCORES = draw(8)[0].tolist()
 
 
 @pytest.mark.filterwarnings("error")
