@@ -249,7 +249,8 @@ class BeamformingAid(DirectionalAid, HubModel):
 def _subtract(frames: Tensor, weights: Tensor) -> Tensor:
     """Subtract the filtered signals without sound from the front from the beams.
 
-    Over a hop, the filters change linearly from the weights before it to the next ones.
+    Over a hop, the filters change linearly from the weights before it to the next ones. The result
+    is ``LOOK_AHEAD_SAMPLES`` late.
 
     Shape: (..., hops, signals, ears, FRAME), (..., hops + 1 or more, blocked signals, ears, bands)
         -> (..., ears, hops * HOP).

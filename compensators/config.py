@@ -73,8 +73,8 @@ class HearingAidConfig(ModelConfig):
         opening: Time constant in seconds, 0 to 1, with which the attenuation of noise decreases.
         closing: Time constant in seconds, 0.01 to 2, with which the attenuation of noise increases.
         cap_db: Largest amplification of a band in dB, 0 to 80.
-        quiet_spl: Level of the whole frame in dB SPL, 0 to 80, below which the amplification fades.
-            Frames that are 15 dB softer than this level are not amplified.
+        quiet_spl: Level of the whole frame in dB SPL, smoothed by ``attack`` and ``release``, 0 to
+            80, below which the amplification fades. At 15 dB below it, there is none.
         limit_spl: Peak of the output in dB SPL, 60 to 140, that no sample exceeds.
 
     Raises:

@@ -239,25 +239,29 @@ class MicrophoneStream:
             ValueError: The chunk is not a floating-point waveform, or has no samples, another
                 number of microphones or ears, other leading dimensions than the first one, or a
                 sample that is NaN, infinite or above 1e9 in magnitude; or the aid rejects an ear or
-                a slider.
+                a slider. A rejected chunk leaves the stream as it was.
         """
         samples = as_samples(chunk)
         self._front_end.check_microphones(samples)
         check_finite(samples, "the chunk")  # It would stay in the averages of powers.
         signals = samples.to(torch.promote_types(samples.dtype, torch.float32))
         shape: torch.Size = self._zero.shape[:-1]
-        if self._state is None:
-            self._state = self._front_end.initial_state(signals)
-            self._zero = torch.zeros_like(samples[..., :1])
+        state = self._state
+        if state is None:
+            state = self._front_end.initial_state(signals)
         elif signals.shape[:-1] != shape:
             raise ValueError(
                 f"expected a chunk of shape {(*shape, 'time')} as before, got "
                 f"{tuple(signals.shape)}; call flush before a signal of another shape"
             )
         with torch.autocast(signals.device.type, enabled=False):
-            output, self._state = self._front_end.process(signals, self._state)
+            output, state = self._front_end.process(signals, state)
         output = output.to(samples.dtype)
-        return as_type_of(chunk, output if self.aid is None else self.aid(output))
+        if self.aid is not None:
+            output = self.aid(output)
+        # The aid may reject the chunk, which then has not changed this stream.
+        self._state, self._zero = state, torch.zeros_like(samples[..., :1])
+        return as_type_of(chunk, output)
 
     def flush(self) -> Tensor:
         """Return the end of the output, which is still missing because of the delay.

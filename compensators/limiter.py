@@ -41,7 +41,7 @@ def soft_limit(waveform: Tensor, limit_spl: float) -> Tensor:
     Up to half of the limit, samples are attenuated by less than 0.005 dB.
 
     Args:
-        waveform: Samples in pascals. Any shape.
+        waveform: Samples in pascals, float32 or float64. Any shape.
         limit_spl: Limit of the magnitude of each sample of the result, in dB relative to 20
             micropascals.
 

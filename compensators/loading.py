@@ -124,7 +124,9 @@ def save_compensator(model: Trained, folder: str | Path, audiogram: EarLike | No
 
 
 def trained_for(name: str | Path) -> Audiogram | None:
-    """Return the ear for which a compensator was trained; None for all ears or a prescription.
+    """Return the ear for which a compensator was trained, or None if there is no single one.
+
+    This is so for aids for all ears, prescriptions and checkpoints of simulators.
 
     Args:
         name: Name or folder, as in ``load_compensator``.

@@ -122,7 +122,8 @@ def _powers(frames: int, past: float) -> NDArray[np.float64]:
 def _weights(frames: int, past: float) -> NDArray[np.float64]:
     """Return the matrix that turns values of frames into their exponential averages.
 
-    The averages start from 0. Returns: Lower triangular, (frames, frames).
+    The averages start from 0, and ``past`` is the weight of the past, 0 to below 1. Returns: Lower
+    triangular, (frames, frames).
     """
     distance = np.arange(frames)[:, None] - np.arange(frames)
     return np.where(distance >= 0, (1.0 - past) * past ** np.maximum(distance, 0), 0.0)

@@ -475,12 +475,13 @@ class Stream:
 
     Raises:
         ValueError: For the constructor: the aid has another sample rate, rejects the ear or has no
-            such slider. For a call: a slider is outside 0 to 1 (on a GPU this is not checked, and
-            the output is NaN until ``flush``) or does not broadcast to the items, the leading
+            such slider. For a call: a slider is outside 0 to 1 (a tensor on a GPU is not checked,
+            and the output is NaN until ``flush``) or does not broadcast to the items, the leading
             dimensions differ from those of earlier chunks or do not fit the ears, there are no
-            samples, samples are no floating-point numbers or above 1e9 in magnitude, or a sample is
-            NaN or infinite, which would affect all later output. A rejected chunk leaves the stream
-            as it was. A rejected value of a slider stays until ``set`` replaces it.
+            samples, samples are no floating-point numbers or, on a CPU, above 1e9 in magnitude, or
+            a sample is NaN or infinite, which would affect all later output. A rejected chunk
+            leaves the stream as it was. A rejected value of a slider stays until ``set`` replaces
+            it.
 
     >>> import hlsim
     >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")
@@ -563,16 +564,17 @@ class Stream:
                 slider are not valid.
         """
         is_first = not self._state
+        batch, fitted = self._batch, self._fitted
         if is_first:
-            self._shape = chunk.shape[:-1]
-            self._batch, self._fitted = self._aid.prepare(chunk, self._audiogram)
+            batch, fitted = self._aid.prepare(chunk, self._audiogram)
         elif chunk.shape[:-1] != self._shape:
             raise ValueError(
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
                 f"got {tuple(chunk.shape)}; call flush before a signal of another shape"
             )
-        self._sliders = self._aid.stack_sliders(self.sliders, self._batch, self._fitted)
+        self._sliders = self._aid.stack_sliders(self.sliders, batch, fitted)
         if is_first:
+            self._shape, self._batch, self._fitted = chunk.shape[:-1], batch, fitted
             self._state = self._aid.initial_state(self._sliders)
             self._partial_hop = self._fitted.new_zeros(len(self._fitted), 0)
 

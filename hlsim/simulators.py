@@ -50,9 +50,10 @@ _LOWEST_PLUGIN_RATE = 1000
 class Attenuation(StoredEars, nn.Module):
     """Linear ear: each frequency is attenuated by the hearing loss, and nothing else happens.
 
-    The gain in dB at a frequency is the threshold in dB HL times -1. Thresholds are interpolated
-    linearly in Hz, and constant below 250 Hz and above 8 kHz. There is neither recruitment
-    nor smearing nor delay. Use this ear beside MSBG to see whether a result depends on these.
+    The gain in dB at a frequency is the threshold in dB HL times -1. Those at the eight
+    ``FREQUENCIES`` are interpolated linearly in Hz, and constant below 250 Hz and above 8 kHz.
+    There is neither recruitment nor smearing nor delay. Use this ear beside MSBG to see whether a
+    result depends on these.
 
     Args:
         audiogram: Ear or ears; they may be passed with each call instead.

@@ -163,6 +163,7 @@ def map_on_cores(
         arguments: Arguments of the calls.
         signal: Tensor on which the function depends. If it is not on a CPU, or its gradient is
             recorded, the calls are made in this thread, to which the hooks of autograd belong.
+            Other threads record no gradients, so no other tensor may need one.
 
     Returns:
         Results in the order of the arguments.

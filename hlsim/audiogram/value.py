@@ -199,8 +199,9 @@ class Audiogram:
         They are those that were measured, ``ucl``, or else predicted from the thresholds (see
         ``hlsim.audiogram.discomfort``, which states the error of the prediction, 8.7 dB RMS).
         Between measured frequencies, the difference of the levels from the prediction is
-        interpolated over log frequency; beyond them it is constant. A measured level of 115 dB HL
-        or more means that it was not reached, so it can raise the prediction, but not lower it.
+        interpolated over log frequency; beyond them it is constant. The result is not below the
+        threshold. A measured level of 115 dB HL or more means that it was not reached, so it can
+        raise the prediction, but not lower it.
 
         Args:
             frequencies: Frequencies of the result in Hz.
@@ -230,6 +231,7 @@ class Audiogram:
             is_reached = measured < UCL_NOT_REACHED
             difference = np.where(is_reached, difference, np.maximum(difference, 0.0))
             levels = levels + interpolate_over_log(hertz, measured_hz, difference)
+            levels = np.maximum(levels, self._interpolate(hertz))
         return tuple(round(level, 6) for level in levels.tolist())
 
     def _interpolate(self, frequencies: Numbers) -> NDArray[np.float64]:
@@ -605,14 +607,14 @@ def _parse_level(text: str, column: str, lowest: float, highest: float, advice: 
 
 
 def _as_array(values: Any) -> NDArray[np.float64]:
-    """Convert a sequence of numbers into a float64 array with NaN in place of ``None``.
+    """Convert numbers, or texts of numbers, into a float64 array with NaN in place of ``None``.
 
     Raises:
-        ValueError: The value is not a sequence of numbers.
+        ValueError: The value is not a sequence of numbers, or its gradient is recorded.
     """
     try:
         numbers = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         numbers = np.array(math.nan)
     if numbers.ndim != 1:
         raise ValueError(

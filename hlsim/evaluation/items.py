@@ -363,7 +363,8 @@ def _level_and_snr(ear: int, turn: int, levels: Sequence[float]) -> tuple[float,
 
     Args:
         ear: Number of the ear, or of the kind of ear.
-        turn: Number of earlier items with this ear.
+        turn: Number of earlier items with this ear, where a clean and a noisy item of a pair count
+            as one.
         levels: Levels in dB SPL, -20 to 140.
 
     Returns:

@@ -333,7 +333,9 @@ def network_loss(simulator: nn.Module) -> Measure:
     The loss is that of ``HearingLossLoss(criterion="bands")`` with a network as the simulator: it
     compares what the ear perceives of the output with what a normal ear perceives of the clean
     speech. The column ``loss_msbg`` of the measure ``PERCEPTION`` is the same loss with the exact
-    MSBG, so that both show whether an aid exploits errors of the network.
+    MSBG, so that both show whether an aid exploits errors of the network. For an ear that was
+    measured at other frequencies than the eight of the network, they differ by MSBG's
+    interpolation, too.
 
     Args:
         simulator: The network, a Neuro-MSBG for the sample rate of the items and signals in

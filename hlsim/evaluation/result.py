@@ -231,7 +231,7 @@ class Evaluation:
 
 
 def _replace_nonfinite(value: Any) -> Any:
-    """Return a copy of nested dicts and lists for JSON, with None in place of NaN and infinity."""
+    """Return a copy of nested dicts and lists with None in place of Python's NaN and infinity."""
     if isinstance(value, Mapping):
         return {key: _replace_nonfinite(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -317,8 +317,8 @@ def run_study(
 
     Raises:
         ValueError: There are no items, conditions or measures; two conditions or measures have the
-            same name; a fact or a measured value has the name of another column; no scheduler
-            answers; or the store cannot be written.
+            same name; a fact or a measured value has the name of another column or of one that is
+            reserved for the report; no scheduler answers; or the store cannot be written.
         MissingExtraError: A package is not installed.
 
     >>> signal = torch.ones(1600)

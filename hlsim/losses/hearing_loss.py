@@ -424,7 +424,8 @@ class HearingLossLoss(StoredEars, nn.Module):
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Apply ``function``, such as that of ``.to()``, to modules that are not registered, too.
 
-        They move to other devices and to float64, but not to half precision.
+        They move to other devices except meta, and between float32 and float64, but not to half
+        precision.
         """
 
         def move(tensor: Tensor) -> Tensor:

@@ -19,15 +19,19 @@ def interaural_loss(output: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
     Gains and delays that are equal in both ears are ignored. The loss of an octave is the error of
     the level difference in bels (10 dB), plus 1 minus the cosine of the error of the phase
     difference. The result is a mean over five octaves around 250 Hz to 4 kHz, in which octaves
-    where clean speech is soft have less weight.
+    where clean speech is soft have less weight. Differences are those of mean spectra over the
+    whole signal, so that changes over time may cancel.
 
     Args:
         output: Output of an aid for the left and the right ear in Pa. Shape: (..., 2, time).
         clean: Clean speech at the left and the right ear in Pa. Shape: (..., 2, time).
-        sample_rate: Sample rate in Hz.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns:
         One loss per pair of ears, about 0 for equal differences. Shape: (...).
+
+    Raises:
+        ValueError: The rate is out of range.
 
     >>> noise = torch.randn(2, 16000)
     >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)

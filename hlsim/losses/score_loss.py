@@ -41,8 +41,9 @@ def score_loss(
         Loss of each item, 0 to 1. Shape: (items,).
 
     Raises:
-        ValueError: An item is shorter than 0.7 s, or an argument is not valid; the message has the
-            index of the item.
+        ValueError: An item is shorter than 0.7 s or its ear is not valid, with its index in the
+            message; or the number of ``lengths`` or the rate is wrong.
+        KeyError: There is no such score.
 
     >>> speech = torch.randn(1, 16000)
     >>> loss = score_loss("haspi", speech, speech, torch.zeros(1, 8), [16000], 16000)

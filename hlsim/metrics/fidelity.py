@@ -208,7 +208,8 @@ def _score(
 
     Raises:
         ValueError: The signals are not what ``_check_signals`` accepts, the output is silent, or
-            the package raises an error or returns a value that is not finite.
+            the package raises an error, returns a value that is not finite, or (pystoi) finds too
+            little speech.
     """
     x, y = _check_signals(clean, output)
     if not y.any():

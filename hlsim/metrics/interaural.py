@@ -70,7 +70,6 @@ def interaural(waveform: Samples, *, sample_rate: int = 16000) -> Interaural:
     >>> interaural(torch.stack((10.0 * noise, noise))).level.round()
     tensor([20., 20., 20., 20., 20.], dtype=torch.float64)
     """
-    check_rate(sample_rate)
     waveform = check_waveform(as_samples(waveform))
     check_two_channels(waveform)
     left, right, cross, octaves = spectra_of_ears(waveform.detach().double(), sample_rate)
@@ -128,16 +127,20 @@ def spectra_of_ears(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor,
 
     Args:
         waveform: Waveforms of the left and the right ear in Pa. Shape: (..., 2, time).
-        sample_rate: Sample rate in Hz.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
 
     Returns:
         Power spectra of the left and of the right ear in Pa^2, (..., frequencies) each; the complex
         cross spectrum, left times conjugate of right, (..., frequencies); and a matrix with 1 where
         a frequency lies in an octave and 0 elsewhere, (frequencies, 5).
 
+    Raises:
+        ValueError: The rate is out of range.
+
     >>> spectra_of_ears(torch.randn(2, 16000), 16000)[0].shape
     torch.Size([257])
     """
+    check_rate(sample_rate)
     stft, _, scale = band_analysis(waveform, sample_rate)
     spectra = stft.analyse(waveform.reshape(-1, waveform.shape[-1])) * scale**0.5
     left, right = spectra.reshape(*waveform.shape[:-1], *spectra.shape[-2:]).unbind(-3)

@@ -118,6 +118,9 @@ def _score_batch(signals: Tensor, rate: int) -> Tensor:
 
     Returns:
         Scores. Shape: (items,).
+
+    Raises:
+        ValueError: Without pauses, an item has 30 frames or fewer.
     """
     frames, counts = _remove_silence(_resample(signals.movedim(0, 2), rate))
     return _mean_correlation(_band_features(frames), counts)

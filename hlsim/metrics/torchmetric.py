@@ -275,7 +275,8 @@ class HASPI(_MeanScore):
         options: Keyword arguments of ``torchmetrics.Metric``, except ``dist_sync_on_step``.
 
     Raises:
-        ValueError: A value is out of range, or ``dist_sync_on_step`` is true.
+        ValueError: A value is out of range, the audiogram is not valid, or ``dist_sync_on_step`` is
+            true.
 
     >>> from hlsim import example_speech
     >>> speech, metric = example_speech()[:16000], HASPI()

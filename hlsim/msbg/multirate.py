@@ -123,7 +123,7 @@ def _rate_and_detector(
     """Choose the sample rate of a channel, and the detector, from which its envelope is computed.
 
     A rate is stated in samples per step. A step is the time between two values of an envelope: 24
-    samples at 44.1 kHz, or 24.5 if the signals have 22.05 kHz.
+    samples at 44.1 kHz, or for signals at 22.05 kHz the time of 24.5 samples at 44.1 kHz.
 
     Args:
         bank: Filter bank of the channel.

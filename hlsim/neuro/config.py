@@ -174,7 +174,7 @@ class NetworkConfig(ModelConfig):
 
     @property
     def stft(self) -> STFT:
-        """Short-time Fourier transform with which the network computes spectrograms."""
+        """Transform (``fft``, ``window``, ``hop``) by which spectrograms are computed."""
         return STFT(self.fft, self.window, self.hop)
 
     @property

@@ -44,6 +44,11 @@ def test_a_level_that_was_not_reached_is_a_lower_bound(measured: float, expected
     assert deaf.uncomfortable_levels([1000.0]) == (max(measured, 116.9) if measured > 114 else 114,)
 
 
+def test_no_uncomfortable_level_is_below_the_threshold() -> None:
+    ear = Audiogram({500: 20, 4000: 90}, ucl={500: 60})
+    assert ear.uncomfortable_levels([500, 4000]) == (60.0, 90.0)
+
+
 @pytest.mark.parametrize("frequencies", [1000, 1000.0, "low", [0.0], [None], [float("nan")]])
 def test_bad_frequencies_are_rejected(frequencies: Any) -> None:
     with pytest.raises(ValueError, match=r"list of frequencies in Hz, such as \[500, 1000\]"):

@@ -142,7 +142,10 @@ def test_pyclaritys_audiograms_are_ears() -> None:
     assert levels.tolist() == [list(ear.levels), [10, 15, 19, 25, 28, 31, 35, 38]]
 
 
-def test_a_name_in_place_of_levels_is_refused_with_the_fix() -> None:
+def test_levels_that_are_no_list_of_numbers_are_refused_with_the_fix() -> None:
+    for levels in ([10**400] * 8, torch.zeros(8, requires_grad=True)):
+        with pytest.raises(ValueError, match="expected a list of numbers"):
+            Audiogram(levels)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"got 'N3'; .* write Audiogram\.standard\('N3'\)"):
         Audiogram("N3")
 

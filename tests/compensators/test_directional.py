@@ -180,6 +180,18 @@ def test_a_directional_aid_has_a_stream_and_takes_arrays(noise: Tensor) -> None:
     assert isinstance(aid.front_end(signals.numpy()), np.ndarray)
 
 
+def test_a_chunk_that_the_aid_rejects_does_not_change_the_front_end(noise: Tensor) -> None:
+    aid = DirectionalAid(BinauralMVDR(), HearingAid())
+    first, second = (0.02 * noise[:8000].reshape(2, 2, 2000)).split(1000, -1)
+    stream, undisturbed = aid.stream(["N2", "N4"]), aid.stream(["N2", "N4"])
+    for chunk in (first, second):
+        stream.aid.set(noise_reduction=2.0)
+        with pytest.raises(ValueError, match="noise_reduction"):
+            stream(chunk)
+        stream.aid.set(noise_reduction=0.5)
+        assert torch.equal(stream(chunk), undisturbed(chunk))
+
+
 def test_the_stream_of_the_shipped_aid_is_the_whole_signal_delayed(noise: Tensor) -> None:
     aid = load_compensator("hearing-aid-directional")
     scene = make_scene(hlsim.example_speech()[8000:24000], [noise], [120.0], snr=0.0)

@@ -68,6 +68,14 @@ def test_chunks_of_any_size_equal_the_whole_signal(
     assert_close(stream(signal)[:, 64:], whole[:, :-64])  # flush begins again
 
 
+def test_a_rejected_first_chunk_leaves_the_stream_as_it_was(noise: Tensor) -> None:
+    stream = varied_hearing_aid().stream(EAR, noise_reduction=2.0)
+    with pytest.raises(ValueError, match="noise_reduction"):
+        stream(noise)
+    stream.set(noise_reduction=0.5)
+    assert stream.flush().shape == (64,)
+
+
 @both_aids
 def test_a_stream_uses_the_ear_of_the_aid(name: str, noise: Tensor) -> None:
     aid = build_wearable(name, audiogram=EAR)

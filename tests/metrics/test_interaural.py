@@ -69,6 +69,8 @@ def test_the_loss_depends_only_on_differences_between_the_ears(scene: Tensor) ->
     assert float(interaural_loss(later, scene, 16000)) > 0.2
     loss_of_silence = interaural_loss(scene, torch.zeros_like(scene), 16000)
     assert float(loss_of_silence) == pytest.approx(0.0, abs=1e-5)
+    with pytest.raises(ValueError, match="sample_rate"):
+        interaural_loss(scene, scene, 5000)
 
 
 @pytest.mark.parametrize("left", [1.0, 0.0])

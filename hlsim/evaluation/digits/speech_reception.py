@@ -84,6 +84,9 @@ several microphones, (items, ..., time).
 class ReceptionThreshold:
     """Speech reception thresholds in noise. The lower a threshold, the better.
 
+    The values of an ``Estimate`` are numbers for one ear, and arrays for several ears. A threshold
+    above 32 dB is infinite, with its interval; ``benefit`` is then infinite or NaN.
+
     Attributes:
         unaided: Threshold without an aid, as signal-to-noise ratio in dB.
         aided: Threshold with the aid, or None without an aid.

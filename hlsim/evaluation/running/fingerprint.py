@@ -127,13 +127,14 @@ def value_hash(value: Any) -> str:
     Args:
         value: Text, number of Python, list, or dict (in any order), nested as you like, with
             tensors, arrays, dataclasses, modules with a fingerprint, and functions and classes. Of
-            a function or class of hlsim or torch, only the name counts; of another one, also its
-            attribute ``fingerprint`` or the file with its source code and the user's files that it
-            imports.
+            a function or class of hlsim or torch, only the name counts; of another one, also the
+            file with its source code and the user's files that it imports, or the attribute
+            ``fingerprint`` of a function in place of these.
 
     Raises:
-        TypeError: The value contains something else, such as a lambda or another function within a
-            function, or a module whose ``fingerprint`` is None.
+        TypeError: The value contains something else, such as a function without ``fingerprint``
+            that is a lambda, lies within a function or has no source file, or a module whose
+            ``fingerprint`` is None.
 
     >>> value_hash({"a": 1, "b": [2.0]}) == value_hash({"b": [2.0], "a": 1})
     True
@@ -257,10 +258,10 @@ def _describe(value: Any) -> Any:
 def _hash_code(code: Any) -> str | None:
     """Return the fingerprint of a function, or else the hash of the source of a function or class.
 
-    It is None for compiled code, such as a function of NumPy.
+    It is None for a compiled function, such as one of NumPy.
 
     Raises:
-        TypeError: There is no source file, as in a notebook.
+        TypeError: There is no source file, as in a notebook or for a class of a built-in module.
     """
     # The fingerprint of a class may be a property of its objects.
     stated = None if isinstance(code, type) else fingerprint(code)

@@ -259,7 +259,7 @@ def _apply_gammatones(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tenso
 def _control_power(signal: Tensor, channels: slice) -> Tensor:
     """Compute the power of the envelopes of the control filters, whose level decides on the gain.
 
-    Shape: (items, padded) -> (items, channels, padded), where 1 is 0 dB SPL.
+    Shape: (items, padded) -> (items, channels, padded), where 1 is an amplitude of 20 uPa.
     """
     filters = _control_filters(channels.start, channels.stop, signal.device, signal.dtype)
     return _apply_gammatones(filters, signal)[1]
