@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -198,12 +199,44 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
             )
         if clean.intersection(utterance.noisy_files):
             raise ValueError(f"{utterance.noisy} is listed both as clean and as noisy speech")
-        for folder in utterance.path.split("/")[:-1]:
-            if _NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):
-                raise ValueError(
-                    f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
-                )
+        folder = _non_speech_folder(utterance.path)
+        if folder:
+            raise ValueError(
+                f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
+            )
         for kind, name in (("file", utterance.path), ("speaker", utterance.speaker.casefold())):
             split = splits.setdefault((kind, name), utterance.split)
             if name and split != utterance.split:
                 raise ValueError(f"{kind} {name} is in the splits {split} and {utterance.split}")
+
+
+def warn_of_non_speech(folder: str | Path, files: Sequence[Path]) -> None:
+    """Warn if files of clean speech are in subfolders with names such as ``noise`` or ``noisy``.
+
+    Args:
+        folder: Folder of clean speech. Its own name has no influence.
+        files: Files in this folder.
+
+    >>> import warnings
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warn_of_non_speech("corpus", [Path("corpus/clean/a.wav"), Path("corpus/noise/b.wav")])
+    >>> len(caught)
+    1
+    """
+    folders = [_non_speech_folder(file.relative_to(folder).as_posix()) for file in files]
+    non_speech = [name for name in folders if name]
+    if non_speech:
+        warnings.warn(
+            f"{folder}: {len(non_speech)} of {len(files)} files are used as clean speech, but are "
+            f"in folders such as {non_speech[0]!r}; pass the folder of clean speech alone, or a "
+            "manifest (hlsim prepare)",
+            stacklevel=3,
+        )
+
+
+def _non_speech_folder(path: str) -> str:
+    """Return the first folder of a path whose name is that of other sounds, or an empty text."""
+    for folder in path.split("/")[:-1]:
+        if _NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):
+            return folder
+    return ""

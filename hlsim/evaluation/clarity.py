@@ -153,7 +153,8 @@ def evaluate_scenes(
             before NAL-R and before each of ``aids``.
         measures: Further measures: names of hlsim's own, or ``package.module:name`` of yours.
         precision: Number of bits with which HASPI, HASQI and HAAQI are computed, 32 or 64.
-        linked: Whether one level sets the gains of both ears. All ``aids`` must support it.
+        linked: Whether one level sets the gains of both ears. There must be ``aids``, which all
+            support it.
         full_scale_spl: Level in dB SPL of a file whose RMS is 1.0.
         seed: Seed of the noise that HASPI, HASQI and HAAQI add.
         listen: Number of pairs of scene and listener with sounds for the players of a page, as an
@@ -390,6 +391,10 @@ def _make_conditions(
         ValueError: An aid cannot be loaded or linked, two aids have the same label, or the signals
             of two conditions would have the same folder.
     """
+    if linked and not aids:
+        raise ValueError(
+            "linked (--linked) has no effect on existing outputs; name an aid, or leave it out"
+        )
     loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
     for label in (*aids, *folders):
         if label in (UNAIDED, NAL_R) or (label in aids and label in folders):

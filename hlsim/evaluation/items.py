@@ -19,6 +19,7 @@ from hlsim.checks import check_attributes, check_names, check_number
 from hlsim.data.augment import compress
 from hlsim.data.clips import Clips
 from hlsim.data.ears import MILDER, draw_thresholds
+from hlsim.data.manifest import warn_of_non_speech
 from hlsim.data.mixing import mix
 from hlsim.data.recorded_scenes import SceneClips
 from hlsim.evaluation.study import Item
@@ -346,6 +347,7 @@ def _draw_clips(
     check_number("items", items, 1, whole=True)
     check_number("seconds", seconds, 0.02)
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
+    warn_of_non_speech(speech, clips.files)
     noises = None
     if noise is not None:
         noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True)

@@ -27,7 +27,7 @@ from hlsim.data.augment import (
 )
 from hlsim.data.clips import AudioFiles, Clips, hash_source
 from hlsim.data.ears import draw_thresholds
-from hlsim.data.manifest import read_manifest
+from hlsim.data.manifest import read_manifest, warn_of_non_speech
 from hlsim.data.mixing import mix
 from hlsim.data.recorded_scenes import SceneClips, SceneFiles
 from hlsim.data.scenes import draw_scenes
@@ -206,6 +206,8 @@ class _RandomBatches(Dataset[Batch]):
         self.ear = None if ear is None else torch.tensor(ear.thresholds)
         self.clip_settings: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **self.clip_settings)
+        if isinstance(data.speech, str | Path):
+            warn_of_non_speech(data.speech, self.speech.files)
         self.noise = Clips(data.noise, repeat=True, **self.clip_settings) if data.noise else None
         self.measured_ears: Tensor | None = None  # (ears, 8) dB HL
         if data.audiograms is not None:

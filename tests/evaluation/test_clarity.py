@@ -417,6 +417,7 @@ LEFT_EAR_ONLY = {"L0001": {**EAR, "audiogram_levels_r": None}}
         ({"aids": {"mine": "wdrc", "Mine": "wdrc"}}, "the same folder, mine, where"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"aids": {"a": "torch:neg"}, "linked": True}, "torch:neg has no setting linked"),
+        ({"aids": {}, "linked": True}, "no effect on existing outputs"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
         ({"precision": 16}, "expected precision 32 or 64"),
         ({"stride": 0}, "expected stride to be a whole number from 1"),

@@ -16,6 +16,7 @@ from hlsim import NALR, WDRC, Audiogram
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.prescription import nalr_gains_db
+from hlsim.calibration import set_level
 from hlsim.data import bundled
 from hlsim.dsp.fir import filters_with_gains
 from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
@@ -434,6 +435,14 @@ def test_bad_arguments_raise_value_error(name: str) -> None:
         clean = change.get("clean", pair()[0][0])
         with pytest.raises(ValueError):
             SCORES[name](**{"output": clean, "clean": clean, "audiogram": N3, **change})
+
+
+def test_speech_at_the_lowest_level_is_not_too_soft() -> None:
+    """Rounding may put speech of 20 dB SPL a little below the limit."""
+    clean = set_level(pair()[0][0], 20.0 - 1e-4)
+    assert 0.0 <= float(haspi(clean, clean, NH)) <= 1.0
+    with pytest.raises(ValueError, match=r"19\.9 dB SPL .*; expected 20 dB SPL or more"):
+        haspi(0.99 * clean, clean * 0.99, NH)
 
 
 def test_scores_of_an_item_draw_the_noise_of_the_ear_and_count_it_once(

@@ -1,6 +1,7 @@
 """Batches depend on seed and index alone, whether drawn from folders or from a manifest."""
 
 import itertools
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,8 +14,10 @@ from hlsim.audio import write_audio
 
 pytest.importorskip("lightning")
 
+from hlsim import Audiogram
 from hlsim.calibration import level_spl
 from hlsim.data.manifest import Utterance, write_manifest
+from hlsim.evaluation.items import draw_aid_items
 from hlsim.training.batches import BatchData, TrainingData, make_data
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
@@ -84,8 +87,21 @@ def test_validation_is_on_other_speech_where_there_is_some(manifest: Path) -> No
     manifest.write_text(rows.replace("train", "test"))
     with pytest.raises(ValueError, match="an empty list"):
         load(TrainingData.from_manifest(manifest))
+    speech = manifest.parent / "clean"
     with pytest.raises(ValueError, match="both training and validation"):
-        load(TrainingData(manifest.parent, valid_speech=manifest.parent / "noisy/../clean"))
+        load(TrainingData(speech, valid_speech=manifest.parent / "noisy/../clean"))
+
+
+def test_noise_among_the_clean_speech_causes_a_warning(manifest: Path) -> None:
+    corpus = manifest.parent
+    with pytest.warns(UserWarning, match="4 of 8 files are used as clean speech.*'noisy'"):
+        load(TrainingData(corpus))
+    with pytest.warns(UserWarning, match="4 of 8 files are used as clean speech.*'noisy'"):
+        ears = [("N3", Audiogram.standard("N3"))]
+        draw_aid_items(corpus, None, ears, items=1, seconds=0.5, seed=0, levels=[65.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(TrainingData(corpus / "noisy"))
 
 
 def test_other_files_are_another_training(manifest: Path) -> None:

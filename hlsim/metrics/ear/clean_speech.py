@@ -79,7 +79,7 @@ class CleanBatch:
             range(len(clean))[items], levels.tolist(), lengths, strict=True
         ):
             label = "clean" if len(clean) == 1 else f"clean, item {item},"
-            if level < LOWEST_REFERENCE_SPL:
+            if round(level, 1) < LOWEST_REFERENCE_SPL:
                 raise UnscorableError(
                     f"{label} is silent or too soft, at {level:.1f} dB SPL with full_scale_spl "
                     f"{full_scale_spl:g}; expected {LOWEST_REFERENCE_SPL:g} dB SPL or more; "
