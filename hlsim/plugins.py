@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import hashlib
 import importlib
 import importlib.machinery
 import importlib.util
@@ -233,7 +234,10 @@ def _import_file(path: Path) -> ModuleType:
         ImportError: Python has no loader for the file. The file may raise other errors.
     """
     _search_first(path.parent)
-    spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)
+    # Python finds the source of a class by the name of its module, so that files of one name in
+    # two folders need different modules.
+    number = hashlib.sha256(str(path).encode()).hexdigest()[:8]
+    spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}_{number}", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)

@@ -132,6 +132,20 @@ def test_functions_of_one_name_in_two_files_have_two_fingerprints(tmp_path: Path
     assert len(fingerprints) == 2 and None not in fingerprints
 
 
+def test_classes_of_one_name_in_two_folders_have_two_fingerprints(tmp_path: Path) -> None:
+    plugins = []
+    for number in (1, 2):
+        file = tmp_path / f"variant-{number}" / "enhancer.py"
+        file.parent.mkdir()
+        file.write_text(
+            "from torch import nn\nclass Enhancer(nn.Module):\n    config = {}\n"
+            f"    def forward(self, x, rate):\n        return x / {number}\n"
+        )
+        plugins.append(WaveformPlugin(f"{file}:Enhancer", "enhancer"))
+    fingerprints = {fingerprint(plugin) for plugin in plugins}
+    assert len(fingerprints) == 2 and None not in fingerprints
+
+
 def test_a_condition_that_contains_a_function_of_a_user_needs_its_fingerprint(
     tmp_path: Path,
 ) -> None:
