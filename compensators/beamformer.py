@@ -271,7 +271,7 @@ def _subtract(frames: Tensor, weights: Tensor) -> Tensor:
 
 @constant
 def _filters(bands: int) -> NDArray[np.float64]:
-    """Return the frequency responses of the bands' filters, which begin 0.5 ms before time 0.
+    """Return the frequency responses of the bands' filters, which are delayed by 0.5 ms.
 
     Returns: Real and imaginary parts, (2, bands, FRAME / 2 + 1).
     """

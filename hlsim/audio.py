@@ -216,6 +216,8 @@ def _warn_if_truncated(file: soundfile.SoundFile, samples: int) -> None:
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     """Write a WAV file with samples in 32-bit float, completely or not at all.
 
+    Samples are not scaled, so the level in dB SPL is that of the waveform at the same full scale.
+
     Args:
         path: File to write.
         waveform: Samples, (channels, time) or (time,), where 1.0 is full scale.

@@ -177,8 +177,9 @@ def read_record(name: str | Path) -> dict[str, Any]:
 
     Returns:
         Dict with, among others, ``kind``; ``config``, the settings of the model; ``sha256``, which
-        identifies the weights; and ``about``, the record of the training, such as the version of
-        hlsim, the recipe with its seed, the steps, the time in minutes and the validation scores.
+        identifies the weights; and ``about``, the record of the training, whose entries depend on
+        the checkpoint. A training by hlsim writes ``hlsim`` (its version), ``recipe`` (with the
+        ``seed``), ``steps``, ``minutes`` and ``validation``.
 
     Raises:
         ValueError: There is no such checkpoint, or the file cannot be read.

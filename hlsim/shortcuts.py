@@ -187,7 +187,7 @@ def listen(
     """Show a player in a notebook that switches between signals at the same position.
 
     All signals have the same gain, so that a sound that the ear perceives as soft is soft here. The
-    volume starts low. The player needs the extra ``eval``.
+    volume starts at half. The player needs the extra ``eval``.
 
     Args:
         sample_rate: Sample rate in Hz of all signals, 16000 to 48000.

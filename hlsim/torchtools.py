@@ -520,7 +520,8 @@ def on_device(values: Tensor, device: torch.device) -> Tensor:
 def on_host(values: Tensor) -> Tensor:
     """Return a tensor without a gradient on the CPU.
 
-    This synchronises with a GPU unless a copy of the values on the CPU is remembered.
+    This synchronises with a GPU unless a copy of the values on the CPU is remembered. The result
+    must not be changed in place: it may be this copy, or share the memory of ``values``.
 
     Args:
         values: Tensor of any shape on any device.

@@ -248,7 +248,7 @@ def _log_weights(grid: Frequencies, points: Frequencies) -> NDArray[np.float64]:
 
 @constant
 def _table(name: str) -> list[Any]:
-    """Return one of the ``PRESCRIPTION_TABLES`` by name, as a constant whose tensors are stored."""
+    """Return one of the ``PRESCRIPTION_TABLES`` by name, with ``like`` as a tensor."""
     table: list[Any] = PRESCRIPTION_TABLES[name]
     return table
 

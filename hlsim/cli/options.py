@@ -269,6 +269,8 @@ class Parser(argparse.ArgumentParser):
     def limit_to_ear(self, table: str) -> None:
         """Declare ``--limit-to-ear``, with which no band exceeds the ear's uncomfortable level.
 
+        Declare also ``--ucl``, with measured levels.
+
         Args:
             table: Option with a file of ears and an example of its columns, for the help text.
         """

@@ -259,7 +259,8 @@ def hash_source(source: AudioFiles) -> str:
 
     Paths have no influence except on the order of the files, so that a corpus may be moved. If all
     files together have 1 GB or less, they are read completely. Otherwise, the hash covers the size
-    of each file and four pieces of each large file, from its start to its end, about 1 GB in total.
+    of each file, small files, and four pieces of each large file, from its start to its end. This
+    is 1 GB at most for up to 32,768 recordings, and 16 kB of each large file for more.
 
     Args:
         source: Folder or files, see ``AudioFiles``.

@@ -194,14 +194,15 @@ def recognise(
     Args:
         files: Paths of audio files relative to the corpus, with forward slashes.
         folders: Meaning of each level of folders, the top first, instead of a known layout:
-            ``split``, ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
+            ``split``, ``speaker``, ``condition`` (``clean``, ``noisy``, or ``noise``, which is
+            left out), or ``other``.
 
     Returns:
-        The name of the layout, and the utterances.
+        The name of the layout, and the utterance of each clean file.
 
     Raises:
         ValueError: The layout is unknown or contradictory, or ``folders`` has an unknown meaning,
-            or twice the same.
+            or twice the same except ``other``.
 
     >>> layout, utterances = recognise(["ann/1.wav", "bob/1.wav"], folders=["speaker"])
     >>> [row.speaker for row in utterances]

@@ -111,14 +111,15 @@ def measure_gain_curve(
         aid: The hearing aid.
         ear: The audiogram.
         speech: Utterances at 16 kHz. Shape: (utterances, time).
-        levels: Levels in dB SPL. All utterances are processed at each of them.
+        levels: Levels in dB SPL, see ``set_level``. All utterances are processed at each of them.
 
     Returns:
-        ``gain_db``, gains in dB of shape (levels, 24), and its axes ``levels`` (dB SPL) and
+        ``gain_db``, nested lists of gains in dB, (levels, 24), and its axes ``levels`` (dB SPL) and
         ``frequencies`` (centres of 24 bands of equal width on the ERB scale, in Hz).
 
     Raises:
-        ValueError: An output of the aid is not valid, see ``cut_output``.
+        ValueError: A level is out of range, or an output of the aid is not valid, see
+            ``cut_output``.
 
     >>> curve = measure_gain_curve(lambda x, _: 10.0 * x, NORMAL, torch.randn(1, 16000), [65.0])
     >>> round(curve["gain_db"][0][0])

@@ -142,7 +142,8 @@ def _compare_voices(table: DataFrame) -> list[ConditionComparison]:
     Args:
         table: Table of the study, with the column ``voice``.
 
-    Returns: A list of the planned comparison alone, or an empty list if no voice has both scores.
+    Returns: A list of the planned comparison alone, or an empty list if no voice has both scores or
+    no other condition has scores.
     """
     means = table.groupby(["voice", "condition"], sort=False)[["haspi", "level"]].mean()
     rows = means.reset_index().rename(columns={"voice": "item"})

@@ -270,6 +270,8 @@ def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
 def ear_name(audiogram: Audiogram) -> str:
     """Return the name of an ear if it is a standard one, and its thresholds as text otherwise.
 
+    The text has no frequencies. Uncomfortable levels have no influence.
+
     >>> ear_name(Audiogram.standard("N4")), ear_name(Audiogram([30, 40], [500, 4000]))
     ('N4', '30, 40 dB HL')
     """

@@ -31,8 +31,9 @@ class ReferenceKind:
         normal_ear: Normal ear of a simulator that emulates MSBG: ``"filter"``, one filter with
             MSBG's response for normal ears and the phase of the impaired ear's filter bank, or
             ``"simulator"``, the simulator itself at 0 dB HL.
-        bank_phase: Whether the reference gets the phase of MSBG's filter bank for the impaired ear,
-            if the simulator emulates MSBG.
+        bank_phase: Whether clean speech, or the normal ear ``"simulator"``, gets the phase of
+            MSBG's filter bank for the impaired ear, if the simulator emulates MSBG. The normal ear
+            ``"filter"`` always has it.
 
     >>> ReferenceKind("clean").bank_phase
     True

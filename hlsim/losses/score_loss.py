@@ -41,8 +41,8 @@ def score_loss(
         Loss of each item, 0 to 1. Shape: (items,).
 
     Raises:
-        ValueError: An item is shorter than 0.7 s or its ear is not valid, with its index in the
-            message; or the number of ``lengths`` or the rate is wrong.
+        ValueError: An item is shorter than 0.7 s, its ear is not valid, ``clean`` is not finite, or
+            a sample is above 1e9 in magnitude; or the number of ``lengths`` or the rate is wrong.
         KeyError: There is no such score.
 
     >>> speech = torch.randn(1, 16000)

@@ -24,7 +24,8 @@ SPECTRAL_FLOOR = 1e-12
 def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:
     """Compute the power of the error over that of the target in dB, the negative SNR.
 
-    A perfect estimate has the lowest value, -60 dB. If the target is silent, the value is 0 dB for
+    A perfect estimate has the lowest value, -60 dB, or more for targets below about -30 dB SPL. If
+    the target is silent, the value is 0 dB for
     a silent estimate, and otherwise the level of the estimate in dB SPL plus 106 dB.
 
     Shape: (items, time) twice, in pascals -> (items,).

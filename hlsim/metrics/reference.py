@@ -131,11 +131,11 @@ class Reference(ABC):
         """Return the thresholds in dB HL of the ear of each item. Shape: -> (items, 8).
 
         Args:
-            audiogram: One ear, or one for each item.
+            audiogram: Ears that broadcast to the leading dimensions of the clean signals, such as
+                one, or one for each item.
 
         Raises:
-            ValueError: The number of ears is neither 1 nor that of the items, or an ear is not
-                valid.
+            ValueError: The ears do not broadcast to the items, or an ear is not valid.
         """
         shape = self._clean.shape[:-1]
         ears = resolve_thresholds(None, audiogram, self._clean, highest=HIGHEST_LEVEL)

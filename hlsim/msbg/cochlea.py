@@ -251,7 +251,7 @@ def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: Filter
 
     A filter bank splits the signals into band-pass signals, the channels. Recruitment multiplies
     each channel by a gain that follows its envelope, and the channels are added up. All channels
-    run at 44.1 kHz.
+    run at 44.1 kHz. Each is advanced by its delay, so that the result is not late.
 
     Shape: (items, time), (items, channels) -> (items, time).
 

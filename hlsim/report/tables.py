@@ -261,7 +261,8 @@ def _paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> 
 
     Args:
         c: Statistics over the items.
-        p_t, p_w: P values of the t-test and of Wilcoxon's test to show, adjusted or not.
+        p_t, p_w: P values of the t-test and of Wilcoxon's test to show, adjusted or not; for None,
+            the cell of the test is n/a.
     """
     interval = "" if c.ci_low is None else f" [{c.ci_low:+.3f}, {c.ci_high:+.3f}]"
     return {

@@ -487,8 +487,9 @@ def make_data(
         ear: Ear of a personal compensator; None for random and measured ears.
 
     Raises:
-        ValueError: Files are missing or invalid, or used for both training and validation, the
-            recipe requires noise and there is none, a compensator is trained on recorded scenes
+        ValueError: A folder does not exist or has no audio, a table of ears is not valid, files are
+            used for both training and validation, no clip for validation can be drawn, the recipe
+            requires noise and there is none, a compensator is trained on recorded scenes
             and there is other speech for validation, or the microphones of its network do not fit
             the data (see ``_CompensatorBatches``).
 

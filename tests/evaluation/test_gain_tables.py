@@ -154,7 +154,7 @@ def test_command_prints_or_writes_the_text(
 def test_other_formats_several_ears_and_low_rates_are_refused() -> None:
     with pytest.raises(ValueError, match="no format 'pdf'; expected one of camilladsp, "):
         export_gains(WDRC(), "N3", "pdf")
-    with pytest.raises(ValueError, match="expected one ear to export, got 2"):
+    with pytest.raises(ValueError, match="expected one ear, got a list of 2"):
         export_gains(WDRC(), ["N3", "N4"], "csv")
     for rate in (8000, 44100.5):
         with pytest.raises(ValueError, match="sample_rate to be a whole number from 16000"):

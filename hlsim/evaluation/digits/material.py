@@ -85,6 +85,9 @@ def draw_triplets(count: int, generator: torch.Generator) -> Triplets:
         count: Number of triplets.
         generator: Source of the random numbers.
 
+    Returns:
+        Speech, masking noise, internal noise and digits, see ``Triplets``.
+
     >>> draw_triplets(2, torch.Generator().manual_seed(0)).digits.shape
     torch.Size([2, 3])
     """

@@ -101,7 +101,7 @@ def export_gains(
     gains = np.stack([aid.gains(ear, level).double().cpu().numpy() for level in levels])
     if gains.ndim != 2:
         ears = gains.shape[1]
-        raise ValueError(f"expected one ear to export, got {ears}; export one at a time")
+        raise ValueError(f"expected one ear, got a list of {ears}; export one at a time")
     return PROGRAMS[program](gains, **settings)
 
 
@@ -150,7 +150,7 @@ def _write_csv(gains: Array) -> str:
 
 
 def _write_equalizer_apo(gains: Array, level: float) -> str:
-    """Return the configuration of Equalizer APO: gains in dB at the eight frequencies.
+    """Return the configuration of Equalizer APO, which has these gains in thirds of an octave.
 
     Args:
         gains: Insertion gains in dB for speech at the level, (1, 8).

@@ -350,7 +350,7 @@ def _synchrony_weights() -> NDArray[np.float64]:
 
 
 def channel_shares(levels: Tensor) -> Tensor:
-    """Return the share of each channel in the sum of amplitudes over all channels.
+    """Return the share of each channel in the sum of the amplitudes, 10^(level / 20), of all.
 
     Args:
         levels: Level of each channel in dB over threshold. Shape: (..., channels).

@@ -325,7 +325,7 @@ def simulate_cochlea(
         signal: Sound behind the middle ear at 24 kHz, in multiples of 20 uPa. Shape: (items,
             padded), where ``padded`` is a multiple of 64 samples.
         ear: Hair cells of all channels. Shape: (items, 32) or (32,).
-        channels: Channels to compute.
+        channels: Channels to compute, with a start and a stop.
         extent: Number of samples at 24 kHz of each item without its padding.
         motion: Whether to return the motion of the basilar membrane and the long-term level, which
             are empty otherwise.
