@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 import hlsim
 from compensators import NALR, WDRC, load_compensator
@@ -83,9 +83,56 @@ def test_settings_of_any_describable_type_count() -> None:
     assert fingerprint(unknown(1.0)) is None, "a class without a source file"
 
 
+class Gain(nn.Module):
+    """A gain that is a plain attribute."""
+
+    def __init__(self, gain: float) -> None:
+        super().__init__()
+        self.gain = gain
+        self.config = "none"
+
+    def forward(self, waveform: Tensor) -> Tensor:
+        return self.gain * waveform
+
+
+def test_the_object_of_a_method_counts() -> None:
+    fingerprints = [fingerprint(Foreign(Gain(gain).forward)) for gain in (1.0, 1.0, 2.0)]
+    assert None is not fingerprints[0] == fingerprints[1] != fingerprints[2]
+    assert fingerprint(Foreign(Path().exists)) is None, "the object is unknown"
+    aid = Foreign(1.0)
+    aid.setting = aid.parameters
+    assert fingerprint(aid) is not None, "the method of the module itself"
+    first, second = Gain(1.0), Gain(1.0)
+    first.gain, second.gain = second.forward, first.forward  # type: ignore[assignment]
+    assert fingerprint(first) is None
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
+def test_the_program_of_a_module_of_torch_counts() -> None:
+    for translate in (torch.jit.script, torch.fx.symbolic_trace):
+        modules = [nn.Sequential(translate(Gain(gain)), nn.Linear(1, 1)) for gain in (1.0, 2.0)]
+        modules[1][1] = modules[0][1]
+        modules.append(nn.Sequential(translate(Gain(1.0)), modules[0][1]))
+        first, second, third = map(fingerprint, modules)
+        assert None is not first == third != second
+
+
+def test_hooks_count() -> None:
+    aid = nn.Linear(1, 1)
+    alone = fingerprint(aid)
+    aid.register_forward_hook(_double)
+    assert fingerprint(aid) not in (None, alone)
+    aid.register_forward_pre_hook(lambda module, inputs: inputs)
+    assert fingerprint(aid) is None, "a lambda is unknown"
+
+
+def _double(module: nn.Module, inputs: Any, output: Tensor) -> Tensor:
+    return 2.0 * output
+
+
 MODULE = """
 import torch
-from torch import nn
+from torch import Tensor, nn
 class Aid(nn.Module):
     def __init__(self):
         super().__init__()

@@ -19,11 +19,11 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
-from torch import Tensor, nn
+from torch import Tensor, fx, jit, nn
 
 import compensators
 from hlsim.files import sha256, source_hash
@@ -74,9 +74,10 @@ def fingerprint(processing: Any) -> str | None:
 
     Args:
         processing: Function or ``torch.nn.Module``. If it has an attribute ``fingerprint``, its
-            name and this attribute are hashed. Otherwise, the classes, the attributes and the
-            tensors of a module and its submodules are, without private attributes of modules of
-            hlsim and torch, and for other classes their source files and those that these import.
+            name and this attribute are hashed. Otherwise, the classes, the attributes, the hooks
+            and the tensors of a module and its submodules are, without private attributes of
+            modules of hlsim and torch, and for other classes their source files and those that
+            these import, or the program of a module of TorchScript or ``torch.fx``.
 
     Returns:
         The SHA-256 in hexadecimal, or None if the outputs could change while the hash does not:
@@ -101,13 +102,15 @@ def fingerprint(processing: Any) -> str | None:
     tensors = dict([*processing.named_parameters(), *processing.named_buffers()])
     if not (_is_from_hlsim(processing) or tensors or hasattr(processing, "config")):
         return None
-    parts = {}
+    parts: dict[str, list[Any]] = {}
     for place, module in processing.named_modules():
         parts[place] = [
             _name(module),
             [_hash_source(kind) for kind in type(module).__mro__ if not _is_known(kind)],
             _attributes(module),
             str(getattr(module, "fingerprint", None)),
+            _program(module),
+            _hooks(module),
         ]
         # A condition of hlsim, such as an aid at another's level, contains the aids of a user.
         contained = _parts(module) if _is_from_hlsim(module) else ()
@@ -117,7 +120,7 @@ def fingerprint(processing: Any) -> str | None:
             return None
     try:
         return value_hash([parts, tensors])
-    except TypeError:
+    except (TypeError, RecursionError):  # of modules that refer to each other by methods
         return None
 
 
@@ -211,14 +214,31 @@ def _is_written_by_user(module: ModuleType) -> bool:
     return not is_installed and not file.is_relative_to(Path(os.__file__).resolve().parent)
 
 
+def _program(module: nn.Module) -> str | None:
+    """Return a hash of a TorchScript module, or the code of one of ``torch.fx``; None for others.
+
+    The class of such a module says nothing about its code.
+    """
+    if isinstance(module, jit.ScriptModule):
+        return hashlib.sha256(module.save_to_buffer()).hexdigest()
+    return module.code if isinstance(module, fx.GraphModule) else None
+
+
+def _hooks(module: nn.Module) -> list[Any]:
+    """Return the functions that change inputs or outputs of a module, except those of torch."""
+    hooks = [*module._forward_pre_hooks.values(), *module._forward_hooks.values()]
+    return [hook for hook in hooks if not _is_known(_code(hook))]
+
+
 def _attributes(module: nn.Module) -> dict[str, Any]:
     """Return the attributes of a module without those that every ``nn.Module`` has.
 
     Parameters, buffers and submodules are not included. Private attributes are left out if the
-    class belongs to hlsim or torch, because calls have computed them.
+    class belongs to hlsim or torch, because calls have computed them. Functions replace the methods
+    of the module itself.
     """
     return {
-        name: value
+        name: value.__func__ if getattr(value, "__self__", None) is module else value
         for name, value in vars(module).items()
         if name not in _MODULE_ATTRIBUTES and not (name.startswith("_") and _is_known(type(module)))
     }
@@ -234,7 +254,7 @@ def _describe(value: Any) -> Any:
 
     A tensor or array becomes its type, shape and hash; a dataclass its name and attributes, which
     JSON converts in turn; a function or class its name, with a hash unless it belongs to hlsim or
-    torch; and a module its fingerprint.
+    torch; a method also its object; and a module its fingerprint.
 
     Raises:
         TypeError: The object is none of these, a lambda or a function within another one, a module
@@ -247,6 +267,8 @@ def _describe(value: Any) -> Any:
         return [str(value.dtype), value.shape, hashlib.sha256(samples).hexdigest()]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return [_name(value), vars(value)]
+    if isinstance(value, MethodType):
+        return [value.__func__, value.__self__]
     if hasattr(value, "__qualname__") and "<" not in value.__qualname__:
         return [value.__qualname__, None if _is_known(value) else _hash_code(value)]
     known = fingerprint(value)
