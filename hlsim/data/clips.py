@@ -150,8 +150,8 @@ class Clips:
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw clips at random positions of random recordings, and redraw silent clips.
 
-        A clip is silent if its RMS is at least 70 dB below the peak of its recording. Of a subclass
-        with several channels, those of ``judged_part`` count.
+        A clip is silent if its RMS is at least 70 dB below the peak of its recording. A subclass
+        may have another definition, see ``is_silent``.
 
         Args:
             count: Number of clips.
@@ -169,7 +169,7 @@ class Clips:
             index = int(torch.randint(len(self), (), generator=generator))
             position = float(torch.rand((), generator=generator))
             clip = self.cut_clip(index, position)
-            if float(self.judged_part(clip).square().mean()) > _SILENT_POWER:
+            if not self.is_silent(clip, index):
                 clips.append(clip)
                 failures = 0
                 continue
@@ -181,9 +181,9 @@ class Clips:
                 )
         return torch.stack(clips)
 
-    def judged_part(self, clip: Tensor) -> Tensor:
-        """Return the part of a clip by which it counts as silent or not, here all of it."""
-        return clip
+    def is_silent(self, clip: Tensor, index: int) -> bool:
+        """Return whether a clip of the recording with this index counts as silent."""
+        return float(clip.square().mean()) <= _SILENT_POWER
 
     def _decode(self, index: int) -> Tensor:
         """Decode the first channel of a file, or of the noise of a pair, at the clips' sample rate.

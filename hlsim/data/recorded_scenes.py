@@ -20,6 +20,12 @@ from hlsim.dsp.resample import resample
 _LARGEST_DIFFERENCE = 0.1
 """Largest difference in length between the files of a scene in seconds, which is cut off."""
 
+_PAUSE_POWER = 1e-2
+"""Power of the clean speech of a pause, relative to that of the whole recording: up to this.
+
+At the level of speech, a pause would have noise that is tens of dB too loud.
+"""
+
 
 class SceneFiles(NamedTuple):
     """Files of a recorded scene.
@@ -201,9 +207,14 @@ class SceneClips(Clips):
         clips = self.draw(count, generator)
         return clips[:, : self.ears], clips[:, self.ears :].unflatten(1, (-1, self.ears))
 
-    def judged_part(self, clip: Tensor) -> Tensor:
-        """Return the clean speech, (ears, samples), which may be silent where there is noise."""
-        return clip[: self.ears]
+    def is_silent(self, clip: Tensor, index: int) -> bool:
+        """Return whether the clean speech pauses, and is 20 dB softer than in the whole recording.
+
+        There may be noise in the pause.
+        """
+        clean, recording = clip[: self.ears], self.read_recording(index)[: self.ears]
+        highest = _PAUSE_POWER * float(recording.square().mean())
+        return super().is_silent(clean, index) or float(clean.square().mean()) <= highest
 
     def _decode(self, index: int) -> Tensor:
         scene = self._scenes[index]

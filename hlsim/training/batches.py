@@ -502,6 +502,13 @@ def make_data(
     plain: dict[str, Any] = {"seconds": _VALIDATION_SECONDS}
     if isinstance(recipe, SimulatorRecipe):
         batches = _SimulatorBatches
+        if data.scenes and not data.noise:
+            warnings.warn(
+                "a simulator is trained without the noise of recorded scenes (rows with a value in "
+                "the column 'reference'), on clean speech alone; for noisy speech, replace the "
+                "manifest by folders (--speech and --noise)",
+                stacklevel=2,
+            )
         levels = (50.0, 80.0) if recipe.treated else recipe.levels
         plain |= {"levels": levels, "treated": False}
     elif isinstance(recipe, CompensatorRecipe):

@@ -182,7 +182,8 @@ class CompensatorRecipe(TrainingRecipe):
             scenes, 0.2 to 1.5; 0 for scenes without rooms. It needs the extra ``scenes``.
         unreduced: Share of items for which a hearing aid's noise reduction is off, from 0 to 1.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
-            from -40 to 20 or numbers by level of the speech in dB SPL, see ``HearingLossLoss``.
+            from -40 to 20 or numbers by level of the speech in dB SPL, see ``HearingLossLoss``; 0
+            for a ``beamforming-aid``, whose amplification is not trained.
         limit_to_ear: Whether the output of a hearing aid is limited in training to the
             uncomfortable levels that are predicted for the ear, see ``HearingAid``. The saved aid
             is limited only if it is loaded with ``limit_to_ear``.
@@ -240,6 +241,11 @@ class CompensatorRecipe(TrainingRecipe):
         if self.trains_noise_reduction() or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"
             self._require("kind", self.kind == "hearing-aid", expected)
+        amplification = self.weights.keys() - {*_NOISE_REDUCTION_CRITERIA}
+        is_trained = any(self.weights[name] for name in amplification)
+        expected = "0, because this recipe trains no amplification; load the aid with loudness"
+        is_amplified = is_trained and self.kind != "beamforming-aid"
+        self._require("loudness", is_amplified or not self.loudness, expected)
         self._require("limit_to_ear", isinstance(self.limit_to_ear, bool), "true or false")
         if self.limit_to_ear:
             expected = "hearing-aid, the only kind that is trained with limit_to_ear"

@@ -92,6 +92,17 @@ def test_clips_of_scenes_have_clean_speech(tmp_path: Path, row: Utterance) -> No
     np.testing.assert_allclose(ratios, [[1.0, 4 / 3], [1 / 3, 2 / 3]], rtol=1e-3)
 
 
+def test_pauses_of_speech_are_no_clips_of_scenes(tmp_path: Path, row: Utterance) -> None:
+    # Half a second is a pause with the noise of the recording, 60 dB below the speech.
+    clean = torch.full((RATE,), 0.5)
+    clean[: RATE // 2] *= 1e-3
+    write_audio(tmp_path / "clean.wav", clean, RATE)
+    scenes = SceneClips([SceneFiles.from_utterance(row, tmp_path)], sample_rate=RATE, seconds=0.1)
+    clips, _ = scenes.draw_scenes(20, torch.Generator().manual_seed(0))
+    levels_db = 20.0 * clips.square().mean(-1).sqrt().log10()
+    assert bool((levels_db > levels_db.max() - 20.0).all())
+
+
 def test_short_scenes_are_repeated_in_all_channels(tmp_path: Path, row: Utterance) -> None:
     files = [SceneFiles.from_utterance(row, tmp_path)]
     scenes = SceneClips(files, sample_rate=RATE, seconds=2.5, repeat=True)

@@ -24,7 +24,7 @@ from hlsim.simulators import BUILT_IN
 from hlsim.training.batches import Batch, TrainingData, make_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
 from hlsim.training.module import describe_simulator
-from hlsim.training.recipes import CompensatorRecipe
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 from tests.helpers import mostly_slow, write_table
 from tests.training.gradients import check_gradients
 
@@ -392,6 +392,13 @@ def test_settings_without_effect_are_named(scenes: TrainingData, data: TrainingD
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_data(data, SMALL)
+
+
+def test_a_simulator_does_not_lose_the_noise_of_scenes_without_a_warning(
+    scenes: TrainingData,
+) -> None:
+    with pytest.warns(UserWarning, match="without the noise of recorded scenes"):
+        make_data(scenes, SimulatorRecipe(validation_items=4))
 
 
 def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: TrainingData) -> None:

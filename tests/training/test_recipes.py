@@ -83,6 +83,12 @@ def test_the_help_describes_every_setting() -> None:
         (SimulatorRecipe, {"levels": (50.0, float("inf"))}),
         (CompensatorRecipe, {"mismatch": 0.2}),  # There is one microphone.
         (CompensatorRecipe, {"kind": "beamforming-aid", "babble": 0.5}),  # It has no effect.
+        # The front end would learn to attenuate, because the amplification is not trained.
+        (CompensatorRecipe, {"kind": "beamforming-aid", "loudness": -10.0}),
+        (
+            CompensatorRecipe,
+            {"kind": "hearing-aid", "weights": {"denoising": 1.0}, "loudness": {65.0: -5.0}},
+        ),
     ],
 )
 def test_invalid_settings_are_rejected(recipe: Any, settings: dict[str, Any]) -> None:
