@@ -34,11 +34,12 @@ _MAX_HASHED_BYTES = 2**30
 _HASHED_PIECES = 4
 _SMALLEST_PIECE = 4096  # bytes
 
-_LOWEST_CORRELATION = -0.4
-"""Correlation of noise and clean speech below which the noise contains inverted clean speech.
+_HIGHEST_CORRELATION = 0.4
+"""Magnitude of the correlation of noise and clean speech above which the noise contains the speech.
 
-Noise and speech of a true pair have about 0. If the noisy file has another sentence, another level
-or a delay, their difference is mostly the clean speech with the opposite sign.
+Noise and speech of a true pair have about 0. If the noisy file has another sentence, a lower level
+or a delay, their difference is mostly the clean speech with the opposite sign; at a higher level,
+it contains the clean speech.
 """
 
 _SILENT_POWER = 1e-7
@@ -240,12 +241,12 @@ def _read_noise(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
 
     Raises:
         ValueError: The noisy speech cannot be read, has another rate, length or number of channels,
-            or does not contain the clean speech: their difference is mostly inverted speech.
+            or does not contain the clean speech at its level: their difference is mostly speech.
     """
     noise = read_noisy(path, clean, clean_rate) - clean
     scale = float(noise.norm() * clean.norm())
     correlation = float((noise * clean).sum()) / scale if scale else 0.0
-    if correlation < _LOWEST_CORRELATION:
+    if abs(correlation) > _HIGHEST_CORRELATION:
         raise ValueError(
             f"{path}: expected the clean speech plus noise, but their difference is not noise "
             f"(correlation with the clean speech {correlation:.2f}); pair files of the same "

@@ -101,13 +101,15 @@ def test_noise_of_pairs_is_noisy_minus_clean(tmp_path: Path) -> None:
         torch.testing.assert_close(clip, noise / noise.abs().max(), atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("change", ["another sentence", "softer", "late"])
+@pytest.mark.parametrize("change", ["another sentence", "softer", "louder", "late"])
 def test_a_noisy_file_that_does_not_contain_its_clean_version_is_left_out(
     tmp_path: Path, change: str
 ) -> None:
     generator = np.random.default_rng(0)
     clean, other, noise = torch.from_numpy(generator.standard_normal((3, 4000))).float() / 4
-    contents = {"another sentence": other, "softer": 0.3 * clean, "late": clean.roll(40)}
+    softer, louder = 0.3 * clean, 2.0 * clean
+    late = clean.roll(40)
+    contents = {"another sentence": other, "softer": softer, "louder": louder, "late": late}
     write_audio(tmp_path / "a.wav", clean, 16000)
     write_audio(tmp_path / "a noisy.wav", clean + noise, 16000)  # at 0 dB
     write_audio(tmp_path / "b noisy.wav", contents[change] + 0.1 * noise, 16000)
