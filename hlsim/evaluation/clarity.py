@@ -425,6 +425,11 @@ def _make_conditions(
                 f"two labels would have the same folder, {folder}, where file names ignore case; "
                 "rename one of them"
             )
+    for condition in conditions:
+        if condition.name in folders:
+            raise ValueError(
+                f"{condition.name} is already evaluated; give the outputs another label"
+            )
     return [*conditions, *(Condition(label) for label in folders)]
 
 

@@ -390,6 +390,9 @@ def test_existing_outputs_that_an_aid_would_replace_are_rejected(
     contents = output.read_bytes()
     with pytest.raises(ValueError, match="outputs of mine would replace those of old; choose"):
         evaluate_scenes({"mine": "wdrc"}, out=tmp_path, **options(clarity, outputs={"old": folder}))
+    settings = options(clarity, outputs={"Halving + NAL-R": folder})
+    with pytest.raises(ValueError, match=r"Halving \+ NAL-R is already evaluated"):
+        evaluate_scenes({}, out=tmp_path / "2", enhancers=[f"{__name__}:Halving"], **settings)
     assert output.read_bytes() == contents
 
 
