@@ -168,6 +168,7 @@ class SceneClips(Clips):
         ears: Number of ears.
         microphones: Number of microphones per ear.
         clean_files: Paths of the clean speech.
+        is_diotic: Whether the clean speech of the first scene is the same at two ears.
 
     Raises:
         ValueError: There are no scenes, the first one is not valid, or another one has another
@@ -186,6 +187,7 @@ class SceneClips(Clips):
         self.clean_files = [scene.clean for scene in scenes]
         clean, microphones, _ = scenes[0].read()
         self.ears, self.microphones = len(clean), len(microphones)
+        self.is_diotic = self.ears > 1 and torch.equal(clean[0], clean[1])
         if {scene.ears for scene in scenes} != {self.ears}:
             raise ValueError("expected the same number of references for all scenes; correct them")
         references = {scene.references for scene in scenes}

@@ -296,6 +296,14 @@ class _CompensatorBatches(_RandomBatches):
                     f"the recipe's model, got {numbers[0]} for each of {numbers[1]} ears in the "
                     "manifest; correct the model, or the column 'reference' of the manifest"
                 )
+            if recipe.weights.get("interaural") and self.scenes.is_diotic:
+                warnings.warn(
+                    f"{self.scenes.clean_files[0]}: the clean speech is the same at both ears, so "
+                    "that the criterion interaural trains an aid to remove the differences between "
+                    "the ears; use clean speech with one channel for each ear, or set the weight "
+                    "of interaural to 0 unless all talkers are in front",
+                    stacklevel=3,
+                )
         elif self.microphones > 1 and (self.microphones, self.ears) != (2, 2):
             raise ValueError(
                 f"expected recorded scenes for {self.microphones} microphones, because only those "

@@ -394,6 +394,13 @@ def test_settings_without_effect_are_named(scenes: TrainingData, data: TrainingD
         make_data(data, SMALL)
 
 
+def test_interaural_differences_need_clean_speech_for_each_ear(scenes: TrainingData) -> None:
+    weights = {"coherent-bands": 1.0, "interaural": 0.1}
+    recipe = replace(SMALL, model={**SMALL.model, "microphones": 3, "ears": 2}, weights=weights)
+    with pytest.warns(UserWarning, match=r"clean\.wav: the clean speech is the same at both ears"):
+        make_data(scenes, recipe)
+
+
 def test_a_simulator_does_not_lose_the_noise_of_scenes_without_a_warning(
     scenes: TrainingData,
 ) -> None:
