@@ -105,7 +105,7 @@ def evaluate_compensators(
 
     Args:
         compensators: Named modules at 16 kHz and 94 dB SPL full scale, which are called with a
-            waveform and an ear.
+            waveform and an ear. They are set to evaluation mode.
         speech: Folder of recordings of clean speech.
         manifest: Manifest of noisy speech instead of ``speech`` and ``noise``, with one or several
             microphones, see ``read_manifest``. Its split ``test`` is used, or else ``valid``. A
@@ -180,6 +180,7 @@ def evaluate_compensators(
         raise ValueError("expected one or more compensators, got none; pass them by their names")
     for name, aid in compensators.items():
         check_attributes(aid, f"the aid {name}", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL)
+        aid.eval()  # before it is called below
     ears_of_aids = {name: Audiogram.standard(name) for name in gain_ears}
     ears = read_ears(audiograms)
     if audiogram is not None:

@@ -292,7 +292,7 @@ def apply_treatments(
             ``"nalr"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
         compensator: Aid of the treatment ``"compensated"``, which is called with a waveform and an
-            ear.
+            ear. It is set to evaluation mode.
 
     Returns: One item per item and treatment: all treatments of the first item, then all of the
         second one. Each has the fact ``treatment``, the name of its treatment.
@@ -317,7 +317,7 @@ def apply_treatments(
         check_attributes(
             compensator, "a compensator", sample_rate=NEURO_RATE, full_scale_spl=PASCAL_SPL
         )
-        functions["compensated"] = compensator
+        functions["compensated"] = compensator.eval()
     check_names(treatments, functions, "inputs (compensated needs a compensator)")
     treated = []
     pairs = [*product(items, treatments)]

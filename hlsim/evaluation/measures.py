@@ -183,6 +183,8 @@ class _PluginMeasure:
     def __init__(self, name: str) -> None:
         self.name = name
         self.function = load_plugin(name, "measure")
+        if isinstance(self.function, nn.Module):
+            self.function.eval()
 
     def __reduce__(self) -> Any:
         return _PluginMeasure, (self.name,)
@@ -204,8 +206,8 @@ def load_measure(name: str) -> Measure:
 
     The function is not tried: one that returns something else fails in the study. Its values are
     stored only if it has the attribute ``fingerprint``, such as a version, which you change with
-    its code. Those of a module (``nn.Module``) with tensors or an attribute ``config`` are stored
-    without it if its attributes can be hashed.
+    its code. A module (``nn.Module``) is set to evaluation mode. The values of one with tensors or
+    an attribute ``config`` are stored without ``fingerprint`` if its attributes can be hashed.
 
     Args:
         name: ``package.module:name`` or ``path/to/file.py:name``.

@@ -74,7 +74,7 @@ def evaluate_simulators(
             (by 20 dB), ``"nalr"`` (amplified by NAL-R for the ear), ``"compressed"`` (3:1) and
             ``"compensated"`` (by ``compensator``).
         compensator: Aid of the treatment ``"compensated"``, which is called with a waveform and an
-            ear.
+            ear. It is set to evaluation mode.
         seed: Seed of all random draws.
         listen: Whether (1) or not (0) an item has sounds for the player of a page.
         running: Arguments of ``run_study``: ``jobs``, the number of processes; ``dask``, the

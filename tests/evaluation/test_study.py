@@ -19,7 +19,7 @@ from hlsim.evaluation import Condition, Item, Measure, ScoreStore, run_study
 from hlsim.evaluation.conditions import Enhanced, PluginAid, Unaided
 from hlsim.evaluation.measures import load_measure
 from hlsim.extras import MissingExtraError
-from hlsim.plugins import WaveformPlugin
+from hlsim.plugins import WaveformPlugin, load_plugin
 
 pytest.importorskip("pandas")
 
@@ -122,6 +122,22 @@ def test_changes_in_place_do_not_reach_other_conditions_and_measures(
     table = run_study(items, [Condition("in place", double), *gains(1)], measures, jobs=1)
     assert table["peak"].tolist() == pytest.approx([0.4, 0.2, 0.8, 0.4, 1.2, 0.6])
     assert table["clean_peak"].tolist() == pytest.approx([0.1, 0.1, 0.2, 0.2, 0.3, 0.3])
+
+
+MODE = """
+from torch import nn
+class Mode(nn.Module):
+    def forward(self, item, output):
+        return {"training": self.training}
+"""
+
+
+def test_a_module_that_measures_is_in_evaluation_mode(items: list[Item], tmp_path: Path) -> None:
+    file = tmp_path / "mode.py"
+    file.write_text(MODE)
+    measures = [load_measure(f"{file}:Mode"), Measure("mode", load_plugin(f"{file}:Mode", "mode"))]
+    for measure in measures:
+        assert run_study(items, gains(1), [measure], jobs=1)["training"].tolist() == [0.0] * 3
 
 
 def test_a_module_is_in_evaluation_mode(items: list[Item]) -> None:
