@@ -182,7 +182,8 @@ class CompensatorRecipe(TrainingRecipe):
             scenes, 0.2 to 1.5; 0 for scenes without rooms. It needs the extra ``scenes``.
         unreduced: Share of items for which a hearing aid's noise reduction is off, from 0 to 1.
         loudness: Loudness in dB relative to a normal ear that the amplification aims at, a number
-            from -40 to 20 or numbers by level of the speech in dB SPL, see ``HearingLossLoss``; 0
+            from -40 to 20 or numbers by level of the speech in dB SPL, see ``HearingLossLoss``;
+            where noise reduction is off (``unreduced``), this is the level with its noise. It is 0
             for a ``beamforming-aid``, whose amplification is not trained.
         limit_to_ear: Whether the output of a hearing aid is limited in training to the
             uncomfortable levels that are predicted for the ear, see ``HearingAid``. The saved aid
