@@ -163,7 +163,8 @@ class Condition:
         name: Name in tables.
         process: Function or module ``(signal, ear) -> output``, for the signal of an item and an
             ``Audiogram``, with an output of shape (time,); None if the outputs were recorded. A
-            module is set to evaluation mode. If the function or module has the attribute
+            module is set to evaluation mode, also by each study, because it may have been trained
+            further. If the function or module has the attribute
             ``may_crash = True``, its compiled code may end the process, so even a study of one item
             runs in another process, unless ``jobs`` is 1.
         kind: Role in the study, such as ``"unaided"``, ``"prescription"``, ``"aid"`` or
@@ -184,9 +185,9 @@ class Condition:
         if isinstance(self.process, nn.Module):
             self.process.eval()
 
-    @cached_property
+    @property
     def fingerprint(self) -> str | None:
-        """Hash of the code and settings of the processing, or None if unknown.
+        """Hash of the present code and settings of the processing, or None if unknown.
 
         For recorded outputs it is the text "recorded". Scores are stored only if it is known.
         """
@@ -385,11 +386,16 @@ def run_measures(
                 warned.add(text)
                 warnings.warn(text, stacklevel=4)
 
+    for function in (*(c.process for c in conditions), *(m.compute for m in measures)):
+        if isinstance(function, nn.Module):
+            function.eval()  # It may have been trained since the condition was made.
+    fingerprints = {condition.name: condition.fingerprint for condition in conditions}
     tasks = []
     for number, source in track(enumerate(items), "items whose scores are looked up", len(items)):
         task = _Task(number, source, [])
         for condition in conditions:
-            for measure, key in zip(measures, _keys(source, condition, measures), strict=True):
+            keys = _keys(source, condition.name, fingerprints[condition.name], measures)
+            for measure, key in zip(measures, keys, strict=True):
                 if key in store.scores:
                     warn_once(store.warnings.get(key, ()))
                     _claim_columns(owners, measure, store.scores[key])
@@ -474,19 +480,27 @@ def _claim_columns(owners: dict[str, str], measure: Measure, values: Values) -> 
             )
 
 
-def _keys(source: ItemSource, condition: Condition, measures: Sequence[Measure]) -> list[str]:
+def _keys(
+    source: ItemSource, condition: str, processing: str | None, measures: Sequence[Measure]
+) -> list[str]:
     """Return the keys under which the values of an item under a condition are stored.
+
+    Args:
+        source: The item.
+        condition: Name of the condition.
+        processing: Fingerprint of the condition, or None if it is unknown.
+        measures: The measures.
 
     Returns:
         One key per measure; an empty text if the values of this measure cannot be stored.
     """
     try:
-        digest = source.digest(condition.name)
+        digest = source.digest(condition)
     except Exception:  # The output fails for the same reason, or a function computes it.
         return [""] * len(measures)
     keys = []
     for measure in measures:
-        parts = [digest, condition.fingerprint, measure.fingerprint]
+        parts = [digest, processing, measure.fingerprint]
         if None in parts:
             keys.append("")
             continue

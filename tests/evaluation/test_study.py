@@ -394,6 +394,24 @@ def test_a_condition_without_a_function_needs_recorded_outputs(items: list[Item]
     assert table["failure"].str.contains("expected the condition mine to have a function").all()
 
 
+def test_a_module_may_be_trained_between_two_studies(items: list[Item]) -> None:
+    class Gain(torch.nn.Dropout):
+        def __init__(self) -> None:
+            super().__init__(1.0)
+            self.gain = torch.nn.Parameter(torch.ones(()))
+
+        def forward(self, signal: Tensor, ear: Any = None) -> Tensor:
+            return super().forward(self.gain * signal)
+
+    aid, store = Gain(), ScoreStore()
+    condition = Condition("aid", aid)
+    for gain in (1.0, 2.0):
+        torch.nn.init.constant_(aid.train().gain, gain)
+        table = run_study(items[:1], [condition], MEASURES[:1], store=store, jobs=1)
+        assert table["peak"].tolist() == pytest.approx([0.2 * gain])
+    assert len(store.scores) == 2
+
+
 def test_values_without_a_fingerprint_are_not_stored(items: list[Item]) -> None:
     store = ScoreStore()
     unknown = [Condition("mine", lambda signal, ear: signal)]
