@@ -27,7 +27,11 @@ from hlsim.evaluation.digits.material import (
 )
 from hlsim.evaluation.digits.people import people_threshold
 from hlsim.evaluation.digits.psychometric import TARGET, Estimate, estimate_threshold, subtract
-from hlsim.evaluation.digits.recogniser import DigitListenerConfig, load_listener
+from hlsim.evaluation.digits.recogniser import (
+    DigitListener,
+    DigitListenerConfig,
+    load_listener,
+)
 from hlsim.simulators import Attenuation, load_simulator
 from tests.helpers import load_figure
 
@@ -282,3 +286,12 @@ def test_speech_and_noise_pass_the_gains_that_the_aid_has_for_their_sum() -> Non
     output = aid(mixture, "NH", noise_reduction=1.0, amplification=0.0)
     assert float(attenuation.min()) < -1.0
     torch.testing.assert_close(sum(parts)[:, 64:], output[:, :-64], rtol=1e-4, atol=1e-7)
+
+
+def test_a_listener_that_was_trained_again_is_loaded_again(tmp_path: Path) -> None:
+    listeners = []
+    for channels in (2, 2, 3):
+        DigitListener(DigitListenerConfig(channels=channels)).save_pretrained(tmp_path)
+        listeners.append(load_listener(tmp_path))
+        assert load_listener(tmp_path) is listeners[-1]
+    assert len({*listeners}) == 3

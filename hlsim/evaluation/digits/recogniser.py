@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.calibration import NEURO_RATE
-from hlsim.checkpoint import DIGIT_LISTENER, HubModel, read_checkpoint
+from hlsim.checkpoint import DIGIT_LISTENER, HubModel, read_checkpoint, read_record
 from hlsim.data.bundled import SLOT_SAMPLES
 from hlsim.dsp.erb import erb_frequency, erb_number
 from hlsim.dsp.fft import power
@@ -121,11 +121,10 @@ class DigitListener(nn.Module, HubModel):
         return torch.from_numpy(np.stack(weights, 1).astype(np.float32))
 
 
-@cache
 def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
     """Load a trained listener, in evaluation mode and without gradients of its weights.
 
-    Later calls with the same argument return the same object.
+    Later calls with the same argument return the same object, until the checkpoint changes.
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or the folder of a checkpoint.
@@ -136,4 +135,10 @@ def load_listener(name: str | Path = DIGIT_LISTENER) -> DigitListener:
     >>> load_listener().config.bands
     40
     """
+    record = read_record(name)
+    return _load_listener(name, record.get("sha256"), record.get("config_sha256"))
+
+
+@cache
+def _load_listener(name: str | Path, *hashes: str | None) -> DigitListener:
     return read_checkpoint(name, [DigitListener])
