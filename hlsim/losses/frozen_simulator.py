@@ -1,6 +1,7 @@
 """A simulator that is not trained, and the reference with which its output is compared."""
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.checkpoint import read_record
 from hlsim.checks import check_shape
 from hlsim.dsp.resample import resample
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
-from hlsim.simulators import load_simulator
+from hlsim.neuro import NeuroMSBG
+from hlsim.simulators import LINEAR, load_simulator
 from hlsim.torchtools import broadcast_shape, compute_once, flatten_items, on_device
 
 ReferenceName = Literal["clean", "normal-hearing"]
@@ -100,6 +103,8 @@ class FrozenSimulator:
         self._band_rate = 2.0 * getattr(model, "highest_frequency", math.inf)
         self._needs_exact_lengths = getattr(model, "needs_exact_lengths", False)
         self._has_bank_phase = normal is None and getattr(model, "emulates_msbg", False)
+        if self._has_bank_phase and model is not simulator and isinstance(model, NeuroMSBG):
+            _warn_of_other_teacher(str(simulator))
 
     def simulate(
         self, waveform: Tensor, thresholds: Tensor, lengths: Tensor | None = None
@@ -188,6 +193,20 @@ class FrozenSimulator:
             return clean
         low = resample(clean, self.sample_rate, round(self._band_rate))
         return resample(low, round(self._band_rate), self.sample_rate)[..., : clean.shape[-1]]
+
+
+def _warn_of_other_teacher(checkpoint: str) -> None:
+    """Warn if the record of a network names a teacher that hlsim does not know as MSBG."""
+    record = str(read_record(checkpoint).get("about", {}).get("teacher", ""))
+    teacher = record.partition(" (")[0]  # without its fingerprint
+    is_plugin = ":" in teacher and teacher.rpartition(":")[-1].isidentifier()
+    if is_plugin or teacher == LINEAR:
+        warnings.warn(
+            f"{checkpoint} has learned from {teacher}, but is compared with the normal ear of "
+            "MSBG; unless this teacher is MSBG, use the teacher itself as simulator "
+            f"(--simulator {teacher}), or pass its normal ear to HearingLossLoss (normal)",
+            stacklevel=4,
+        )
 
 
 @compute_once

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from hlsim.losses.frozen_simulator import ReferenceKind
 from hlsim.losses.paper import paper_parts
 from hlsim.metrics.band_levels import band_level_loss
 from hlsim.msbg.response import apply_bank_phase
+from hlsim.neuro import NeuroConfig
 from hlsim.shortcuts import example_speech
 from hlsim.training.recipes import CompensatorRecipe
 from tests.helpers import mostly_slow
@@ -691,3 +693,16 @@ def test_output_and_clean_speech_of_other_shapes_or_devices_are_rejected() -> No
             loss(output, torch.zeros(400))
     with pytest.raises(ValueError, match="on the same device, got meta and cpu"):
         loss(torch.zeros(400, device="meta"), torch.zeros(400))
+
+
+def test_the_normal_ear_of_another_teacher_is_asked_for(tmp_path: Path) -> None:
+    network = NeuroMSBG(NeuroConfig(channels=8))
+    for teacher in ("ear.py:Ear (v2)", "attenuation"):
+        network.save_pretrained(tmp_path, about={"teacher": teacher})
+        with pytest.warns(UserWarning, match=f"has learned from {teacher.split()[0]}, but"):
+            HearingLossLoss(N3, simulator=tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        HearingLossLoss(N3, simulator=tmp_path, normal=nn.Identity())
+        network.save_pretrained(tmp_path, about={"teacher": "msbg"})
+        HearingLossLoss(N3, simulator=tmp_path)
