@@ -212,8 +212,8 @@ def read_criterion(
         and the weight of each part by its name, multiplied by the weight of its criterion.
 
     Raises:
-        ValueError: A criterion or a part is unknown, a weight is negative or not finite, or all
-            weights are 0.
+        ValueError: A criterion or a part is unknown, two criteria have a part of the same name, a
+            weight is negative or not finite, or all weights are 0.
 
     >>> criteria, weights = read_criterion({"bands": 0.5, "haspi": 2.0, "paper": 0.0})
     >>> list(criteria), weights
@@ -233,6 +233,11 @@ def read_criterion(
     defaults: dict[str, float] = {}
     part_scales: dict[str, float] = {}
     for name, entry in criteria.items():
+        if repeated := defaults.keys() & entry.weights.keys():
+            raise ValueError(
+                f"expected parts of different names, but {name} has a part {min(repeated)!r} as "
+                "another criterion has; rename it"
+            )
         defaults |= entry.weights
         part_scales |= dict.fromkeys(entry.weights, scales[name])
     chosen = check_weights(defaults if weights is None else weights, defaults, "parts of the loss")

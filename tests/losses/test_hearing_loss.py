@@ -706,3 +706,10 @@ def test_the_normal_ear_of_another_teacher_is_asked_for(tmp_path: Path) -> None:
         HearingLossLoss(N3, simulator=tmp_path, normal=nn.Identity())
         network.save_pretrained(tmp_path, about={"teacher": "msbg"})
         HearingLossLoss(N3, simulator=tmp_path)
+
+
+def test_parts_of_two_criteria_have_different_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = Criterion(weights={"levels": 1.0}, compute=lambda _: {}, reference=ReferenceKind())
+    monkeypatch.setitem(CRITERIA, "mine", mine)
+    with pytest.raises(ValueError, match="mine has a part 'levels' as another criterion has"):
+        HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "mine": 1.0})
