@@ -1,5 +1,6 @@
 """Fingerprints differ for modules with different outputs, and nothing else changes them."""
 
+import io
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -115,6 +116,18 @@ def test_the_program_of_a_module_of_torch_counts() -> None:
         modules.append(nn.Sequential(translate(Gain(1.0)), modules[0][1]))
         first, second, third = map(fingerprint, modules)
         assert None is not first == third != second
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.*` is deprecated")
+def test_a_program_that_cannot_be_saved_is_unknown() -> None:
+    layers = nn.Sequential(nn.Conv2d(1, 4, 3), nn.BatchNorm2d(4), nn.ReLU()).eval()
+    program = torch.jit.optimize_for_inference(torch.jit.script(layers))
+    can_be_saved = True
+    try:
+        torch.jit.load(io.BytesIO(program.save_to_buffer()))
+    except RuntimeError:  # with weights in the format of oneDNN
+        can_be_saved = False
+    assert (fingerprint(Foreign(program)) is not None) == can_be_saved
 
 
 def test_hooks_count() -> None:

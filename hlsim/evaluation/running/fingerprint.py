@@ -13,9 +13,11 @@ import ast
 import dataclasses
 import hashlib
 import importlib.util
+import io
 import json
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -104,12 +106,16 @@ def fingerprint(processing: Any) -> str | None:
         return None
     parts: dict[str, list[Any]] = {}
     for place, module in processing.named_modules():
+        try:
+            program = _program(module)
+        except RuntimeError:
+            return None
         parts[place] = [
             _name(module),
             [_hash_source(kind) for kind in type(module).__mro__ if not _is_known(kind)],
             _attributes(module),
             str(getattr(module, "fingerprint", None)),
-            _program(module),
+            program,
             _hooks(module),
         ]
         # A condition of hlsim, such as an aid at another's level, contains the aids of a user.
@@ -218,9 +224,17 @@ def _program(module: nn.Module) -> str | None:
     """Return a hash of a TorchScript module, or the code of one of ``torch.fx``; None for others.
 
     The class of such a module says nothing about its code.
+
+    Raises:
+        RuntimeError: TorchScript cannot save and load the module.
     """
     if isinstance(module, jit.ScriptModule):
-        return hashlib.sha256(module.save_to_buffer()).hexdigest()
+        program = module.save_to_buffer()
+        # Without an error, it lacks weights that torch.jit.optimize_for_inference has converted.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # TorchScript is deprecated
+            jit.load(io.BytesIO(program))
+        return hashlib.sha256(program).hexdigest()
     return module.code if isinstance(module, fx.GraphModule) else None
 
 
