@@ -12,11 +12,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.checkpoint import read_record
 from hlsim.checks import check_shape
 from hlsim.dsp.resample import resample
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
-from hlsim.neuro import NeuroMSBG
 from hlsim.simulators import LINEAR, load_simulator
 from hlsim.torchtools import broadcast_shape, compute_once, flatten_items, on_device
 
@@ -103,8 +101,8 @@ class FrozenSimulator:
         self._band_rate = 2.0 * getattr(model, "highest_frequency", math.inf)
         self._needs_exact_lengths = getattr(model, "needs_exact_lengths", False)
         self._has_bank_phase = normal is None and getattr(model, "emulates_msbg", False)
-        if self._has_bank_phase and model is not simulator and isinstance(model, NeuroMSBG):
-            _warn_of_other_teacher(str(simulator))
+        if self._has_bank_phase and model is not simulator:
+            _warn_of_other_teacher(simulator, getattr(model, "teacher", ""))
 
     def simulate(
         self, waveform: Tensor, thresholds: Tensor, lengths: Tensor | None = None
@@ -195,14 +193,18 @@ class FrozenSimulator:
         return resample(low, round(self._band_rate), self.sample_rate)[..., : clean.shape[-1]]
 
 
-def _warn_of_other_teacher(checkpoint: str) -> None:
-    """Warn if the record of a network names a teacher that hlsim does not know as MSBG."""
-    record = str(read_record(checkpoint).get("about", {}).get("teacher", ""))
-    teacher = record.partition(" (")[0]  # without its fingerprint
+def _warn_of_other_teacher(simulator: Any, record: str) -> None:
+    """Warn if a network has learned from a teacher that hlsim does not know as MSBG.
+
+    Args:
+        simulator: Name or folder of the simulator.
+        record: Name of the teacher, perhaps with its fingerprint; empty if there is none.
+    """
+    teacher = record.partition(" (")[0]
     is_plugin = ":" in teacher and teacher.rpartition(":")[-1].isidentifier()
     if is_plugin or teacher == LINEAR:
         warnings.warn(
-            f"{checkpoint} has learned from {teacher}, but is compared with the normal ear of "
+            f"{simulator} has learned from {teacher}, but is compared with the normal ear of "
             "MSBG; unless this teacher is MSBG, use the teacher itself as simulator "
             f"(--simulator {teacher}), or pass its normal ear to HearingLossLoss (normal)",
             stacklevel=4,

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.calibration import NEURO_RATE, PASCAL_SPL
-from hlsim.checkpoint import SIMULATOR, HubModel, read_checkpoint
+from hlsim.checkpoint import SIMULATOR, HubModel, read_checkpoint, read_record
 from hlsim.checks import check_rate
 from hlsim.dsp.fft import power
 from hlsim.dsp.interpolation import interpolate
@@ -83,6 +83,7 @@ class NeuroMSBG(EarNetwork, HubModel):
         emulates_msbg: True, because the simulator emulates MSBG.
         highest_frequency: Highest frequency of outputs in Hz, 8000.
         needs_exact_lengths: True, because silence after the end of a signal changes its output.
+        teacher: Name of the simulator from which a loaded network has learned, if it is recorded.
 
     Raises:
         ValueError: The rate or the level is out of range, or ``config`` is not a ``NeuroConfig``.
@@ -95,6 +96,7 @@ class NeuroMSBG(EarNetwork, HubModel):
     emulates_msbg = True
     highest_frequency = NEURO_RATE / 2.0
     needs_exact_lengths = True
+    teacher = ""
     kind = SIMULATOR
     config_class = NeuroConfig
     build_options: ClassVar = {"compute_prior": False}
@@ -336,4 +338,5 @@ def load_pretrained(
     check_rate(sample_rate)
     levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     model: NeuroMSBG = read_checkpoint(name, [NeuroMSBG], **levels)
+    model.teacher = str(read_record(name).get("about", {}).get("teacher", ""))
     return model
