@@ -167,8 +167,9 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         ValueError: There are no rows, a file is both clean and noisy, two rows have the same noisy
             files, or the same clean file and none noisy, a clean file is in a folder of noises,
             mixtures or impulse responses by its name, a clean file or a speaker is in two splits, a
-            microphone is in a row twice, or a reference is not valid, lacks a noisy file, is
-            missing for several noisy files, or has not the same number of channels in all rows.
+            row names a microphone twice, or a reference is not valid, has no noisy file, is missing
+            where there are several noisy files, or names another number of channels than other
+            rows.
 
     >>> check_utterances([Utterance("noise/1.wav")])
     Traceback (most recent call last):

@@ -21,9 +21,9 @@ _LARGEST_DIFFERENCE = 0.1
 """Largest difference in length between the files of a scene in seconds, which is cut off."""
 
 _PAUSE_POWER = 1e-2
-"""Power of the clean speech of a pause, relative to that of the whole recording: up to this.
+"""Highest power of the clean speech in a pause, relative to that of the whole recording.
 
-At the level of speech, a pause would have noise that is tens of dB too loud.
+Raised to the level of speech, a pause would have noise that is tens of dB too loud.
 """
 
 
@@ -185,6 +185,7 @@ class SceneClips(Clips):
         super().__init__([scene.microphones[0] for scene in scenes], **settings)
         self._scenes = scenes
         self.clean_files = [scene.clean for scene in scenes]
+        self._speech_powers: dict[int, float] = {}  # of whole recordings, by index
         clean, microphones, _ = scenes[0].read()
         self.ears, self.microphones = len(clean), len(microphones)
         self.is_diotic = self.ears > 1 and torch.equal(clean[0], clean[1])
@@ -210,12 +211,15 @@ class SceneClips(Clips):
         return clips[:, : self.ears], clips[:, self.ears :].unflatten(1, (-1, self.ears))
 
     def is_silent(self, clip: Tensor, index: int) -> bool:
-        """Return whether the clean speech pauses, and is 20 dB softer than in the whole recording.
+        """Return whether the clean speech is at least 20 dB softer than in the whole recording.
 
-        There may be noise in the pause.
+        There may be noise in such a pause.
         """
-        clean, recording = clip[: self.ears], self.read_recording(index)[: self.ears]
-        highest = _PAUSE_POWER * float(recording.square().mean())
+        if index not in self._speech_powers:
+            recording = self.read_recording(index)[: self.ears]
+            self._speech_powers[index] = float(recording.square().mean())
+        clean = clip[: self.ears]
+        highest = _PAUSE_POWER * self._speech_powers[index]
         return super().is_silent(clean, index) or float(clean.square().mean()) <= highest
 
     def _decode(self, index: int) -> Tensor:

@@ -222,7 +222,7 @@ class Measure:
         name: Name in options and files.
         compute: Function ``(item, output) -> dict from column to value``, for an ``Item`` and an
             output with shape (time,). It raises ValueError if a value is not defined. A module is
-            set to evaluation mode.
+            set to evaluation mode by each study.
         packages: Packages on whose installed versions the values depend.
         settings: Text that names all else on which the values depend, such as the hash of a network
             or a version of the function; None if this is unknown. Values are then not stored.
@@ -245,10 +245,6 @@ class Measure:
     uses_facts: bool = True
     scores: Sequence[str] | None = None
     may_crash: bool = False
-
-    def __post_init__(self) -> None:
-        if isinstance(self.compute, nn.Module):
-            self.compute.eval()
 
     @cached_property
     def fingerprint(self) -> str | None:

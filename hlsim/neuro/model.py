@@ -338,5 +338,6 @@ def load_pretrained(
     check_rate(sample_rate)
     levels: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
     model: NeuroMSBG = read_checkpoint(name, [NeuroMSBG], **levels)
-    model.teacher = str(read_record(name).get("about", {}).get("teacher", ""))
+    record = read_record(name).get("about") or {}
+    model.teacher = str(record.get("teacher", ""))
     return model
